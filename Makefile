@@ -1,0 +1,65 @@
+# make demo    environment, then a still life made, fitted, rendered and compared: pictures in out/demo
+# make test    environment, then the tests
+#
+# PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
+# PIP_FLAGS   more options for pip. On Linux, plain PyPI has torch with CUDA (gigabytes); for the CPU build:
+#             make PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" setup
+
+PYTHON ?= python3
+PIP_FLAGS ?=
+PYTEST_FLAGS ?= -q
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.drgs-installed
+
+.PHONY: setup demo test smoke lint llvm clean
+.DEFAULT_GOAL := setup
+
+setup: $(STAMP) llvm
+
+demo: setup
+	$(BIN)/drgs demo -o out/demo
+
+test: setup
+	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+smoke: setup
+	$(BIN)/drgs --help
+	$(BIN)/drgs info
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make: Python >= 3.11 is needed, $(PYTHON) is $$($(PYTHON) --version 2>&1); use make PYTHON=..." >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	touch $@
+
+# Not a stamp: a library can go away, and looking takes a few hundredths of a second. A CUDA card needs no libLLVM.
+llvm: $(STAMP)
+	@$(BIN)/python -c 'from drgs.libllvm import require_llvm; require_llvm()' 2>/dev/null \
+	  || ldconfig -p 2>/dev/null | grep -q libcuda.so.1 \
+	  || $(MAKE) --no-print-directory install-llvm
+
+.PHONY: install-llvm
+install-llvm:
+	@set -e; \
+	error=$$($(BIN)/python -c 'from drgs.libllvm import require_llvm; require_llvm()' 2>&1 | tail -n 1 | sed 's/^[A-Za-z]*Error: //'); \
+	root=none; \
+	if [ -z "$$DRJIT_LIBLLVM_PATH" ] && command -v apt-get >/dev/null; then \
+	  if [ "$$(id -u)" = 0 ]; then root=; \
+	  elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then root="sudo -n"; fi; \
+	fi; \
+	if [ "$$root" = none ]; then echo "$$error" >&2; exit 1; fi; \
+	$$root apt-get update; \
+	for version in 19 20 21 18 17; do \
+	  if apt-cache show libllvm$$version >/dev/null 2>&1; then break; fi; \
+	done; \
+	$$root apt-get install -y libllvm$$version; \
+	$(BIN)/python -c 'from drgs.libllvm import require_llvm; print("libLLVM:", require_llvm().path)'

@@ -1,0 +1,87 @@
+"""drgs: differentiable Gaussian rendering with Dr.Jit and Mitsuba 3, on any CPU and on CUDA.
+
+    import drgs
+    g = drgs.load_ply("point_cloud.ply")
+    out = drgs.render(g, camera, drgs.RenderSettings.preset("exact"))
+
+Importing this package imports none of its heavy dependencies; names load at first access.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from drgs import libllvm as _libllvm
+
+__version__ = "0.1.0"
+
+# Public name -> module that defines it.
+_NAMES = {
+    "Camera": "cameras",
+    "Gaussians": "ellipsoids",
+    "RenderSettings": "settings",
+    "load_ply": "files",
+    "render": "integrator",
+    "render_jvp": "integrator",
+    "save_ply": "files",
+}
+_MODULES = frozenset(
+    {
+        "cameras",
+        "cli",
+        "data",
+        "demo",
+        "ellipsoids",
+        "files",
+        "integrator",
+        "metrics",
+        "reference",
+        "runtime",
+        "settings",
+        "sfm",
+        "tiles",
+        "train",
+    }
+)
+
+__all__ = [
+    "Camera",
+    "Gaussians",
+    "RenderSettings",
+    "__version__",
+    "data",
+    "load_ply",
+    "reference",
+    "render",
+    "render_jvp",
+    "runtime",
+    "save_ply",
+]
+
+if TYPE_CHECKING:
+    from drgs import data, reference, runtime
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Gaussians
+    from drgs.files import load_ply, save_ply
+    from drgs.integrator import render, render_jvp
+    from drgs.settings import RenderSettings
+
+# Before anything can import drjit: it loads libLLVM at once, and the wrong one aborts the process.
+_libllvm.prepare()
+
+
+def __getattr__(name: str):
+    """Load public names and submodules at first access (PEP 562)."""
+    if name in _NAMES:
+        value = getattr(importlib.import_module(f"drgs.{_NAMES[name]}"), name)
+    elif name in _MODULES:
+        value = importlib.import_module(f"drgs.{name}")
+    else:
+        raise AttributeError(f"module 'drgs' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_NAMES, *_MODULES})

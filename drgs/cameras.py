@@ -1,0 +1,509 @@
+"""Cameras, and the one place where camera conventions convert.
+
+Conventions, stated once for the whole project:
+
+- Camera axes are OpenCV's: +x right, +y down, +z forward (COLMAP and gsplat agree).
+- ``w2c`` (4,4) maps homogeneous world points to camera points, ``c2w`` is its inverse.
+- ``K`` (3,3) is ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels. The image spans
+  [0, width] x [0, height]; the center of pixel (column i, row j) lies at (i + 0.5, j + 0.5). Resizing an image
+  by s therefore multiplies fx, cx (and fy, cy) by s exactly. OpenCV functions that resample images count pixel
+  centers at integers, so they get ``cx - 0.5, cy - 0.5``; functions on points need no shift.
+- Distortion is OpenCV's: model ``opencv`` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model ``opencv_fisheye`` with
+  (k1, k2, k3, k4) on the angle; ``pinhole`` has none.
+- Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right,
+  +y up, looking along -z), LLFF ``poses_bounds`` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
+  looking along +z). World axes never change, only the camera's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.lenses import (
+    distort_opencv,
+    fisheye_directions,
+    fisheye_polynomial,
+    undistort_opencv,
+)
+
+__all__ = [
+    "Camera",
+    "c2w_from_llff",
+    "c2w_from_opengl",
+    "c2w_to_mitsuba",
+    "c2w_to_opengl",
+    "intrinsics",
+    "intrinsics_from_fov",
+    "load_cameras_json",
+    "look_at",
+    "orbit",
+    "save_cameras_json",
+]
+
+_OPENCV_LENGTHS = (4, 5, 8)
+_ROTATION_TOLERANCE = 1e-4
+# An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
+_INVERSE_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera: intrinsics, pose, image size and lens. See the module text for conventions.
+
+    Attributes:
+        K: (3,3) float64 intrinsics in pixels.
+        w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that gradients reach it.
+        width, height: image size in pixels.
+        model: ``pinhole``, ``opencv`` or ``opencv_fisheye``.
+        distortion: coefficients in OpenCV's order; empty for ``pinhole``.
+        name: for messages and file names.
+
+    Raises:
+        ValueError: K, w2c, size, model or distortion is not what it must be.
+    """
+
+    K: np.ndarray
+    w2c: Any
+    width: int
+    height: int
+    model: str = "pinhole"
+    distortion: tuple[float, ...] = ()
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        where = f"Camera {self.name!r}" if self.name else "Camera"
+        put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 (the dataclass is frozen)
+        put("K", _checked_intrinsics(where, self.K))
+        pose = _checked_pose(where, _as_numpy(self.w2c))
+        if not _is_tensor(self.w2c):
+            put("w2c", pose)
+        for axis in ("width", "height"):
+            value = getattr(self, axis)
+            if int(value) != value or value < 1:
+                raise ValueError(
+                    f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct it"
+                )
+            put(axis, int(value))
+        put("distortion", _checked_distortion(where, self.model, self.distortion))
+
+    @property
+    def c2w(self) -> np.ndarray:
+        """(4,4) float64 camera to world (detached)."""
+        w2c = _as_numpy(self.w2c).astype(np.float64)
+        c2w = np.eye(4)
+        c2w[:3, :3] = w2c[:3, :3].T
+        c2w[:3, 3] = -w2c[:3, :3].T @ w2c[:3, 3]
+        return c2w
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) float64 camera center in the world (detached)."""
+        return self.c2w[:3, 3]
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the lens differs from a pinhole (a fisheye with zero coefficients still does)."""
+        return self.model == "opencv_fisheye" or (self.model == "opencv" and any(self.distortion))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with an image of another size; K is scaled exactly."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return dataclasses.replace(self, K=scale @ self.K, width=width, height=height)
+
+    def undistorted(self) -> Camera:
+        """The pinhole camera of the same K, size and pose."""
+        return dataclasses.replace(self, model="pinhole", distortion=())
+
+    def pixel_directions(self) -> np.ndarray:
+        """(H,W,3) float64 unit world directions through the pixel centers, lens included.
+
+        Warns, with their number, about pixels that the lens model cannot undistort.
+        """
+        columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
+        directions = self._camera_directions(pixels) @ self.c2w[:3, :3].T
+        return directions.reshape(self.height, self.width, 3)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project world points, lens included.
+
+        Args:
+            points: (P,3) world points.
+
+        Returns:
+            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses, which may
+            see behind themselves.
+        """
+        w2c = _as_numpy(self.w2c).astype(np.float64)
+        local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ w2c[:3, :3].T + w2c[:3, 3]
+        return self._project_local(local), local[:, 2]
+
+    def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
+        """A Mitsuba ``perspective`` sensor as a dictionary for ``mi.load_dict`` (box filter, one sample a pixel).
+
+        Mitsuba's film has square pixels, so fx and fy may differ by no more than 0.1 pixel at the image border.
+
+        Args:
+            near, far: clip distances in scene units. Mitsuba's rays start at the near plane.
+
+        Raises:
+            ValueError: the camera is distorted, skewed or has pixels that are not square.
+        """
+        import mitsuba as mi
+
+        fx, fy = self.K[0, 0], self.K[1, 1]
+        problem = None
+        if self.is_distorted:
+            problem = f"an undistorted camera, got model {self.model}; use camera.undistorted()"
+        elif self.K[0, 1] != 0.0:
+            problem = f"zero skew, got {self.K[0, 1]:g}; trace camera.pixel_directions() instead"
+        elif abs(fx / fy - 1.0) * self.height / 2 > 0.1:
+            problem = f"square pixels, got fx {fx:g} and fy {fy:g}; trace camera.pixel_directions() instead"
+        if problem:
+            raise ValueError(f"Camera.to_mitsuba: Mitsuba's perspective sensor needs {problem}")
+        return {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(c2w_to_mitsuba(self.c2w)),
+            "fov_axis": "x",
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * self.width / fx))),
+            # Mitsuba offsets the film against the axis, not the axis on the film: both signs turn.
+            "principal_point_offset_x": float(0.5 - self.K[0, 2] / self.width),
+            "principal_point_offset_y": float(0.5 - self.K[1, 2] / self.height),
+            "near_clip": near,
+            "far_clip": far,
+            "film": {
+                "type": "hdrfilm",
+                "width": self.width,
+                "height": self.height,
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": 1},
+        }
+
+    def _camera_directions(self, pixels: np.ndarray) -> np.ndarray:
+        """(P,3) unit directions in the camera's frame through pixels (P,2)."""
+        if self.model == "opencv_fisheye":
+            directions = fisheye_directions(self._normalized(pixels), self.distortion)
+        else:
+            plane = self._normalized(pixels)
+            if self.is_distorted:
+                plane = undistort_opencv(plane, self.distortion)
+            directions = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        if self.is_distorted:
+            error = np.linalg.norm(self._project_local(directions) - pixels, axis=1)
+            bad = int(np.count_nonzero(~(error < _INVERSE_TOLERANCE)))
+            if bad:
+                warnings.warn(
+                    f"Camera {self.name!r}: the {self.model} lens cannot be inverted at {bad} of {len(pixels)} pixels; "
+                    "their rays are approximate, mask them or check the coefficients",
+                    stacklevel=3,
+                )
+        return directions
+
+    def _project_local(self, local: np.ndarray) -> np.ndarray:
+        """Pixels (P,2) of camera-frame points (P,3)."""
+        x, y, z = local.T
+        if self.model == "opencv_fisheye":
+            radius = np.hypot(x, y)
+            angle = np.arctan2(radius, z)
+            # On the axis the ratio is 0/0; its limit multiplies x = y = 0 and does not matter.
+            factor = fisheye_polynomial(angle, self.distortion)[0] / np.where(
+                radius > 0, radius, 1.0
+            )
+            plane = np.stack([x * factor, y * factor], axis=-1)
+        else:
+            depth = np.where(z > 0, z, np.nan)
+            plane = np.stack([x / depth, y / depth], axis=-1)
+            if self.is_distorted:
+                plane = distort_opencv(plane, self.distortion)
+        return plane @ self.K[:2, :2].T + self.K[:2, 2]
+
+    def _normalized(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels (P,2) on the image plane at z = 1, the lens still in them."""
+        y = (pixels[:, 1] - self.K[1, 2]) / self.K[1, 1]
+        x = (pixels[:, 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
+        return np.stack([x, y], axis=-1)
+
+
+# ---------------------------------------------------------------------------------------------------------- frames
+
+_OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_MITSUBA_FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def c2w_from_opengl(c2w: np.ndarray) -> np.ndarray:
+    """OpenGL / Blender / Nerfstudio camera-to-world (4,4) to OpenCV's."""
+    return np.asarray(c2w, dtype=np.float64) @ _OPENGL_FLIP
+
+
+def c2w_to_opengl(c2w: np.ndarray) -> np.ndarray:
+    """OpenCV camera-to-world (4,4) to OpenGL's (also Blender's and Nerfstudio's)."""
+    return np.asarray(c2w, dtype=np.float64) @ _OPENGL_FLIP
+
+
+def c2w_from_llff(pose: np.ndarray) -> np.ndarray:
+    """LLFF pose (3,4) or (3,5), camera axes in columns (down, right, backward), to an OpenCV camera-to-world (4,4)."""
+    pose = np.asarray(pose, dtype=np.float64)
+    c2w = np.eye(4)
+    c2w[:3, 0], c2w[:3, 1], c2w[:3, 2], c2w[:3, 3] = pose[:, 1], pose[:, 0], -pose[:, 2], pose[:, 3]
+    return c2w
+
+
+def c2w_to_mitsuba(c2w: np.ndarray) -> np.ndarray:
+    """OpenCV camera-to-world (4,4) to Mitsuba's ``to_world``."""
+    return np.asarray(c2w, dtype=np.float64) @ _MITSUBA_FLIP
+
+
+# ------------------------------------------------------------------------------------------------- making cameras
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """(3,3) float64 K from focal lengths and principal point in pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=np.float64)
+
+
+def intrinsics_from_fov(fov: float, width: int, height: int, axis: str = "x") -> np.ndarray:
+    """(3,3) K of a centered camera with square pixels.
+
+    Args:
+        fov: full field of view along ``axis`` in degrees, between 0 and 180.
+        width, height: image size in pixels.
+        axis: ``x`` or ``y``.
+    """
+    if not 0.0 < fov < 180.0:
+        raise ValueError(
+            f"intrinsics_from_fov: fov must lie between 0 and 180 degrees, got {fov}; correct it"
+        )
+    if axis not in ("x", "y"):
+        raise ValueError(f"intrinsics_from_fov: axis must be x or y, got {axis!r}; choose one")
+    focal = 0.5 * (width if axis == "x" else height) / np.tan(np.radians(fov) / 2)
+    return intrinsics(focal, focal, width / 2, height / 2)
+
+
+def look_at(eye: Any, target: Any, up: Any = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """(4,4) float64 w2c of a camera at ``eye`` looking at ``target``, ``up`` (world) pointing up in its image."""
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    forward = target - eye
+    right = np.cross(forward, up)
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
+        raise ValueError(
+            f"look_at: eye, target and up must not lie on one line, got {eye}, {target}, {up}; move one of them"
+        )
+    forward /= np.linalg.norm(forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = rotation, -rotation @ eye
+    return w2c
+
+
+def orbit(
+    center: Any,
+    radius: float,
+    n: int,
+    elevation: float = 20.0,
+    *,
+    width: int = 640,
+    height: int = 480,
+    fov: float = 45.0,
+    up: Any = (0.0, 0.0, 1.0),
+) -> list[Camera]:
+    """Cameras on a circle around a point, all looking at it.
+
+    Args:
+        center: (3,) the point looked at.
+        radius: distance of every camera from it, in scene units.
+        n: number of cameras, evenly spaced; the last one does not repeat the first.
+        elevation: degrees above the plane through ``center`` that is orthogonal to ``up``.
+        width, height: image size in pixels.
+        fov: horizontal field of view in degrees.
+        up: (3,) world direction that points up; scenes straight out of COLMAP usually have (0, -1, 0).
+    """
+    if n < 1 or not radius > 0:
+        raise ValueError(
+            f"orbit: n must be >= 1 and radius > 0, got {n} and {radius}; correct them"
+        )
+    center = np.asarray(center, dtype=np.float64)
+    axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    # Any direction orthogonal to up serves as azimuth 0; the world axis least aligned with up is the stable choice.
+    first = np.cross(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]), axis)
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    K, rise = intrinsics_from_fov(fov, width, height), np.radians(elevation)
+    cameras = []
+    for index in range(n):
+        turn = 2 * np.pi * index / n
+        outward = (
+            np.cos(rise) * (np.cos(turn) * first + np.sin(turn) * second) + np.sin(rise) * axis
+        )
+        w2c = look_at(center + radius * outward, center, axis)
+        cameras.append(Camera(K=K, w2c=w2c, width=width, height=height, name=f"orbit_{index:04d}"))
+    return cameras
+
+
+# ------------------------------------------------------------------------------------------------------------ files
+
+
+def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
+    """Write cameras in INRIA's ``cameras.json`` layout, with cx and cy added; atomically.
+
+    Raises:
+        ValueError: a camera is distorted or skewed (the layout has no room for that).
+    """
+    entries = []
+    for index, camera in enumerate(cameras):
+        if camera.is_distorted or camera.K[0, 1] != 0.0:
+            raise ValueError(
+                f"{path}: cameras.json holds pinhole cameras without skew, camera {index} ({camera.name!r}) is not one; "
+                "use camera.undistorted()"
+            )
+        c2w = camera.c2w
+        entries.append(
+            {
+                "id": index,
+                "img_name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "position": c2w[:3, 3].tolist(),
+                "rotation": c2w[:3, :3].tolist(),
+                "fx": float(camera.K[0, 0]),
+                "fy": float(camera.K[1, 1]),
+                "cx": float(camera.K[0, 2]),
+                "cy": float(camera.K[1, 2]),
+            }
+        )
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(entries, indent=1))
+    partial.replace(path)
+
+
+def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
+    """Read cameras in INRIA's layout: a list of id, img_name, width, height, position, rotation (c2w), fx, fy[, cx, cy].
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not that layout, or a camera that cannot be; names the first one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a cameras.json file, found none; check the path")
+    try:
+        entries = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(
+            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see INRIA's layout"
+        )
+    cameras = []
+    for index, entry in enumerate(entries):
+        try:
+            w, h = entry["width"], entry["height"]
+            K = intrinsics(entry["fx"], entry["fy"], entry.get("cx", w / 2), entry.get("cy", h / 2))
+            c2w = np.eye(4)
+            c2w[:3, :3], c2w[:3, 3] = entry["rotation"], entry["position"]
+            # The rotation's transpose stands for its inverse; Camera refuses what is not a rotation.
+            w2c = np.eye(4)
+            w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
+            name = str(entry.get("img_name", entry.get("id", index)))
+            cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name))
+        except KeyError as error:
+            raise ValueError(
+                f"{path}: camera {index} must have the key {error}, found none; add it"
+            ) from None
+        except (TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"{path}: camera {index}: {error}") from None
+    return cameras
+
+
+# -------------------------------------------------- checks
+
+
+def _is_tensor(value: Any) -> bool:
+    """Whether a value is a torch tensor, told without importing torch."""
+    return hasattr(value, "detach")
+
+
+def _as_numpy(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if _is_tensor(value) else np.asarray(value)
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    array = np.array(array, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _checked_intrinsics(where: str, K: Any) -> np.ndarray:
+    K = _read_only(_as_numpy(K))
+    if K.shape != (3, 3):
+        raise ValueError(
+            f"{where}: K must have shape (3, 3), got {K.shape}; see drgs.cameras.intrinsics"
+        )
+    if not np.isfinite(K).all():
+        raise ValueError(
+            f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct it"
+        )
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError(
+            f"{where}: focal lengths must be positive, got {K[0, 0]:g} and {K[1, 1]:g}; correct K"
+        )
+    if K[1, 0] != 0 or tuple(K[2]) != (0.0, 0.0, 1.0):
+        raise ValueError(
+            f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct it"
+        )
+    return K
+
+
+def _checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
+    w2c = _read_only(w2c)
+    if w2c.shape != (4, 4):
+        raise ValueError(
+            f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1"
+        )
+    if not np.isfinite(w2c).all():
+        row, column = np.argwhere(~np.isfinite(w2c))[0]
+        raise ValueError(
+            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop this view"
+        )
+    if np.abs(w2c[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError(
+            f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?"
+        )
+    rotation = w2c[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        got = f"an error of {error:.2g}" if error > _ROTATION_TOLERANCE else "a reflection"
+        raise ValueError(
+            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove scale and flips"
+        )
+    return w2c
+
+
+def _checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, ...]:
+    values = tuple(float(v) for v in distortion)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}: distortion must be finite, got {values}; correct it")
+    lengths = {"pinhole": (0,), "opencv": _OPENCV_LENGTHS, "opencv_fisheye": (4,)}.get(model)
+    if lengths is None:
+        raise ValueError(
+            f"{where}: model must be pinhole, opencv or opencv_fisheye, got {model!r}; choose one"
+        )
+    if len(values) not in lengths:
+        raise ValueError(
+            f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion coefficients, got {len(values)}; "
+            "pad with zeros"
+        )
+    return values

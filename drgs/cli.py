@@ -1,0 +1,331 @@
+"""The `drgs` command: options as dataclasses, one level of subcommands, one line per error.
+
+Each command's dataclass is its option list; the work is done by the module named in `_RUN`, loaded
+only when its command runs, so that `drgs --help` imports nothing heavy. A `run` function takes the
+dataclass and returns None or an exit code.
+
+Exit codes: 0 done, 2 bad usage or bad input (one line on stderr), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import logging
+import re
+import sys
+import typing
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
+
+__all__ = ["Demo", "Eval", "Fit", "Info", "Render", "Sfm", "main"]
+
+_Output = Annotated[Path, arg(aliases=["-o"])]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Common:
+    """Options that every command has."""
+
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb"] = "auto"
+    """Backend; auto follows DRGS_VARIANT, then CUDA if it works, else LLVM."""
+    threads: int | None = None
+    """Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core."""
+    quiet: bool = False
+    """No progress, warnings only."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Settings(_Common):
+    """Options of commands that render."""
+
+    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "exact"
+    """Render settings of a named system."""
+    overrides: Annotated[
+        tuple[str, ...],
+        arg(name="set", metavar="KEY=VALUE", help="Replace one render setting, e.g. order=ray."),
+        UseAppendAction,
+    ] = ()
+
+    def settings(self):
+        """The `RenderSettings` that --preset and --set describe.
+
+        Raises:
+            ValueError: If an override is no KEY=VALUE, names no field or has the wrong type.
+        """
+        from drgs.settings import RenderSettings
+
+        hints = typing.get_type_hints(RenderSettings)
+        values = {}
+        for text in self.overrides:
+            key, equals, value = text.partition("=")
+            if not equals or key not in hints:
+                what = "KEY=VALUE" if not equals else "a render setting"
+                raise ValueError(f"--set: must be {what}, got {text!r}; known: {', '.join(hints)}")
+            values[key] = _parse(key, hints[key], value)
+        return RenderSettings.preset(self.preset, **values)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Info(_Common):
+    """Report backend, libLLVM, CUDA, threads and package versions."""
+
+    json: bool = False
+    """Print JSON."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render(_Settings):
+    """Render a Gaussian PLY, or a finished run, to pictures or a video."""
+
+    scene: Positional[Path]
+    """A 3DGS point_cloud.ply or a run folder."""
+    cameras: str = "orbit"
+    """A data set folder, a cameras.json, or orbit."""
+    output: _Output = Path("out/render")
+    """Folder for the pictures."""
+    width: int | None = None
+    """Image width in pixels; default the camera's."""
+    height: int | None = None
+    """Image height in pixels; default the camera's."""
+    frames: int = 60
+    """Views of an orbit."""
+    format: str = "png"
+    """Comma-separated list of png, exr, webm."""
+    depth: bool = False
+    """Write depth too."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which views of a data set."""
+    limit: int | None = None
+    """At most this many views."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fit(_Settings):
+    """Fit Gaussians to photographs with known cameras."""
+
+    data: Positional[Path]
+    """A data set: COLMAP, transforms.json, LLFF, or a folder made by drgs sfm."""
+    output: _Output
+    """The run folder."""
+    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
+    """Render settings of a named system."""
+    max_steps: int = 3000
+    """Optimizer steps."""
+    max_pixels: int = 130_000
+    """Images are reduced to at most this many pixels."""
+    max_gaussians: int = 60_000
+    """Budget of the density control."""
+    init_points: str = "auto"
+    """Where the initial points come from."""
+    test_every: int = 8
+    """Every n-th view, by name, is held out; 0 holds out none."""
+    seed: int = 0
+    """Seed of everything random."""
+    sh_degree: Literal[0, 1, 2, 3] = 3
+    """Highest degree of the view-dependent color."""
+    deterministic: bool = False
+    """Same seed, same bits; slower."""
+    resume: bool = False
+    """Continue from the last checkpoint in the run folder."""
+    save_every: int = 1000
+    """Steps between checkpoints."""
+    mask: Literal["auto", "ignore"] = "auto"
+    """Use the data set's masks, or do not."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB in [0, 1] behind everything."""
+
+    def settings(self):
+        """As for every command, with the background that the photographs are composited on."""
+        return super().settings().replace(background=self.background)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eval(_Common):
+    """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS when weights are given."""
+
+    run: Positional[Path]
+    """A run folder."""
+    split: Literal["all", "train", "test"] = "test"
+    """Which views."""
+    lpips_weights: Path | None = None
+    """Weights of the LPIPS backbone; without them LPIPS is reported as null."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sfm(_Common):
+    """Recover cameras and points from plain photographs (COLMAP on the CPU)."""
+
+    images: Positional[Path]
+    """A folder of photographs."""
+    output: _Output
+    """Folder for the data set."""
+    camera_model: Literal[
+        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+    ] = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens; photographs of one size share one camera."""
+    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Match all pairs, or neighbors by name (video); auto decides by their number."""
+    seed: int = 0
+    """Seed of all random sampling."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo(_Common):
+    """Make a still life, fit it, render it and compare presets: a tour in minutes."""
+
+    output: _Output = Path("out/demo")
+    """Folder for pictures and tables."""
+
+
+# Command -> (its options, module, function). Modules load only when their command runs.
+_RUN = {
+    "info": (Info, "drgs.cli", "_run_info"),
+    "render": (Render, "drgs.render_command", "run"),
+    "fit": (Fit, "drgs.train", "run_fit"),
+    "eval": (Eval, "drgs.metrics", "run_eval"),
+    "sfm": (Sfm, "drgs.sfm", "run_command"),
+    "demo": (Demo, "drgs.demo", "run"),
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: Arguments without the program's name, default `sys.argv[1:]`.
+    Returns:
+        The exit code. Bad usage and --help leave through SystemExit, as argparse does.
+    """
+    argv = sys.argv[1:] if argv is None else list(argv)
+    args = _parse_arguments(argv)
+    name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("drgs").setLevel(logging.WARNING if args.quiet else logging.INFO)
+    try:
+        if args.variant != "auto" or args.threads is not None:
+            # Only when asked for: a command that needs no backend shall not load one.
+            from drgs import runtime
+
+            runtime.setup(args.variant, args.threads)
+        return getattr(importlib.import_module(module), function)(args) or 0
+    except (ValueError, NotImplementedError, OSError) as error:
+        if args.debug:
+            raise
+        _complain(name, str(error) or type(error).__name__)
+        return 2
+    except KeyboardInterrupt:
+        if args.debug:
+            raise
+        _complain(name, "interrupted")
+        return 130
+
+
+def _parse_arguments(argv: list[str]):
+    """The dataclass of the command in argv; tyro's framed usage errors become one line."""
+    commands = typing.Union[  # noqa: UP007 (built at run time)
+        tuple(Annotated[t, subcommand(name)] for name, (t, _, _) in _RUN.items())
+    ]
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            return tyro.cli(
+                commands,
+                args=argv,
+                prog="drgs",
+                description="Differentiable Gaussian rendering, exact gradients, any CPU.",
+                config=(FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        if end.code:
+            command = next((a for a in argv if a in _RUN), None)
+            line = _one_line(errors.getvalue())
+            _complain(command, f"{line} (see `drgs {f'{command} ' if command else ''}--help`)")
+        raise
+
+
+def _one_line(framed: str) -> str:
+    """The message in tyro's box of box-drawing characters, with its first suggestion."""
+    lines = [line.strip("╭╮╰╯│ ") for line in framed.splitlines()]
+    sections, title = [[]], True
+    for line in lines:
+        if title and "─" in line:  # the box's upper edge carries only a title
+            title = False
+        elif set(line) == {"─"}:
+            sections.append([])
+        elif line and "─" not in line:
+            sections[-1].append(line)
+    message = " ".join(sections[0]) or "bad usage"
+    message = message.split(" Got errors:")[0].rstrip(".")
+    for section in sections[1:]:
+        if section and section[0].startswith("Perhaps you meant"):
+            message += f"; perhaps {section[1]}"
+    return message
+
+
+def _complain(command: str | None, message: str) -> None:
+    """One line on stderr: `drgs COMMAND: message`."""
+    where = f"drgs {command}" if command else "drgs"
+    message = " ".join(message.removeprefix("drgs: ").split())
+    print(f"{where}: {message}", file=sys.stderr)
+
+
+def _parse(key: str, hint, text: str):
+    """One --set value by its field's type: str, float, `float | None`, or a tuple of floats."""
+    kinds = typing.get_args(hint) or (hint,)
+    try:
+        if typing.get_origin(hint) is tuple:
+            return tuple(float(part) for part in text.strip("()[] ").split(","))
+        if type(None) in kinds and text.lower() == "none":
+            return None
+        if bool in kinds:
+            return {"true": True, "false": False}[text.lower()]
+        number = next((kind for kind in (int, float) if kind in kinds), None)
+        return number(text) if number else text
+    except (ValueError, KeyError):
+        kind = hint.__name__ if kinds == (hint,) else hint
+        raise ValueError(f"--set {key}: must be of type {kind}, got {text!r}") from None
+
+
+def _run_info(args: Info) -> int:
+    """`drgs info`: exit code 2 when nothing can be rendered here."""
+    from drgs import runtime
+
+    report = runtime.info()
+    if args.json:
+        import json
+
+        print(json.dumps(report, indent=2))
+    else:
+        print(_plain(report))
+    if report["backend"]["error"]:
+        raise ValueError(report["backend"]["error"])
+    return 0
+
+
+def _plain(report: dict) -> str:
+    """The report of `runtime.info()` as aligned lines."""
+    llvm, cuda, optix = report["llvm"], report["cuda"], report["optix"]
+    cores = report["cores"]
+    others = [x["path"] for x in llvm["found"] if x["path"] != llvm["path"]]
+    rows = {
+        "drgs": f"{report['drgs']} (commit {report['commit'] or 'unknown'})",
+        "python": f"{report['python']} on {report['platform']}",
+        "cpu": f"{report['cpu']}, {cores['usable']} of {cores['machine']} cores",
+        "backend": report["backend"]["variant"] or "none",
+        "libLLVM": f"{llvm['version']} ({llvm['path']})" if llvm["version"] else "not in use",
+        "also found": ", ".join(others) or "no other libLLVM",
+        "threads": ", ".join(f"{name} {count}" for name, count in report["threads"].items()),
+        "CUDA": cuda["device"] or "yes" if cuda["available"] else f"no: {cuda['reason']}",
+        "OptiX": "yes" if optix["available"] else f"no: {optix['reason']}",
+        **{name: version or "not installed" for name, version in report["packages"].items()},
+    }
+    width = max(map(len, rows))
+    return re.sub(r" +$", "", "\n".join(f"{k:<{width}}  {v}" for k, v in rows.items()), flags=re.M)

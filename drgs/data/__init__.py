@@ -1,0 +1,79 @@
+"""Data sets: ``drgs.data.load(path)`` finds out which format a folder has and returns a `Dataset`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from drgs.data.checks import list_images
+from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
+from drgs.data.llff import load_llff
+from drgs.data.points import initial_points, scene_extent
+from drgs.data.transforms import find_transforms, load_transforms
+from drgs.data.views import Dataset, View
+
+__all__ = ["Dataset", "View", "initial_points", "load", "scene_extent"]
+
+
+def load(
+    path: str | os.PathLike,
+    *,
+    test_every: int = 8,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Dataset:
+    """Load a data set; its format is found out from its files. No image is decoded.
+
+    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json``; a COLMAP model in ``.``,
+    ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``. A JSON or npy file may be named itself.
+
+    Args:
+        path: folder or file.
+        test_every: every how many views `Dataset.split` holds one out; 0 for none.
+        background: color in [0,1] that images with an alpha channel are composited on.
+
+    Raises:
+        FileNotFoundError: nothing there, or photos without poses.
+        ValueError: a file that is damaged or says something that cannot be.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"{path}: must be a data set, found no such file or folder; check the path"
+        )
+    if path.is_file():
+        loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
+        if loader is None:
+            raise ValueError(
+                f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these"
+            )
+    elif find_transforms(path):
+        loader = load_transforms
+    elif find_model(path):
+        loader = load_colmap
+    elif (path / "poses_bounds.npy").is_file():
+        loader = load_llff
+    else:
+        raise _nothing_found(path)
+    dataset = loader(path, background=background)
+    dataset.test_every = test_every
+    dataset.split()  # refuses a test_every that cannot be
+    return dataset
+
+
+def _nothing_found(path: Path) -> FileNotFoundError:
+    for folder in (path, path / "images"):
+        if folder.is_dir() and list_images(folder):
+            return FileNotFoundError(
+                f"{path}: must hold camera poses, found {len(list_images(folder))} photos without; "
+                f"run `drgs sfm {folder} -o OUT` and load OUT"
+            )
+    looked = [
+        "transforms.json",
+        "transforms_{train,val,test}.json",
+        *MODEL_FOLDERS,
+        "poses_bounds.npy",
+        "images",
+    ]
+    return FileNotFoundError(
+        f"{path}: must be a data set, found none (looked for {', '.join(looked)}); check the path"
+    )

@@ -1,0 +1,147 @@
+"""Reading files that may lie: sizes are compared with what the file holds before anything is allocated."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_json", "read_npy"]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_MAX_NPY_HEADER = 65536
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files directly in a folder, by name; hidden files are left out."""
+    return sorted(
+        p
+        for p in folder.iterdir()
+        if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
+    )
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not JSON.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a JSON file, found none; check the path")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Read a plain numeric ``.npy`` array; the shape in its header is checked against the file size first.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not a numeric npy file, or shorter than its header claims.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a .npy file, found none; check the path")
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0
+            if version >= (2, 0):
+                read = np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file, max_header_size=_MAX_NPY_HEADER)
+            start = file.tell()
+    except (ValueError, EOFError, OSError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(
+            f"{path}: must be a .npy file, got {text}; save it with numpy.save"
+        ) from None
+    if dtype.hasobject or dtype.kind not in "fiub":
+        raise ValueError(f"{path}: must hold plain numbers, got dtype {dtype}; save a float array")
+    # Python integers: a claimed shape of 10^12 x 10^12 must not wrap around.
+    claimed = dtype.itemsize
+    for side in shape:
+        claimed *= int(side)
+    actual = path.stat().st_size - start
+    if any(side < 0 for side in shape) or claimed > actual:
+        raise ValueError(
+            f"{path}: the header claims shape {shape} ({claimed} bytes), the file holds {actual} bytes; "
+            "it is truncated or damaged, copy it again"
+        )
+    return np.load(path, allow_pickle=False)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image; of PNG and JPEG only the header is read.
+
+    Raises:
+        ValueError: not an image.
+    """
+    with path.open("rb") as file:
+        head = file.read(24)
+        if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR":
+            return struct.unpack(">II", head[16:24])
+        if head[:2] == b"\xff\xd8":
+            size = _jpeg_size(file)
+            if size:
+                return size
+    height, width = read_image(path).shape[:2]
+    return width, height
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Decode an image as stored: (H,W) or (H,W,C), its own bit depth, channels in RGB order, EXIF rotation ignored.
+
+    Poses and intrinsics belong to the stored pixels, hence no rotation.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not an image that OpenCV decodes.
+    """
+    import cv2
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
+    try:
+        data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        data = None
+    if data is None:
+        raise ValueError(
+            f"{path}: must be an image, could not be decoded; copy or convert it again"
+        )
+    if data.ndim == 3:
+        order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(data.shape[2])
+        if order is None:
+            data = data[..., 0]
+        else:
+            data = np.ascontiguousarray(data[..., order])
+    return data
+
+
+def _jpeg_size(file: Any) -> tuple[int, int] | None:
+    """(width, height) from a JPEG's frame header, None if there is none."""
+    file.seek(2)
+    while True:
+        marker = file.read(2)
+        if len(marker) < 2 or marker[0] != 0xFF:
+            return None
+        if marker[1] == 0xFF:  # fill byte: the second byte may start the marker
+            file.seek(-1, 1)
+            continue
+        length = file.read(2)
+        if len(length) < 2:
+            return None
+        # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC (arithmetic).
+        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+            body = file.read(5)
+            if len(body) < 5:
+                return None
+            height, width = struct.unpack(">HH", body[1:5])
+            return (width, height) if width and height else None
+        file.seek(struct.unpack(">H", length)[0] - 2, 1)

@@ -1,0 +1,353 @@
+"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have been checked."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from drgs.cameras import Camera, intrinsics
+from drgs.data.views import Dataset, View, fit_to_image
+
+__all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
+
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+# COLMAP's model numbers and parameter counts, for the camera models that drgs renders.
+_MODELS = {
+    "SIMPLE_PINHOLE": (0, 3),
+    "PINHOLE": (1, 4),
+    "SIMPLE_RADIAL": (2, 4),
+    "RADIAL": (3, 5),
+    "OPENCV": (4, 8),
+    "OPENCV_FISHEYE": (5, 8),
+}
+_REQUIRED = ("cameras", "images", "points3D")
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder of a COLMAP model at or below ``path``, or None."""
+    for folder in (path, *(path / name for name in MODEL_FOLDERS)):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
+    """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a folder).
+
+    Args:
+        path: the data set, or the model's own folder.
+        background: color that images with alpha are composited on.
+
+    Raises:
+        FileNotFoundError: no model, no ``images`` folder, or an image that the model lists is missing.
+        ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
+    """
+    model = find_model(path)
+    if model is None:
+        raise FileNotFoundError(
+            f"{path}: must hold a COLMAP model, found no cameras.bin or cameras.txt in . or {', '.join(MODEL_FOLDERS)}; "
+            "run `drgs sfm`"
+        )
+    reconstruction = _read(model)
+    folder = _image_folder(path, model)
+    views = []
+    registered = sorted(reconstruction.reg_image_ids())
+    if not registered:
+        raise ValueError(
+            f"{model}: must hold at least one registered image, got none; run `drgs sfm` again"
+        )
+    for index, image_id in enumerate(registered):
+        image = reconstruction.images[image_id]
+        where = f"{model}: image {index} ({image.name})"
+        if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
+            raise ValueError(
+                f"{where}: the name must stay inside {folder}, got {image.name!r}; rename it"
+            )
+        w2c = np.eye(4)
+        w2c[:3] = image.cam_from_world().matrix()
+        if not np.isfinite(w2c).all():
+            raise ValueError(
+                f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model"
+            )
+        camera = _camera(reconstruction.cameras[image.camera_id], w2c, image.name, where)
+        views.append(
+            View(
+                camera=fit_to_image(camera, folder / image.name, where),
+                name=str(Path(image.name).with_suffix("")),
+                image_path=folder / image.name,
+                mask_path=_mask(folder, image.name),
+                background=background,
+            )
+        )
+    points, colors = _points(reconstruction, model)
+    source = f"COLMAP model {model.name}, {len(points)} points" if len(points) else ""
+    return Dataset(
+        path=path,
+        format="colmap",
+        views=views,
+        points=points if len(points) else None,
+        colors=colors if len(points) else None,
+        point_source=source,
+    )
+
+
+def _image_folder(path: Path, model: Path) -> Path:
+    """``images`` beside the model or above it."""
+    tried = []
+    for base in (path, model, model.parent, model.parent.parent):
+        folder = base / "images"
+        if folder.is_dir():
+            return folder
+        tried.append(str(folder))
+    raise FileNotFoundError(
+        f"{path}: the photos must lie in a folder named images, found none (looked at {', '.join(dict.fromkeys(tried))}); "
+        "move or link them there"
+    )
+
+
+def _mask(folder: Path, name: str) -> Path | None:
+    """COLMAP's own ``masks/NAME.EXT.png``, or ``masks/NAME.png``."""
+    masks = folder.parent / "masks"
+    for candidate in (masks / f"{name}.png", (masks / name).with_suffix(".png")):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def _camera(camera: object, w2c: np.ndarray, name: str, where: str) -> Camera:
+    p = [float(v) for v in camera.params]
+    kind = camera.model_name
+    if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        K, rest = intrinsics(p[0], p[0], p[1], p[2]), p[3:]
+    else:
+        K, rest = intrinsics(*p[:4]), p[4:]
+    model, distortion = "pinhole", ()
+    if kind == "OPENCV_FISHEYE":
+        model, distortion = "opencv_fisheye", tuple(rest)
+    elif any(rest):
+        model, distortion = "opencv", (*rest, *([0.0] * (4 - len(rest))))
+    try:
+        return Camera(
+            K=K,
+            w2c=w2c,
+            width=camera.width,
+            height=camera.height,
+            model=model,
+            distortion=distortion,
+            name=name,
+        )
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _points(reconstruction: object, model: Path) -> tuple[np.ndarray, np.ndarray]:
+    entries = [reconstruction.points3D[key] for key in sorted(reconstruction.point3D_ids())]
+    points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(
+        -1, 3
+    ) / np.float32(255)
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"{model}: points must be finite, got {points[bad[0]]} at index {bad[0]}; run `drgs sfm` again"
+        )
+    return points, colors
+
+
+# ------------------------------------------------------------------------------------ checks before pycolmap reads
+
+
+def _read(model: Path) -> object:
+    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file does not hold."""
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    for name in _REQUIRED:
+        if not (model / f"{name}{suffix}").is_file():
+            raise FileNotFoundError(
+                f"{model}: must hold {name}{suffix}, found none; copy the whole model"
+            )
+    check = _check_binary if suffix == ".bin" else _check_text
+    for name in (*_REQUIRED, "rigs", "frames"):
+        if (model / f"{name}{suffix}").is_file():
+            check(model / f"{name}{suffix}", name)
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3
+    try:
+        read(str(model))
+    except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
+        text = str(error).strip().splitlines()
+        raise ValueError(
+            f"{model}: must be a COLMAP model that pycolmap reads, got {text[-1][:160] if text else type(error).__name__}; "
+            "export it again"
+        ) from None
+    finally:
+        pycolmap.logging.minloglevel = level
+    return reconstruction
+
+
+class _Walk:
+    """A cursor over a binary file that never passes its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+
+    def need(self, size: int, what: str) -> None:
+        if self.at + size > len(self.data):
+            raise ValueError(
+                f"{self.path}: must hold {what} ({size} bytes from byte {self.at}), the file ends at byte "
+                f"{len(self.data)}; it is truncated or damaged, copy it again"
+            )
+
+    def take(self, layout: struct.Struct, what: str) -> tuple:
+        self.need(layout.size, what)
+        values = layout.unpack_from(self.data, self.at)
+        self.at += layout.size
+        return values
+
+    def skip(self, size: int, what: str) -> None:
+        self.need(size, what)
+        self.at += size
+
+    def name(self, what: str) -> str:
+        end = self.data.find(b"\0", self.at)
+        self.need(end + 1 - self.at if end >= 0 else len(self.data), what)
+        raw, self.at = self.data[self.at : end], end + 1
+        return raw.decode("utf-8", errors="replace")
+
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_POINT = struct.Struct("<Q3d3BdQ")
+_PAIR = struct.Struct("<II")
+_RIG_SENSOR = struct.Struct("<iIB")
+_FRAME = struct.Struct("<II7dI")
+# The least that one record of a file can take, to refuse a claimed count at once.
+_LEAST = {"cameras": 48, "images": 73, "points3D": _POINT.size, "rigs": 8, "frames": _FRAME.size}
+
+
+def _check_binary(path: Path, kind: str) -> None:
+    walk = _Walk(path)
+    (count,) = walk.take(_COUNT, "a count")
+    walk.need(count * _LEAST[kind], f"the {count} {kind} that it claims")
+    for index in range(count):
+        what = f"{kind} record {index} of {count}"
+        if kind == "cameras":
+            _, number, _, _ = walk.take(_CAMERA, what)
+            walk.skip(8 * _parameter_count(path, number), what)
+        elif kind == "images":
+            walk.take(_IMAGE, what)
+            walk.name(f"the name of {what}")
+            (observations,) = walk.take(_COUNT, what)
+            walk.skip(24 * observations, f"the {observations} observations of {what}")
+        elif kind == "points3D":
+            length = walk.take(_POINT, what)[-1]
+            walk.skip(8 * length, f"the {length} track elements of {what}")
+        elif kind == "rigs":
+            _, sensors = walk.take(_PAIR, what)
+            walk.skip(8 if sensors else 0, what)
+            for _ in range(sensors - 1):
+                has_pose = walk.take(_RIG_SENSOR, what)[-1]
+                walk.skip(56 if has_pose else 0, what)
+        else:
+            entries = walk.take(_FRAME, what)[-1]
+            walk.skip(16 * entries, f"the {entries} entries of {what}")
+
+
+def _parameter_count(path: Path, number: int) -> int:
+    for model_number, parameters in _MODELS.values():
+        if model_number == number:
+            return parameters
+    import pycolmap
+
+    try:
+        name = pycolmap.CameraModelId(number).name
+    except ValueError:
+        name = f"number {number}"
+    raise _unsupported(path, name)
+
+
+def _unsupported(path: Path, name: str) -> ValueError:
+    return ValueError(
+        f"{path}: the camera model must be one of {', '.join(_MODELS)}, got {name}; undistort the images with "
+        "`colmap image_undistorter`, or run `drgs sfm` again"
+    )
+
+
+def _check_text(path: Path, kind: str) -> None:
+    """Every data line must have the numbers that its kind takes."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(
+            f"{path}: must be a text file, got binary data; export the model again"
+        ) from None
+    lines = [
+        (number, line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")
+    ]
+    if kind == "images":
+        _check_image_lines(path, lines)
+        return
+    for number, line in lines:
+        words = line.split()
+        if not words:
+            continue
+        if kind == "cameras":
+            name = words[1] if len(words) > 1 else ""
+            if name not in _MODELS:
+                raise _unsupported(path, name or "none")
+            _numbers(path, number, [words[0], *words[2:]], 3 + _MODELS[name][1], exact=True)
+        elif kind == "points3D":
+            _numbers(path, number, words, 8)
+            if len(words) % 2:
+                raise _bad_line(
+                    path,
+                    number,
+                    "a track of pairs IMAGE_ID, POINT2D_IDX",
+                    f"{len(words) - 8} numbers",
+                )
+        # Rigs and frames mix words and numbers; they are small, and pycolmap reports what it cannot parse.
+
+
+def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
+    """Pairs of lines: pose and name, then observations (which may be empty)."""
+    index = 0
+    while index < len(lines):
+        number, line = lines[index]
+        words = line.split(maxsplit=9)
+        if not words:
+            index += 1
+            continue
+        if len(words) < 10:
+            raise _bad_line(path, number, "ID, pose (7), CAMERA_ID and NAME", f"{len(words)} words")
+        _numbers(path, number, words[:9], 9)
+        if index + 1 < len(lines):
+            observations = lines[index + 1][1].split()
+            if len(observations) % 3:
+                raise _bad_line(
+                    path,
+                    lines[index + 1][0],
+                    "triples X, Y, POINT3D_ID",
+                    f"{len(observations)} numbers",
+                )
+            _numbers(path, lines[index + 1][0], observations, 0)
+        index += 2
+
+
+def _numbers(path: Path, line: int, words: list[str], least: int, exact: bool = False) -> None:
+    if len(words) < least or (exact and len(words) != least):
+        raise _bad_line(path, line, f"{least} numbers", f"{len(words)}")
+    try:
+        np.array(words, dtype=np.float64)
+    except ValueError:
+        raise _bad_line(path, line, "numbers", "other words") from None
+
+
+def _bad_line(path: Path, line: int, needs: str, got: str) -> ValueError:
+    return ValueError(
+        f"{path}: line {line} must hold {needs}, got {got}; it is truncated or damaged, export it again"
+    )

@@ -1,0 +1,67 @@
+"""LLFF data sets: ``poses_bounds.npy`` and the photos in ``images``, paired in the order of their names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from drgs.cameras import Camera, c2w_from_llff, intrinsics
+from drgs.data.checks import list_images, read_npy
+from drgs.data.views import Dataset, View, fit_to_image
+
+__all__ = ["load_llff"]
+
+
+def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
+    """Load an LLFF data set: (N,17) rows of a 3x5 matrix [pose | height, width, focal] and two depth bounds.
+
+    Args:
+        path: the folder, or the ``.npy`` file.
+        background: color that images with alpha are composited on.
+
+    Raises:
+        FileNotFoundError: no such file, or no ``images``.
+        ValueError: not an (N,17) array, another number of images, or a pose that is not one.
+    """
+    file = path if path.is_file() else path / "poses_bounds.npy"
+    rows = read_npy(file)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
+        raise ValueError(f"{file}: must have shape (N, 17), got {rows.shape}; this is no LLFF file")
+    folder = file.parent / "images"
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{file}: the photos must lie in {folder}, found no such folder; move them there"
+        )
+    images = list_images(folder)
+    if len(images) != len(rows):
+        raise ValueError(
+            f"{file}: must have one row an image, got {len(rows)} rows and {len(images)} images; match them"
+        )
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image"
+        )
+    views = []
+    for index, (row, image) in enumerate(zip(rows.astype(np.float64), images, strict=True)):
+        where = f"{file}: row {index} ({image.name})"
+        matrix = row[:15].reshape(3, 5)
+        height, width, focal = matrix[:, 4]
+        c2w = c2w_from_llff(matrix)
+        w2c = np.eye(4)
+        w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
+        try:
+            K = intrinsics(focal, focal, width / 2, height / 2)
+            camera = Camera(K=K, w2c=w2c, width=width, height=height, name=image.stem)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        views.append(
+            View(
+                fit_to_image(camera, image, where),
+                name=image.stem,
+                image_path=image,
+                background=background,
+            )
+        )
+    return Dataset(path, "llff", views)

@@ -1,0 +1,156 @@
+"""Local features and their matches, by pycolmap on the CPU, in steps small enough to report progress."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+__all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs"]
+
+Progress = Callable[[str, int, int], None]
+_IMAGES_A_STEP = 8
+_PAIRS_A_STEP = 64
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep COLMAP's log off the terminal, errors included: they arrive as exceptions."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def extract(
+    database: Path,
+    folder: Path,
+    names: list[str],
+    *,
+    camera_model: str,
+    shared_camera: bool,
+    masks: Path | None = None,
+    max_image_size: int = 0,
+    wide_baseline: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """SIFT features of images into a COLMAP database.
+
+    Args:
+        database: file, made if absent.
+        folder, names: the images, relative to the folder.
+        camera_model: COLMAP's name.
+        shared_camera: one camera for all images, or one each.
+        masks: folder of ``NAME.EXT.png``; features on black are dropped. Every image needs one.
+        max_image_size: pixels on the longer side above which images are shrunk; 0 for never.
+        wide_baseline: affine shapes and pooled scales: connects views further apart, at 2.5 times the cost.
+        progress: called with ("features", done, total).
+    """
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    if max_image_size:
+        options.max_image_size = max_image_size
+    options.sift.estimate_affine_shape = wide_baseline
+    options.sift.domain_size_pooling = wide_baseline
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = camera_model
+    if masks is not None:
+        reader.mask_path = masks
+    mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
+    for start in range(0, len(names), _IMAGES_A_STEP):
+        if progress:
+            progress("features", start, len(names))
+        if shared_camera and start:
+            # Every call would otherwise open a camera of its own.
+            with pycolmap.Database.open(database) as handle:
+                reader.existing_camera_id = handle.read_all_cameras()[0].camera_id
+        pycolmap.extract_features(
+            database,
+            folder,
+            image_names=names[start : start + _IMAGES_A_STEP],
+            camera_mode=mode,
+            reader_options=reader,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+    if progress:
+        progress("features", len(names), len(names))
+
+
+def match(
+    database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progress: Progress | None = None
+) -> None:
+    """Match image pairs and verify them geometrically; results go to the database.
+
+    Args:
+        database: with features.
+        pairs: image names.
+        seed: of the random sampling in the verification.
+        progress: called with ("matching", done, total).
+    """
+    import pycolmap
+
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    with tempfile.TemporaryDirectory(prefix="drgs-pairs-") as folder:
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = Path(folder) / "pairs.txt"
+        for start in range(0, len(pairs), _PAIRS_A_STEP):
+            if progress:
+                progress("matching", start, len(pairs))
+            step = pairs[start : start + _PAIRS_A_STEP]
+            pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in step))
+            pycolmap.match_image_pairs(
+                database,
+                matching_options=options,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+    if progress:
+        progress("matching", len(pairs), len(pairs))
+
+
+def sequential_pairs(names: list[str], window: int) -> list[tuple[str, str]]:
+    """Each name with the ``window`` names after it, and with powers of two beyond, to bridge gaps."""
+    steps = set(range(1, window + 1)) | {2**k for k in range(16) if 2**k > window}
+    return [
+        (names[i], names[i + s])
+        for i in range(len(names))
+        for s in sorted(steps)
+        if i + s < len(names)
+    ]
+
+
+def nearby_pairs(centers: np.ndarray, axes: np.ndarray, neighbors: int) -> list[tuple[int, int]]:
+    """Pairs of posed cameras that are likely to see the same things.
+
+    Args:
+        centers: (V,3) camera centers.
+        axes: (V,3) unit viewing directions.
+        neighbors: partners of each camera; all pairs if there are no more cameras than that.
+
+    Returns:
+        index pairs (i, j), i < j.
+    """
+    count = len(centers)
+    if count <= neighbors + 1:
+        return list(itertools.combinations(range(count), 2))
+    distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
+    # One median distance counts as much as turning by 60 degrees; cameras back to back share nothing.
+    cost = distance / max(float(np.median(distance)), 1e-12) + 2.0 * (1.0 - axes @ axes.T)
+    np.fill_diagonal(cost, np.inf)
+    nearest = np.argsort(cost, axis=1, kind="stable")[:, :neighbors]
+    return sorted({(min(i, j), max(i, j)) for i in range(count) for j in nearest[i].tolist()})

@@ -1,0 +1,393 @@
+"""Initial points of a scene: the data set's own, from depth maps, triangulated, or random; and the scene extent."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.data.matching import extract, match, nearby_pairs, quiet
+from drgs.data.views import Dataset, View
+
+__all__ = ["initial_points", "read_point_ply", "scene_extent"]
+
+_EXTENT_MARGIN = 1.1
+_MIN_TRIANGULATED = 50
+_MAX_RANDOM = 20_000
+_NEIGHBORS = 20
+_FEATURE_SIZE = 1600
+_MASK_KEEP = 0.5
+_MAX_PLY_HEADER = 65536
+_PLY_BYTES = {
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+
+
+def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
+    """1.1 x the largest distance of a camera center to their mean (3DGS), in scene units.
+
+    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to it; 1.0 without points.
+
+    Args:
+        cameras: at least one.
+        points: (P,3) world points, used only in that case.
+    """
+    if not cameras:
+        raise ValueError(
+            "scene_extent: there must be at least one camera, got none; pass the training views' cameras"
+        )
+    centers = np.stack([camera.center for camera in cameras])
+    middle = centers.mean(axis=0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
+        return _EXTENT_MARGIN * spread
+    if points is not None and len(points):
+        return _EXTENT_MARGIN * float(np.median(np.linalg.norm(points - middle, axis=1)))
+    return 1.0
+
+
+def initial_points(
+    data: Dataset | list[View],
+    seed: int = 0,
+    max_points: int = 100_000,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Points to start Gaussians from, by the first way that works.
+
+    The data set's own points; back-projected depth maps; SIFT features triangulated with the given poses; random points
+    where the cameras look. Given a list of views, nothing but these views is read, as active runs need it.
+
+    Args:
+        data: a data set, or views (then there are no given points).
+        seed: of all random choices.
+        max_points: at most so many.
+        progress: called with (stage, done, total) while triangulating.
+
+    Returns:
+        points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
+    """
+    rng = np.random.default_rng(seed)
+    views = data.views if isinstance(data, Dataset) else list(data)
+    if not views:
+        raise ValueError(
+            "initial_points: there must be at least one view, got none; pass the training views"
+        )
+    if isinstance(data, Dataset) and data.points is not None and len(data.points):
+        colors = (
+            data.colors
+            if data.colors is not None
+            else np.full(data.points.shape, 0.5, dtype=np.float32)
+        )
+        keep = _subset(len(data.points), max_points, rng)
+        note = "" if len(keep) == len(data.points) else f", {len(keep)} kept"
+        return data.points[keep], colors[keep], f"{data.point_source}{note}"
+    if any(view.depth_path is not None for view in views):
+        points, colors = _from_depth(views, max_points, rng)
+        if len(points):
+            used = sum(view.depth_path is not None for view in views)
+            return points, colors, f"back-projected from {used} depth maps, {len(points)} points"
+    tried = ""
+    if len(views) >= 2 and all(view.image_path is not None for view in views):
+        points, colors = _triangulated(views, seed, progress)
+        if len(points) >= _MIN_TRIANGULATED:
+            keep = _subset(len(points), max_points, rng)
+            source = f"triangulated from {len(views)} given poses, {len(points)} points"
+            return points[keep], colors[keep], source
+        tried = f" (triangulation gave {len(points)})"
+    points, colors = _random(views, min(max_points, _MAX_RANDOM), rng)
+    return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
+
+
+def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P,3) float64 and colors (P,3) float32 of a PLY point cloud; gray where it has no colors.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no PLY with x, y, z, shorter than it claims, or not finite.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path"
+        )
+    import plyfile
+
+    try:
+        _check_ply_size(path)
+        vertex = plyfile.PlyData.read(str(path))["vertex"]
+        points = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
+        names = vertex.data.dtype.names
+        colors = np.full(points.shape, 0.5, dtype=np.float32)
+        if {"red", "green", "blue"} <= set(names):
+            raw = np.stack([vertex[channel] for channel in ("red", "green", "blue")], axis=-1)
+            whole = raw.dtype.kind in "iu"
+            colors = raw.astype(np.float32) / np.float32(np.iinfo(raw.dtype).max if whole else 1)
+    except (plyfile.PlyParseError, ValueError, KeyError, UnicodeDecodeError, EOFError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(
+            f"{path}: must be a PLY point cloud with x, y, z, got {text}; export it again"
+        ) from None
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"{path}: points must be finite, got NaN or Inf at index {bad[0]}; export it again"
+        )
+    return points, colors
+
+
+def _check_ply_size(path: Path) -> None:
+    """Compare the least size that a PLY header claims with the file's, before anything is allocated."""
+    with path.open("rb") as file:
+        head = file.read(_MAX_PLY_HEADER)
+    end = head.find(b"end_header")
+    if not head.startswith(b"ply") or end < 0:
+        raise ValueError("no PLY header")
+    least, count, text = 0, 0, False
+    for words in (line.split() for line in head[:end].decode("ascii").splitlines()):
+        if words[:1] == ["format"]:
+            text = words[1:2] == ["ascii"]
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
+            count = int(words[2])
+        elif words[:1] == ["property"] and len(words) >= 3:
+            # A list takes at least its length; a number in text at least a digit and a blank.
+            kind = words[2] if words[1] == "list" else words[1]
+            least += count * (2 if text else _PLY_BYTES.get(kind, 1))
+    held = path.stat().st_size - end - len(b"end_header\n")
+    if least > held + text:  # text may lack the last line break
+        raise ValueError(
+            f"a header that claims at least {least} bytes of data where the file holds {held}"
+        )
+
+
+def _subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of all, or of ``limit`` random ones in their order."""
+    return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))
+
+
+# ---------------------------------------------------------------------------------------------------------- depth
+
+
+def _from_depth(
+    views: list[View], limit: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Back-projected pixels, an even share a view, thinned by voxels to at most ``limit``."""
+    with_depth = [view for view in views if view.depth_path is not None]
+    # Views overlap: four times the wanted number leaves the voxels enough to choose from.
+    share = max(1, 4 * limit // len(with_depth))
+    points, colors = [], []
+    for view in with_depth:
+        depth, mask = view.depth(), view.mask()
+        valid = depth > 0 if mask is None else (depth > 0) & (mask > _MASK_KEEP)
+        pixels = np.flatnonzero(valid)
+        if not len(pixels):
+            continue
+        # A random phase on a regular step through the valid pixels: even, without the grid's moire between views.
+        step = max(1.0, len(pixels) / share)
+        chosen = pixels[
+            np.arange(rng.uniform(0, min(step, len(pixels))), len(pixels), step).astype(np.int64)
+        ]
+        points.append(_back_project(view.camera, chosen, depth.reshape(-1)[chosen]))
+        if view.image_path is None:
+            colors.append(np.full((len(chosen), 3), 0.5, dtype=np.float32))
+        else:
+            colors.append(view.image().reshape(-1, 3)[chosen])
+    if not points:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
+    return _thin(np.concatenate(points), np.concatenate(colors), limit, rng)
+
+
+def _back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """(P,3) world points of flat pixel indices (P,) of the undistorted image at z-depths (P,)."""
+    K = camera.K
+    y = (pixels // camera.width + 0.5 - K[1, 2]) / K[1, 1]
+    x = (pixels % camera.width + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    local = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[:, None].astype(np.float64)
+    c2w = camera.c2w
+    return local @ c2w[:3, :3].T + c2w[:3, 3]
+
+
+def _thin(
+    points: np.ndarray, colors: np.ndarray, limit: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``limit`` points: the means of voxels, whose side grows until few enough are left."""
+    if len(points) <= limit:
+        return points, colors
+    low = points.min(axis=0)
+    side = (
+        float((np.quantile(points, 0.95, axis=0) - np.quantile(points, 0.05, axis=0)).max()) / limit
+    )
+    while True:
+        cells = np.floor((points - low) / max(side, 1e-12)).astype(np.int64)
+        _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        if len(count) <= limit:
+            break
+        side *= max(1.05, (len(count) / limit) ** 0.5)
+    group = group.reshape(-1)
+    mean = lambda values: np.stack(  # noqa: E731 (used twice, here)
+        [np.bincount(group, weights=values[:, axis]) / count for axis in range(3)], axis=-1
+    )
+    return mean(points), mean(colors).astype(np.float32)
+
+
+# --------------------------------------------------------------------------------------------------- triangulation
+
+
+def _triangulated(
+    views: list[View], seed: int, progress: Callable[[str, int, int], None] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """SIFT features inside the masks, matched and triangulated with the given poses."""
+    import cv2
+    import pycolmap
+
+    with tempfile.TemporaryDirectory(prefix="drgs-points-") as folder, quiet():
+        base = Path(folder)
+        for name in ("images", "masks", "model"):
+            (base / name).mkdir()
+        names, cameras = [], []
+        masked = any(view.mask_path is not None or view.mask(1, 1) is not None for view in views)
+        for index, view in enumerate(views):
+            camera = view.camera.undistorted()
+            scale = min(1.0, _FEATURE_SIZE / max(camera.width, camera.height))
+            camera = camera.resized(
+                max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+            )
+            image, mask = (
+                view.image(camera.width, camera.height),
+                view.mask(camera.width, camera.height),
+            )
+            name = f"{index:06d}.png"
+            _write_png(base / "images" / name, np.round(image[..., ::-1] * 255).astype(np.uint8))
+            if masked:
+                # COLMAP skips images without a mask as soon as there is a mask folder, so that all get one.
+                mask = np.ones(image.shape[:2]) if mask is None else mask
+                # Features reach past their center; a few pixels of margin keep the outline itself out.
+                inside = cv2.erode((mask > _MASK_KEEP).astype(np.uint8), np.ones((5, 5), np.uint8))
+                _write_png(base / "masks" / f"{name}.png", inside * 255)
+            names.append(name)
+            cameras.append(camera)
+        database = base / "database.db"
+        extract(
+            database,
+            base / "images",
+            names,
+            camera_model="PINHOLE",
+            shared_camera=False,
+            masks=base / "masks" if masked else None,
+            progress=progress,
+        )
+        reconstruction = _posed_model(database, names, cameras)
+        centers = np.stack([camera.center for camera in cameras])
+        axes = np.stack([camera.c2w[:3, 2] for camera in cameras])
+        pairs = [(names[i], names[j]) for i, j in nearby_pairs(centers, axes, _NEIGHBORS)]
+        match(database, pairs, seed=seed, progress=progress)
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = seed
+        result = pycolmap.triangulate_points(
+            reconstruction, database, base / "images", base / "model", options=options
+        )
+        entries = [result.points3D[key] for key in sorted(result.point3D_ids())]
+    points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(
+        -1, 3
+    ) / np.float32(255)
+    keep = np.isfinite(points).all(axis=1)
+    return points[keep], colors[keep]
+
+
+def _posed_model(database: Path, names: list[str], cameras: list[Camera]) -> object:
+    """A reconstruction with the given poses, its numbers those of the database, whose intrinsics are set too."""
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as handle:
+        images = {image.name: image for image in handle.read_all_images()}
+        for name, camera in zip(names, cameras, strict=True):
+            image_id, camera_id = images[name].image_id, images[name].camera_id
+            K = camera.K
+            known = pycolmap.Camera(
+                model="PINHOLE",
+                width=camera.width,
+                height=camera.height,
+                params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+                camera_id=camera_id,
+            )
+            known.has_prior_focal_length = True
+            handle.update_camera(known)
+            reconstruction.add_camera_with_trivial_rig(known)
+            pose = np.linalg.inv(camera.c2w)
+            reconstruction.add_image_with_trivial_frame(
+                pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id),
+                pycolmap.Rigid3d(pose[:3]),
+            )
+    return reconstruction
+
+
+def _write_png(path: Path, data: np.ndarray) -> None:
+    import cv2
+
+    if not cv2.imwrite(str(path), data, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise OSError(
+            f"{path}: the temporary image must be writable, the write failed; free some disk space"
+        )
+
+
+# ----------------------------------------------------------------------------------------------------------- random
+
+
+def _random(
+    views: list[View], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points along random pixels' rays, kept where at least half as many cameras look as look at the best point."""
+    cameras = [view.camera.undistorted() for view in views]
+    distance = _focus_distance(cameras)
+    masks = [view.mask() if view.mask_path is not None else None for view in views]
+    drawn = 8 * count
+    points, colors = [], []
+    for index, camera in enumerate(cameras):
+        number = drawn // len(cameras) + (index < drawn % len(cameras))
+        size = camera.width * camera.height
+        allowed = (
+            np.arange(size) if masks[index] is None else np.flatnonzero(masks[index] > _MASK_KEEP)
+        )
+        if not len(allowed) or not number:
+            continue
+        pixels = rng.choice(allowed, number)
+        # Uniform in disparity between half and three times the distance: near things need more points.
+        depth = 1.0 / rng.uniform(1 / (3 * distance), 2 / distance, number)
+        points.append(_back_project(camera, pixels, depth))
+        view = views[index]
+        gray = np.full((number, 3), 0.5, dtype=np.float32)
+        colors.append(gray if view.image_path is None else view.image().reshape(-1, 3)[pixels])
+    if not points:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
+    points, colors = np.concatenate(points), np.concatenate(colors)
+    seen = np.zeros(len(points), dtype=np.int64)
+    for camera, mask in zip(cameras, masks, strict=True):
+        pixels, _ = camera.project(points)
+        inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        if mask is not None:
+            columns, rows = pixels[inside].astype(np.int64).T
+            inside[inside] = mask[rows, columns] > _MASK_KEEP
+        seen += inside
+    candidates = np.flatnonzero(2 * seen >= seen.max())
+    keep = candidates[_subset(len(candidates), count, rng)]
+    return points[keep], colors[keep]
+
+
+def _focus_distance(cameras: list[Camera]) -> float:
+    """How far the cameras look: to the point nearest to all optical axes, if it lies before them, else their extent."""
+    centers = np.stack([camera.center for camera in cameras])
+    axes = np.stack([camera.c2w[:3, 2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    # Parallel axes have no such point: the system is singular.
+    if len(cameras) > 1 and np.linalg.cond(total) < 1e3:
+        focus = np.linalg.solve(total, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+        depth = float(np.median(((focus - centers) * axes).sum(axis=1)))
+        if depth > 0:
+            return depth
+    return scene_extent(cameras) * (1.0 if len(cameras) == 1 else 3.0)

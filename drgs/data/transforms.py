@@ -1,0 +1,259 @@
+"""Nerfstudio, instant-ngp and Blender data sets: ``transforms.json`` or ``transforms_{train,val,test}.json``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.cameras import Camera, c2w_from_opengl, intrinsics
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, read_json
+from drgs.data.points import read_point_ply
+from drgs.data.views import Dataset, View, fit_to_image
+
+__all__ = ["find_transforms", "load_transforms"]
+
+_SPLITS = ("train", "val", "test")
+_LENSES = {
+    "PINHOLE": "pinhole",
+    "SIMPLE_PINHOLE": "pinhole",
+    "SIMPLE_RADIAL": "opencv",
+    "RADIAL": "opencv",
+    "OPENCV": "opencv",
+    "OPENCV_FISHEYE": "opencv_fisheye",
+}
+_MILLIMETER = 1e-3
+# Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
+_ROUNDING = 1e-2
+
+
+def find_transforms(path: Path) -> list[Path]:
+    """The transforms files of a data set: one, or one a split; empty if there are none."""
+    if path.is_file():
+        return [path]
+    if (path / "transforms.json").is_file():
+        return [path / "transforms.json"]
+    return [file for split in _SPLITS if (file := path / f"transforms_{split}.json").is_file()]
+
+
+def load_transforms(
+    path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Dataset:
+    """Load a ``transforms.json`` data set (OpenGL camera axes).
+
+    Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
+    camera_model and k1, k2, k3, k4, p1, p2. Frames may name ``mask_path`` and ``depth_file_path`` (z-depth; unit from
+    ``depth_unit_scale_factor``, else millimeters for images and scene units for ``.npy``).
+
+    Args:
+        path: the folder, or one JSON file.
+        background: color that images with alpha are composited on.
+
+    Raises:
+        FileNotFoundError: no such file, or an image, mask or depth map that it names is missing.
+        ValueError: broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
+    """
+    files = find_transforms(path)
+    if not files:
+        raise FileNotFoundError(
+            f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
+        )
+    views: list[View] = []
+    points = colors = None
+    source = ""
+    for file in files:
+        data = read_json(file)
+        frames = data.get("frames") if isinstance(data, dict) else None
+        if not isinstance(frames, list) or not frames:
+            raise ValueError(
+                f"{file}: must be an object with a list `frames` of at least one frame; check the file"
+            )
+        named = _named_splits(data)
+        sizes: dict[tuple[int, int], int] = {}
+        for index, frame in enumerate(frames):
+            where = f"{file}: frame {index}"
+            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+                raise ValueError(f"{where}: must be an object with a file_path, got none; add it")
+            view, own = _view(file.parent, where, data, frame, background)
+            if not own:
+                sizes.setdefault((view.camera.width, view.camera.height), index)
+            view.split = named.get(
+                frame["file_path"], file.stem.removeprefix("transforms").lstrip("_")
+            )
+            if view.split not in _SPLITS:
+                view.split = ""
+            views.append(view)
+        if len(sizes) > 1:
+            (first, i), (second, j) = list(sizes.items())[:2]
+            raise ValueError(
+                f"{file}: images must have one size unless every frame has its own intrinsics, got "
+                f"{first[0]}x{first[1]} at frame {i} and {second[0]}x{second[1]} at frame {j}; write fl_x, w, h a frame"
+            )
+        if points is None and isinstance(data.get("ply_file_path"), str):
+            ply = file.parent / data["ply_file_path"]
+            points, colors = read_point_ply(ply)
+            source = f"{ply.name}, {len(points)} points"
+    _make_unique(views)
+    return Dataset(path, "transforms", views, points, colors, source)
+
+
+def _view(
+    folder: Path, where: str, data: dict, frame: dict, background: tuple[float, float, float]
+) -> tuple[View, bool]:
+    """One view, and whether its frame carries its own intrinsics."""
+    image = _image_file(folder, frame["file_path"])
+    if image is None:
+        raise FileNotFoundError(
+            f"{where}: the image {folder / frame['file_path']} must exist, found none; restore it or drop the frame"
+        )
+    own = any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
+    merged = {**{key: value for key, value in data.items() if key != "frames"}, **frame}
+    camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), image)
+    depth = _optional_file(folder, where, frame, "depth_file_path")
+    unit = 1.0 if depth is not None and depth.suffix == ".npy" else _MILLIMETER
+    name = Path(frame["file_path"])
+    if name.suffix.lower() in IMAGE_SUFFIXES:
+        name = name.with_suffix("")
+    parts = [part for part in name.parts if part not in (".", "..", "/")]
+    view = View(
+        camera=fit_to_image(camera, image, where),
+        name="/".join(parts[1:] if len(parts) > 1 and parts[0] == "images" else parts),
+        image_path=image,
+        mask_path=_optional_file(folder, where, frame, "mask_path"),
+        depth_path=depth,
+        depth_scale=_number(where, merged, "depth_unit_scale_factor", unit),
+        background=background,
+    )
+    return view, own
+
+
+def _camera(where: str, values: dict, w2c: np.ndarray, image: Path) -> Camera:
+    if "w" in values and "h" in values:
+        width, height = _number(where, values, "w"), _number(where, values, "h")
+    else:
+        width, height = image_size(image)
+    if "fl_x" in values:
+        fx = _number(where, values, "fl_x")
+        fy = _number(where, values, "fl_y", fx)
+    elif "camera_angle_x" in values:
+        fx = _focal(where, values, "camera_angle_x", width)
+        fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
+    else:
+        raise ValueError(
+            f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; add one"
+        )
+    K = intrinsics(
+        fx, fy, _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
+    )
+    kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if kind not in _LENSES:
+        raise ValueError(
+            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort the images"
+        )
+    k1, k2, k3, k4, p1, p2 = (
+        _number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
+    )
+    model, distortion = _LENSES[kind], ()
+    if model == "opencv_fisheye":
+        distortion = (k1, k2, k3, k4)
+    elif model == "opencv":
+        if k4:
+            raise ValueError(
+                f"{where}: OPENCV takes k1, k2, k3, p1, p2, got k4 = {k4:g}; undistort the images"
+            )
+        distortion = (k1, k2, p1, p2, k3)
+        if not any(distortion):
+            model, distortion = "pinhole", ()
+    try:
+        return Camera(K=K, w2c=w2c, width=width, height=height, model=model, distortion=distortion)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _pose(where: str, matrix: Any) -> np.ndarray:
+    """(4,4) OpenCV w2c from a frame's transform_matrix, (3,4) or (4,4)."""
+    try:
+        c2w = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        c2w = np.empty(0)
+    if c2w.shape not in ((4, 4), (3, 4)):
+        raise ValueError(
+            f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct it"
+        )
+    if not np.isfinite(c2w).all():
+        raise ValueError(
+            f"{where}: transform_matrix must be finite, got NaN or Inf; drop this frame"
+        )
+    pose = np.eye(4)
+    pose[:3] = c2w[:3]
+    pose = c2w_from_opengl(pose)
+    if (
+        np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < _ROUNDING
+        and np.linalg.det(pose[:3, :3]) > 0
+    ):
+        u, _, vt = np.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = u @ vt
+    # The transpose stands for the inverse: Camera then reports whatever is no rotation.
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    return w2c
+
+
+def _focal(where: str, values: dict, key: str, size: float) -> float:
+    angle = _number(where, values, key)
+    if not 0.0 < angle < math.pi:
+        raise ValueError(
+            f"{where}: {key} must lie between 0 and pi radians, got {angle:g}; correct it"
+        )
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+def _number(where: str, values: dict, key: str, default: float | None = None) -> float:
+    value = values.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"{where}: {key} must be a finite number, got {value!r}; correct it")
+    return value
+
+
+def _image_file(folder: Path, name: str) -> Path | None:
+    """The image that a file_path names; Blender leaves the suffix out."""
+    path = folder / name
+    if path.is_file():
+        return path
+    for suffix in (*IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
+        candidate = path.with_name(path.name + suffix)
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def _optional_file(folder: Path, where: str, frame: dict, key: str) -> Path | None:
+    if not isinstance(frame.get(key), str):
+        return None
+    path = folder / frame[key]
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{where}: {key} names {path}, found no such file; restore it or remove the key"
+        )
+    return path
+
+
+def _named_splits(data: dict) -> dict[str, str]:
+    """file_path -> split, from Nerfstudio's train_filenames, val_filenames, test_filenames."""
+    named = {}
+    for split in _SPLITS:
+        names = data.get(f"{split}_filenames")
+        if isinstance(names, list):
+            named.update({name: split for name in names if isinstance(name, str)})
+    return named
+
+
+def _make_unique(views: list[View]) -> None:
+    """Names become file names of renders: a repeated one gets its number."""
+    seen: dict[str, int] = {}
+    for view in views:
+        count = seen[view.name] = seen.get(view.name, 0) + 1
+        if count > 1:
+            view.name = f"{view.name}_{count}"

@@ -1,0 +1,285 @@
+"""Views and data sets: cameras with images, masks and depth maps that are read when asked for."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.data.checks import image_size, read_image, read_npy
+
+__all__ = ["Dataset", "View", "fit_to_image"]
+
+_ASPECT_TOLERANCE = 0.01
+# An undistorted border pixel may look this many pixels past the photo before it counts as unseen.
+_BORDER = 1.0
+
+
+@dataclass
+class View:
+    """One photograph: its camera and where its files are. Nothing is decoded before a method asks.
+
+    Attributes:
+        camera: the camera as calibrated, of the size of the image file, lens included.
+        name: unique in the data set; the image's path below the image folder without its suffix.
+        image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0 is unknown.
+        depth_scale: scene units in one unit of the depth file.
+        background: color in [0,1] that images with an alpha channel are composited on.
+        split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
+    """
+
+    camera: Camera
+    name: str
+    image_path: Path | None = None
+    mask_path: Path | None = None
+    depth_path: Path | None = None
+    depth_scale: float = 1.0
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    split: str = ""
+
+    def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
+        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted, area-resized.
+
+        The result belongs to ``camera.undistorted().resized(width, height)``.
+
+        Args:
+            width, height: pixels; the camera's own size if left out.
+
+        Raises:
+            FileNotFoundError, ValueError: the file is missing, no image, or not of the camera's size.
+        """
+        import cv2
+
+        if self.image_path is None:
+            raise ValueError(f"view {self.name!r}: must have an image, has none; drop this view")
+        data = _unit_range(read_image(self.image_path), self.image_path)
+        self._check_size(data, self.image_path)
+        if data.ndim == 2:
+            data = np.repeat(data[..., None], 3, axis=2)
+        if data.shape[2] == 4:
+            alpha = data[..., 3:]
+            data = data[..., :3] * alpha + (1 - alpha) * np.asarray(
+                self.background, dtype=np.float32
+            )
+        if self.camera.is_distorted:
+            columns, rows, _ = _lens_maps(self.camera)
+            data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
+        return _resize_area(data, *self._size(width, height))
+
+    def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
+        """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.
+
+        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask file.
+        """
+        if self.mask_path is None and not (
+            self.camera.is_distorted and _lens_maps(self.camera)[2] is not None
+        ):
+            return None
+        if self.mask_path is None:
+            data = np.ones((self.camera.height, self.camera.width), dtype=np.float32)
+        else:
+            raw = read_image(self.mask_path)
+            if raw.ndim == 3:
+                raw = raw[..., 3] if raw.shape[2] == 4 else raw[..., 0]
+            # Masks stored as 0 and 1 in 8 bits would otherwise be nearly black.
+            data = raw.astype(np.float32) if raw.max() <= 1 else _unit_range(raw, self.mask_path)
+            data = self._nearest(data, self.mask_path)
+        if self.camera.is_distorted:
+            unseen = _lens_maps(self.camera)[2]
+            if unseen is not None:
+                data = np.where(unseen, np.float32(0), data)
+        return _resize_area(data, *self._size(width, height))
+
+    def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
+        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map."""
+        import cv2
+
+        if self.depth_path is None:
+            return None
+        raw = (
+            read_npy(self.depth_path)
+            if self.depth_path.suffix == ".npy"
+            else read_image(self.depth_path)
+        )
+        if raw.ndim == 3 and raw.shape[2] == 1:
+            raw = raw[..., 0]
+        if raw.ndim != 2:
+            raise ValueError(
+                f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; convert it"
+            )
+        data = raw.astype(np.float32) * np.float32(self.depth_scale)
+        data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
+        data = self._nearest(data, self.depth_path)
+        if self.camera.is_distorted and _lens_maps(self.camera)[2] is not None:
+            data = np.where(_lens_maps(self.camera)[2], np.float32(0), data)
+        # Averaging depths across an edge, or with unknown zeros, would invent surfaces.
+        return cv2.resize(data, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+    def _size(self, width: int | None, height: int | None) -> tuple[int, int]:
+        return width or self.camera.width, height or self.camera.height
+
+    def _check_size(self, data: np.ndarray, path: Path) -> None:
+        height, width = data.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise ValueError(
+                f"{path}: must be {self.camera.width}x{self.camera.height} pixels as its camera, "
+                f"got {width}x{height}; load the data set again"
+            )
+
+    def _nearest(self, data: np.ndarray, path: Path) -> np.ndarray:
+        """A mask or depth map at the camera's size and undistorted, without mixing pixels."""
+        import cv2
+
+        height, width = data.shape
+        if abs(width * self.camera.height / (height * self.camera.width) - 1) > _ASPECT_TOLERANCE:
+            raise ValueError(
+                f"{path}: must have the shape of its image ({self.camera.width}x{self.camera.height}), "
+                f"got {width}x{height}; export it again"
+            )
+        size = (self.camera.width, self.camera.height)
+        if (width, height) != size:
+            data = cv2.resize(data, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        if self.camera.is_distorted:
+            columns, rows, _ = _lens_maps(self.camera)
+            data = cv2.remap(
+                data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+            )
+        return data
+
+
+@dataclass
+class Dataset:
+    """Views of one scene and, where the data set has them, its points.
+
+    Attributes:
+        path: what was loaded.
+        format: ``colmap``, ``transforms`` or ``llff``.
+        views: in the order of the data set.
+        points: (P,3) float64 world points, or None.
+        colors: (P,3) float32 in [0,1], or None.
+        point_source: where the points come from, one line, empty without points.
+        test_every: every how many views one is held out.
+    """
+
+    path: Path
+    format: str
+    views: list[View]
+    points: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    point_source: str = ""
+    test_every: int = 8
+
+    def split(self, test_every: int | None = None) -> tuple[list[View], list[View]]:
+        """(train, test) views, both sorted by name, by the rule that `split_rule` names.
+
+        Args:
+            test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
+        """
+        views = sorted(self.views, key=lambda view: view.name)
+        if any(view.split for view in views):
+            held_out = "test" if any(view.split == "test" for view in views) else "val"
+            train = [view for view in views if view.split not in ("val", "test")]
+            return train, [view for view in views if view.split == held_out]
+        every = self._every(test_every)
+        if every == 0:
+            return views, []
+        train = [view for index, view in enumerate(views) if index % every != 0]
+        return train, views[::every]
+
+    def split_rule(self, test_every: int | None = None) -> str:
+        """The rule of `split` in words, to be recorded with results."""
+        if any(view.split for view in self.views):
+            return "as the data set's files say"
+        every = self._every(test_every)
+        if every == 0:
+            return "no view held out"
+        return f"views sorted by name, index % {every} == 0 held out"
+
+    def _every(self, test_every: int | None) -> int:
+        every = self.test_every if test_every is None else test_every
+        if every < 0 or every == 1:
+            raise ValueError(f"split: test_every must be 0 (none) or >= 2, got {every}; correct it")
+        return 0 if len(self.views) < 2 else every
+
+
+def fit_to_image(camera: Camera, path: Path, where: str) -> Camera:
+    """The camera at the size of its image file, from the file's header.
+
+    Data sets are often downscaled after calibration, so K is scaled when the shapes agree to 1 %.
+
+    Raises:
+        FileNotFoundError: no such image.
+        ValueError: not an image, or another shape.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{where}: the image {path} must exist, found none; restore it or drop the view"
+        )
+    width, height = image_size(path)
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
+        raise ValueError(
+            f"{where}: the image {path} must have the shape of its camera ({camera.width}x{camera.height}), "
+            f"got {width}x{height}; give this view its own intrinsics"
+        )
+    return camera.resized(width, height)
+
+
+def _unit_range(data: np.ndarray, path: Path) -> np.ndarray:
+    """Image data as float32 in [0,1], by its bit depth."""
+    if data.dtype == np.uint8:
+        return data.astype(np.float32) / np.float32(255)
+    if data.dtype == np.uint16:
+        return data.astype(np.float32) / np.float32(65535)
+    if data.dtype.kind == "f":
+        return np.clip(data.astype(np.float32), 0.0, 1.0)
+    raise ValueError(
+        f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it"
+    )
+
+
+def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
+    import cv2
+
+    if data.shape[1::-1] == (width, height):
+        return np.ascontiguousarray(data)
+    shrinks = width <= data.shape[1] and height <= data.shape[0]
+    return cv2.resize(
+        data, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
+
+
+def _lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the photo did not see."""
+    return _cached_lens_maps(
+        camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def _cached_lens_maps(
+    K: bytes, width: int, height: int, model: str, distortion: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    matrix = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
+    lens = Camera(
+        K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion
+    )
+    rays = lens.undistorted().pixel_directions().reshape(-1, 3)
+    pixels = lens.project(rays)[0].reshape(height, width, 2)
+    x, y = pixels[..., 0], pixels[..., 1]
+    unseen = ~((x > -_BORDER) & (x < width + _BORDER) & (y > -_BORDER) & (y < height + _BORDER))
+    # Past the radius where the lens polynomial turns back, rays land on pixels that show something else.
+    radius = np.hypot(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]).reshape(height, width)
+    probe = np.linspace(0.0, radius.max(), 1024)
+    spread = lens.project(np.stack([probe, np.zeros(1024), np.ones(1024)], axis=-1))[0][:, 0]
+    folds = np.flatnonzero(np.diff(spread) <= 0)
+    if len(folds):
+        unseen |= radius > probe[folds[0]]
+    # OpenCV counts pixel centers at integers.
+    table = (pixels - 0.5).astype(np.float32)
+    return table[..., 0].copy(), table[..., 1].copy(), unseen if unseen.any() else None

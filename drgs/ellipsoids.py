@@ -1,0 +1,200 @@
+"""Gaussians: their parameters, activations, validation, and the Mitsuba shape that bounds them.
+
+A Gaussian i has mean mu (3), quaternion q (wxyz, any length but 0), log-scale (3), logit-opacity (1), SH coefficients
+(K, 3) with K = (degree + 1)^2, and optionally features (D). What is stored is what is optimized and differentiated:
+the raw parameters. World frame and world units throughout; means are relative to `origin` (float64), so that a world
+far from zero keeps its detail in float32.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+import torch
+
+__all__ = ["Gaussians", "ellipsoids_shape", "sh_degree_of"]
+
+_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
+# float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
+_FAR_RATIO = 1e5
+
+
+def sh_degree_of(coefficients: int) -> int:
+    """Degree 0..3 of `coefficients` = (degree + 1)^2; anything else raises ValueError."""
+    degree = math.isqrt(coefficients) - 1
+    if degree not in (0, 1, 2, 3) or (degree + 1) ** 2 != coefficients:
+        raise ValueError(
+            f"Gaussians: sh must have 1, 4, 9 or 16 coefficients (degree 0..3), got {coefficients}"
+        )
+    return degree
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians as raw parameters (torch tensors on any device; autograd graphs are kept).
+
+    Attributes:
+        means: (N, 3) float32 or float64, relative to `origin`.
+        quats: (N, 4) wxyz, unnormalized; q and s q (s != 0) are the same rotation.
+        log_scales: (N, 3) natural logarithm of the standard deviations along the local axes.
+        logit_opacities: (N,) logit of the opacity.
+        sh: (N, K, 3), K in {1, 4, 9, 16}; color = max(0.5 + sum_k sh_k Y_k(direction), 0).
+        features: (N, D) or None, composited with the weights of the color.
+        origin: (3,) float64, added to the means.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    log_scales: torch.Tensor
+    logit_opacities: torch.Tensor
+    sh: torch.Tensor
+    features: torch.Tensor | None = None
+    origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self):
+        n = len(self.means)
+        want = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        for name, shape in want.items():
+            _check_shape(name, getattr(self, name), shape, n)
+        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3:
+            _check_shape("sh", self.sh, (n, "K", 3), n)
+        sh_degree_of(self.sh.shape[1])
+        if self.features is not None and (self.features.ndim != 2 or len(self.features) != n):
+            _check_shape("features", self.features, (n, "D"), n)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @classmethod
+    def from_arrays(cls, means, quats, scales, opacities, sh, features=None, origin=None) -> Gaussians:
+        """Gaussians from the usual linear arrays.
+
+        Args:
+            means: (N, 3). float64 keeps its precision; float32 input far from 0 is warned about.
+            quats: (N, 4) wxyz.
+            scales: (N, 3) standard deviations, > 0.
+            opacities: (N,) in (0, 1).
+            sh: (N, K, 3), or (N, 3) for degree 0.
+            features: (N, D) or None.
+            origin: (3,) float64 that the means are relative to, or None for 0.
+        Raises:
+            ValueError: If a shape is wrong or a value is not finite or out of range (the first index is named).
+        Gradients:
+            Reach the tensors passed in: scales and opacities through their logarithm and logit.
+        """
+        means, quats, scales, opacities, sh = (
+            _tensor(name, x)
+            for name, x in zip(
+                ("means", "quats", "scales", "opacities", "sh"),
+                (means, quats, scales, opacities, sh),
+                strict=True,
+            )
+        )
+        if sh.ndim == 2:
+            sh = sh[:, None, :]
+        if opacities.ndim == 2 and opacities.shape[1] == 1:
+            opacities = opacities[:, 0]
+        _check_range("scales", scales, 0.0, math.inf, "log_scales are stored: scales must be linear and > 0")
+        _check_range("opacities", opacities, 0.0, 1.0, "logits are stored: clamp to (0, 1)")
+        made = cls(
+            means,
+            quats,
+            torch.log(scales),
+            torch.log(opacities) - torch.log1p(-opacities),
+            sh,
+            None if features is None else _tensor("features", features),
+            np.zeros(3) if origin is None else np.asarray(origin, np.float64).reshape(3),
+        )
+        made.validate("Gaussians.from_arrays")
+        if means.dtype == torch.float32 and len(made):
+            with torch.no_grad():
+                ratio = (means.abs().amax(1) / scales.amin(1)).max()
+            if ratio > _FAR_RATIO:
+                warnings.warn(
+                    f"Gaussians.from_arrays: float32 means are up to {float(ratio):.1g} standard deviations from 0, "
+                    "their detail is rounded away: pass float64 means, they are re-centered for each view",
+                    stacklevel=2,
+                )
+        return made
+
+    @property
+    def sh_degree(self) -> int:
+        return sh_degree_of(self.sh.shape[1])
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """(N, 3) standard deviations."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """(N,) in (0, 1)."""
+        return torch.sigmoid(self.logit_opacities)
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The raw parameter tensors by group name; `features` only when there are any."""
+        return {name: x for name in _FIELDS if (x := getattr(self, name)) is not None}
+
+    def replace(self, **fields) -> Gaussians:
+        """A copy with the given fields replaced."""
+        return dataclasses.replace(self, **fields)
+
+    def detach(self) -> Gaussians:
+        """The same values without an autograd graph."""
+        return self.replace(**{name: x.detach() for name, x in self.parameters().items()})
+
+    def take(self, index) -> Gaussians:
+        """The Gaussians at `index` (anything that indexes a tensor), in that order."""
+        return self.replace(**{name: x[index] for name, x in self.parameters().items()})
+
+    def validate(self, where: str) -> None:
+        """Raise ValueError, naming the first index, if a parameter is NaN or infinite or a quaternion is 0."""
+        with torch.no_grad():
+            for name, x in self.parameters().items():
+                # One reduction decides; the index is looked for only when there is something to report.
+                if x.numel() and not math.isfinite(float(x.abs().sum(dtype=torch.float64))):
+                    bad = ~torch.isfinite(x).reshape(len(x), -1).all(1)
+                    if bool(bad.any()):
+                        i = int(bad.nonzero()[0, 0])
+                        raise ValueError(
+                            f"{where}: {name} must be finite, got {x[i].reshape(-1)[:4].tolist()} at index {i} "
+                            f"({int(bad.sum())} of {len(x)}); drop or repair these Gaussians"
+                        )
+            zero = self.quats.abs().amax(1) == 0 if len(self) else None
+            if zero is not None and bool(zero.any()):
+                i = int(zero.nonzero()[0, 0])
+                raise ValueError(
+                    f"{where}: quats must not be 0, got {self.quats[i].tolist()} at index {i}; use (1, 0, 0, 0)"
+                )
+
+
+def _tensor(name: str, x) -> torch.Tensor:
+    if isinstance(x, torch.Tensor):
+        return x if x.is_floating_point() else x.to(torch.float32)
+    array = np.asarray(x)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"Gaussians.from_arrays: {name} must be numeric, got dtype {array.dtype}")
+    dtype = np.float64 if array.dtype == np.float64 and name == "means" else np.float32
+    return torch.from_numpy(np.ascontiguousarray(array, dtype))
+
+
+def _check_shape(name: str, x, shape: tuple, n: int):
+    if tuple(x.shape) != shape:
+        want = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(
+            f"Gaussians: {name} must have shape {want} with N = {n} from means, got {tuple(x.shape)}"
+        )
+
+
+def _check_range(name: str, x: torch.Tensor, low: float, high: float, hint: str):
+    with torch.no_grad():
+        bad = ~((x > low) & (x < high)) if x.numel() else None
+        if bad is not None and bool(bad.any()):
+            i = int(bad.reshape(len(x), -1).any(1).nonzero()[0, 0])
+            raise ValueError(
+                f"Gaussians.from_arrays: {name} must be in ({low:g}, {high:g}), got "
+                f"{x[i].reshape(-1).tolist()} at index {i}; {hint}"
+            )

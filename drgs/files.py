@@ -1,0 +1,374 @@
+"""Files: 3DGS `point_cloud.ply`, safetensors checkpoints, and run folders; every file is written atomically.
+
+Headers are not believed: what they claim is compared with the size of the file before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import json
+import logging
+import os
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+    from drgs.ellipsoids import Gaussians
+
+__all__ = [
+    "SCHEMA",
+    "Run",
+    "atomic_write",
+    "load_ply",
+    "load_state",
+    "save_ply",
+    "save_state",
+    "write_json",
+]
+
+SCHEMA = 1
+"""Version of config.json, log.jsonl, metrics.json and state.safetensors; raised when a reader must change."""
+
+_log = logging.getLogger(__name__)
+
+_SIZES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+_MAX_HEADER = 1 << 16
+_NORMALS = ("nx", "ny", "nz")
+
+
+def load_ply(path: str | os.PathLike) -> Gaussians:
+    """Gaussians from a 3DGS PLY; columns are found by name, in any order.
+
+    Args:
+        path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24 or 45 of them, channel by channel),
+            opacity (logit), scale_0..2 (log) and rot_0..3 (wxyz). Normals may be missing. Any other column is left
+            out with a warning in the log.
+    Returns:
+        float32 `Gaussians` with the file's bits.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no PLY, shorter than its header claims, of another layout, or holds values that are not
+            finite (the first index is named).
+    """
+    import plyfile
+    import torch
+
+    from drgs.ellipsoids import Gaussians
+
+    path = Path(path)
+    names = _check_ply(path)
+    rest = _rest_columns(path, names)
+    columns = {
+        "means": ("x", "y", "z"),
+        "quats": tuple(f"rot_{i}" for i in range(4)),
+        "log_scales": tuple(f"scale_{i}" for i in range(3)),
+        "logit_opacities": ("opacity",),
+        "dc": tuple(f"f_dc_{i}" for i in range(3)),
+    }
+    missing = [name for group in columns.values() for name in group if name not in names]
+    if missing:
+        raise ValueError(
+            f"{path}: a 3DGS PLY must have the vertex columns x y z f_dc_* opacity scale_* rot_*, "
+            f"{', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''} missing; "
+            f"{_layout_hint(names)}"
+        )
+    known = {name for group in columns.values() for name in group} | set(rest) | set(_NORMALS)
+    extra = [name for name in names if name not in known]
+    if extra:
+        shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
+        _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
+    try:
+        vertex = plyfile.PlyData.read(str(path))["vertex"].data
+    except (plyfile.PlyParseError, ValueError, OSError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
+
+    def read(group: tuple[str, ...]) -> torch.Tensor:
+        out = np.empty((len(vertex), len(group)), np.float32)
+        for i, name in enumerate(group):
+            out[:, i] = vertex[name]
+        return torch.from_numpy(out)
+
+    arrays = {field: read(group) for field, group in columns.items()}
+    sh = arrays.pop("dc")[:, None, :]
+    if rest:
+        higher = read(rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)
+        sh = torch.cat([sh, higher], dim=1)
+    arrays["logit_opacities"] = arrays["logit_opacities"][:, 0]
+    made = Gaussians(**arrays, sh=sh.contiguous())
+    made.validate(str(path))
+    return made
+
+
+def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
+    """Write Gaussians as INRIA's trainer does: binary little-endian float32, normals 0, the same order of columns.
+
+    `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32; features have no
+    place in this layout and are left out with a warning in the log.
+
+    Raises:
+        ValueError: If a parameter is not finite (the first index is named).
+    """
+    import plyfile
+
+    g.validate("save_ply")
+    if g.features is not None:
+        _log.warning("%s: the 3DGS layout has no columns for features, they are left out", path)
+    fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
+    means = fields["means"]
+    if np.any(g.origin):
+        means = means.astype(np.float64) + g.origin
+    rest = fields["sh"][:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (g.sh.shape[1] - 1))  # channel by channel
+    columns = {
+        **{name: means[:, i] for i, name in enumerate("xyz")},
+        **dict.fromkeys(_NORMALS, np.float32(0)),
+        **{f"f_dc_{i}": fields["sh"][:, 0, i] for i in range(3)},
+        **{f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])},
+        "opacity": fields["logit_opacities"],
+        **{f"scale_{i}": fields["log_scales"][:, i] for i in range(3)},
+        **{f"rot_{i}": fields["quats"][:, i] for i in range(4)},
+    }
+    vertex = np.empty(len(g), [(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        vertex[name] = values
+    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")], byte_order="<")
+    with atomic_write(path) as file:
+        ply.write(file)
+
+
+def _check_ply(path: Path) -> list[str]:
+    """Columns of the vertex element, once the file is known to be as long as its header claims."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a PLY file, found none; check the path")
+    with path.open("rb") as file:
+        head = file.read(_MAX_HEADER)
+    end = head.find(b"end_header")
+    newline = head.find(b"\n", end)
+    if not head.startswith((b"ply\n", b"ply\r")) or end < 0 or newline < 0:
+        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; convert it to a 3DGS PLY")
+    elements: list[tuple[str, int, list[str], int]] = []
+    text_format = None
+    for line in head[:end].decode("ascii", "replace").splitlines():
+        match line.split():
+            case ["format", kind, _]:
+                text_format = kind
+            case ["element", name, count] if count.isdecimal():
+                elements.append((name, int(count), [], 0))
+            case ["property", kind, name] if elements and kind in _SIZES:
+                element, count, names, size = elements[-1]
+                elements[-1] = element, count, [*names, name], size + _SIZES[kind]
+            case ["property", "list", kind, _, name] if elements and kind in _SIZES:
+                element, count, names, size = elements[-1]
+                elements[-1] = element, count, [*names, name], size + _SIZES[kind]
+            case ["ply"] | ["comment", *_] | ["obj_info", *_] | []:
+                pass
+            case _:
+                raise ValueError(f"{path}: PLY header must be well-formed, got {line[:60]!r}; export it again")
+    # At least one digit and one separator a value where numbers are text.
+    claimed = sum(n * (2 * len(names) if text_format == "ascii" else size) for _, n, names, size in elements)
+    held = path.stat().st_size - newline - 1
+    if claimed > held + (text_format == "ascii"):
+        counts = ", ".join(f"{n} {name}" for name, n, _, _ in elements)
+        raise ValueError(
+            f"{path}: the header claims {counts} ({claimed} bytes), the file holds {held} bytes; "
+            "it is truncated or damaged, copy it again"
+        )
+    vertex = next((names for name, _, names, _ in elements if name == "vertex"), None)
+    if vertex is None:
+        raise ValueError(f"{path}: a 3DGS PLY must have an element `vertex`, found none; export it again")
+    return vertex
+
+
+def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:
+    count = sum(name.startswith("f_rest_") for name in names)
+    rest = tuple(f"f_rest_{i}" for i in range(count))
+    if count not in (0, 9, 24, 45) or not set(rest) <= set(names):
+        raise ValueError(
+            f"{path}: must have 0, 9, 24 or 45 columns f_rest_0, f_rest_1, ... (SH degree 0 to 3), got {count}; "
+            "export it again"
+        )
+    return rest
+
+
+def _layout_hint(names: list[str]) -> str:
+    if any(name.startswith("packed_") for name in names):
+        return "this is PlayCanvas' compressed layout, decompress it to a 3DGS PLY"
+    if {"red", "green", "blue"} & set(names):
+        return "this is a plain point cloud, fit Gaussians with `drgs fit`"
+    return "export it as a 3DGS point_cloud.ply"
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """A binary file that appears under its name only once it is complete; missing folders are made.
+
+    A process that dies leaves the old file, or none, and at most a hidden `.NAME.*.tmp` beside it.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        umask = os.umask(0)  # mkstemp makes private files; what we write is to be shared as any other
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def write_json(path: str | os.PathLike, value: Any) -> None:
+    """Write JSON atomically, with settings dataclasses as objects and paths as text; NaN is refused."""
+    text = json.dumps(value, indent=2, default=_jsonable, allow_nan=False)
+    with atomic_write(path) as file:
+        file.write(text.encode() + b"\n")
+
+
+def _jsonable(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"no JSON form of {type(value).__name__}")
+
+
+def save_state(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict) -> None:
+    """Write a checkpoint: tensors, and a JSON header to which the schema version is added."""
+    from safetensors.torch import save
+
+    metadata = {"drgs": json.dumps({"schema": SCHEMA, **header}, default=_jsonable)}
+    data = save({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, metadata)
+    with atomic_write(path) as file:
+        file.write(data)
+
+
+def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
+    """The tensors and header of `save_state`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no checkpoint, damaged, or of another schema version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a checkpoint, found none; start without --resume")
+    try:
+        with safe_open(str(path), "pt") as file:
+            header = json.loads((file.metadata() or {}).get("drgs", "{}"))
+            if header.get("schema") != SCHEMA:
+                raise ValueError(
+                    f"{path}: checkpoint schema must be {SCHEMA}, got {header.get('schema')}; fit again"
+                )
+            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
+    except (SafetensorError, json.JSONDecodeError, struct.error) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path}: must be a checkpoint, got {text}; start without --resume") from None
+
+
+class Run:
+    """A run folder: `config.json`, `env.json`, `log.jsonl`, `metrics.json`, the checkpoint, the PLY and `renders/`.
+
+    Attributes:
+        path: The folder; made by `start`.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+
+    @property
+    def state(self) -> Path:
+        """The checkpoint."""
+        return self.path / "state.safetensors"
+
+    @property
+    def point_cloud(self) -> Path:
+        """The Gaussians, as a 3DGS PLY."""
+        return self.path / "point_cloud.ply"
+
+    @property
+    def renders(self) -> Path:
+        """Folder of pictures."""
+        return self.path / "renders"
+
+    def start(self, config: dict, resume: bool = False) -> None:
+        """Record what will be done, and by what (`env.json`).
+
+        Args:
+            config: Everything that determines the run; JSON-serializable.
+            resume: Continue in a folder that holds a run.
+        Raises:
+            ValueError: If the folder holds a run and `resume` is False.
+        """
+        from drgs import runtime
+
+        if not resume and (self.path / "config.json").exists():
+            raise ValueError(
+                f"{self.path}: must be a new run folder, holds a run already; add --resume or choose another"
+            )
+        if self.path.exists() and not self.path.is_dir():
+            raise ValueError(f"{self.path}: must be a folder, is a file; choose another")
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._drop_partial_line()
+        write_json(self.path / "config.json", {"schema": SCHEMA, **config})
+        write_json(self.path / "env.json", {"schema": SCHEMA, **runtime.info()})
+
+    def config(self) -> dict:
+        """What `start` recorded.
+
+        Raises:
+            FileNotFoundError: If this is no run folder.
+            ValueError: If the file is damaged or of another schema version.
+        """
+        path = self.path / "config.json"
+        if not path.is_file():
+            raise FileNotFoundError(f"{self.path}: must be a run folder, found no config.json; run `drgs fit` first")
+        try:
+            config = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path}: must be valid JSON, got {error}; fit again") from None
+        if not isinstance(config, dict) or config.get("schema") != SCHEMA:
+            got = config.get("schema") if isinstance(config, dict) else type(config).__name__
+            raise ValueError(f"{path}: schema must be {SCHEMA}, got {got}; fit again")
+        return config
+
+    def log(self, event: str, **fields: Any) -> None:
+        """Append one event to `log.jsonl` in one write: a killed run leaves at most one partial last line."""
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+        line = json.dumps({"schema": SCHEMA, "time": now, "event": event, **fields}, default=_jsonable)
+        with (self.path / "log.jsonl").open("ab") as file:
+            file.write(line.encode() + b"\n")
+
+    def events(self) -> list[dict]:
+        """The events of `log.jsonl`; a partial last line is left out."""
+        path = self.path / "log.jsonl"
+        lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+        return [json.loads(line) for line in lines]
+
+    def _drop_partial_line(self) -> None:
+        path = self.path / "log.jsonl"
+        if path.exists() and not (data := path.read_bytes()).endswith(b"\n"):
+            with atomic_write(path) as file:
+                file.write(data[: data.rfind(b"\n") + 1])

@@ -1,0 +1,67 @@
+"""OpenCV's lens models on the image plane at z = 1; `drgs.cameras.Camera` is the way in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["distort_opencv", "fisheye_directions", "fisheye_polynomial", "undistort_opencv"]
+
+
+def distort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Image-plane points (P,2) through OpenCV's radial and tangential model."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *([0.0] * (8 - len(distortion))))
+    x, y = plane.T
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def undistort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Inverse of `distort_opencv`; the caller checks the result by projecting it."""
+    import cv2
+
+    # OpenCV stops at 5 rounds by default, which leaves a tenth of a pixel on ordinary lenses.
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-12)
+    result = cv2.undistortPoints(
+        np.ascontiguousarray(plane[:, None, :]),
+        np.eye(3),
+        np.array(distortion),
+        None,
+        np.eye(3),
+        np.eye(3),
+        criteria,
+    )
+    return result.reshape(-1, 2)
+
+
+def fisheye_polynomial(
+    angle: np.ndarray, distortion: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted angle and its derivative for an angle (radians) to the axis."""
+    k1, k2, k3, k4 = distortion
+    a2 = angle * angle
+    value = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+    slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
+    return value, slope
+
+
+def fisheye_directions(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """(P,3) unit directions of distorted image-plane points (P,2).
+
+    Newton on the angle itself, not OpenCV's tangent of it, so that lenses beyond 180 degrees work.
+    """
+    radius = np.linalg.norm(plane, axis=1)
+    angle = radius.copy()
+    for _ in range(30):
+        value, slope = fisheye_polynomial(angle, distortion)
+        angle = np.clip(
+            angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi
+        )
+    factor = np.sin(angle) / np.where(radius > 0, radius, 1.0)
+    return np.concatenate([plane * factor[:, None], np.cos(angle)[:, None]], axis=1)

@@ -1,0 +1,255 @@
+"""Image metrics, and `drgs eval`: how well a run shows views that it was not fitted to.
+
+Metrics that cannot be computed are None with a reason, never left out. `VARIANTS` says exactly what each number is.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+import drgs
+from drgs.files import SCHEMA, Run, atomic_write, load_ply, write_json
+
+if TYPE_CHECKING:
+    from drgs.cli import Eval
+    from drgs.ellipsoids import Gaussians
+    from drgs.frames import Frame
+    from drgs.settings import RenderSettings
+
+__all__ = ["METRICS", "VARIANTS", "Lpips", "evaluate", "flip", "print_table", "psnr", "run_eval", "save_png", "ssim", "write_metrics"]
+
+VARIANTS = {
+    "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
+    "ssim": "torchmetrics, 11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
+    "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
+    "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
+    "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
+}
+METRICS = tuple(VARIANTS)
+_NO_LPIPS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
+_LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
+_SSIM_MIN_SIDE = 11
+
+
+def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, see `VARIANTS`.
+
+    Args:
+        image, target: (H, W, 3) in [0, 1].
+        mask: (H, W) weights in [0, 1], or None.
+    """
+    error = (image.double() - target.double()).square().mean(2)
+    if mask is not None:
+        if not bool((mask > 0).any()):
+            raise ValueError("psnr: the mask must keep at least one pixel, keeps none; drop this view")
+        mse = float((error * mask).sum() / mask.double().sum())
+    else:
+        mse = float(error.mean())
+    return -10 * math.log10(max(mse, 1e-10))
+
+
+def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
+    """Structural similarity of (H, W, 3) images in [0, 1], at least 11x11 pixels; torchmetrics' variant."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    planes = (x.permute(2, 0, 1)[None].float() for x in (image, target))
+    return float(structural_similarity_index_measure(*planes, sigma=1.5, kernel_size=11, data_range=1.0))
+
+
+def flip(image: torch.Tensor, target: torch.Tensor) -> float:
+    """Mean FLIP error of (H, W, 3) images in [0, 1] sRGB."""
+    import flip_evaluator
+
+    pair = (np.ascontiguousarray(x.numpy(), np.float32) for x in (target, image))
+    _, mean, _ = flip_evaluator.evaluate(*pair, "LDR", inputsRGB=True, applyMagma=False)
+    return float(mean)
+
+
+class Lpips:
+    """LPIPS with the backbone in a file; only the heads ship with the `lpips` package.
+
+    Args:
+        weights: State dictionary of torchvision's AlexNet or VGG16, read with `weights_only`.
+    Raises:
+        FileNotFoundError: If the file, or the `lpips` package, is missing.
+        ValueError: If it holds neither.
+    """
+
+    def __init__(self, weights: Path):
+        weights = Path(weights)
+        if not weights.is_file():
+            raise FileNotFoundError(f"{weights}: must be weights of AlexNet or VGG16, found none; check --lpips-weights")
+        try:
+            import lpips
+        except ImportError:
+            raise FileNotFoundError("eval: LPIPS needs the package lpips, found none; pip install lpips") from None
+        state = _read_weights(weights)
+        first = state.get("features.0.weight")
+        shape = tuple(first.shape) if isinstance(first, torch.Tensor) else None
+        self.backbone = {(64, 3, 11, 11): "alex", (64, 3, 3, 3): "vgg"}.get(shape)
+        if self.backbone is None:
+            raise ValueError(
+                f"{weights}: must be the state dictionary of torchvision's AlexNet or VGG16, got features.0.weight of "
+                f"shape {shape}; download alexnet-owt-7be5be79.pth or vgg16-397923af.pth"
+            )
+        # pnet_rand: build the backbone without downloading it.
+        self._model = lpips.LPIPS(net=self.backbone, pnet_rand=True, verbose=False).eval()
+        try:
+            with torch.no_grad():
+                # The slices keep torchvision's numbering: slice2.3.weight is features.3.weight.
+                for name, parameter in self._model.net.named_parameters():
+                    parameter.copy_(state["features." + name.split(".", 1)[1]])
+        except (KeyError, RuntimeError) as error:
+            text = " ".join(str(error).split())
+            raise ValueError(f"{weights}: must hold every convolution of {self.backbone}, got {text}") from None
+
+    @torch.no_grad()
+    def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
+        """LPIPS of (H, W, 3) images in [0, 1]."""
+        planes = (2 * x.permute(2, 0, 1)[None].float() - 1 for x in (image, target))
+        return float(self._model(*planes))
+
+
+def _read_weights(path: Path) -> dict:
+    import pickle
+
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, OSError, ValueError, EOFError) as error:
+        text = " ".join(str(error).split())[:120]
+        raise ValueError(f"{path}: must be readable weights, got {text}; download the file again") from None
+    return state if isinstance(state, dict) else {}
+
+
+def evaluate(
+    g: Gaussians,
+    frames: list[Frame],
+    settings: RenderSettings,
+    *,
+    lpips: Lpips | None = None,
+    pictures: Path | None = None,
+) -> dict:
+    """All metrics of the given views.
+
+    Args:
+        g: What is shown.
+        frames: Photographs to compare with; may be empty.
+        settings: As in `drgs.render`. Pixels outside a mask are black in both images.
+        lpips: None reports LPIPS as None with a reason.
+        pictures: Folder for one PNG a view: photograph, render, and error times 4, side by side.
+    Returns:
+        JSON-serializable: `views` (a list of name, size and metrics), `mean`, `variants`, `reasons` of what is None.
+    """
+    views, reasons = [], {}
+    if lpips is None:
+        reasons["lpips"] = _NO_LPIPS
+    for frame in frames:
+        with torch.no_grad():
+            image = drgs.render(g, frame.camera, settings).rgb.cpu().clamp(0, 1)
+        target = frame.target()
+        shown = image if frame.mask is None else image * frame.mask[..., None]
+        height, width = target.shape[:2]
+        row = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
+        row["psnr"] = psnr(image, frame.image(), frame.mask)
+        row["ssim_padded"] = _padded_ssim(shown, target)
+        row["flip"] = flip(shown, target)
+        if min(height, width) >= _SSIM_MIN_SIDE:
+            row["ssim"] = ssim(shown, target)
+        else:
+            reasons["ssim"] = f"view {frame.name} is smaller than the 11x11 window"
+        if lpips is not None and min(height, width) >= _LPIPS_MIN_SIDE:
+            row["lpips"] = lpips(shown, target)
+        elif lpips is not None:
+            reasons["lpips"] = f"view {frame.name} is smaller than {_LPIPS_MIN_SIDE} pixels"
+        views.append(row)
+        if pictures is not None:
+            error = (4 * (shown - target).abs()).clamp(0, 1)
+            save_png(pictures / f"{_file_name(frame.name)}.png", torch.cat([target, shown, error], dim=1))
+    mean = {}
+    for name in METRICS:
+        values = [row[name] for row in views if row[name] is not None]
+        mean[name] = sum(values) / len(values) if values and len(values) == len(views) else None
+        if not views:
+            reasons[name] = "no view is held out"
+    variants = dict(VARIANTS)
+    if lpips is not None:
+        variants["lpips"] += f", {lpips.backbone} backbone"
+    return {"views": views, "mean": mean, "variants": variants, "reasons": reasons}
+
+
+def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields) -> dict:
+    """Write `metrics.json` of a run from the result of `evaluate`; returns what was written."""
+    written = {"schema": SCHEMA, "split": split, "count": len(frames), **fields, **result}
+    write_json(run.path / "metrics.json", written)
+    return written
+
+
+def run_eval(args: Eval) -> None:
+    """`drgs eval RUN`."""
+    from drgs.data import load
+    from drgs.frames import load_frames
+    from drgs.trainer import FitConfig
+
+    run = Run(args.run)
+    recorded = run.config()
+    config = FitConfig.from_json(recorded["fit"])
+    lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
+    g = load_ply(run.point_cloud)
+    dataset = load(recorded["data"], test_every=config.test_every, background=config.settings.background)
+    train, test = dataset.split()
+    views = {"test": test, "train": train, "all": train + test}[args.split]
+    if not views:
+        raise ValueError(f"eval: split {args.split} must hold a view, holds none ({dataset.split_rule()}); use --split")
+    frames = load_frames(views, config.max_pixels, config.mask)
+    result = evaluate(g, frames, config.settings, lpips=lpips, pictures=run.renders / args.split)
+    written = write_metrics(run, args.split, frames, result, split_rule=dataset.split_rule(), gaussians=len(g))
+    print_table(written)
+
+
+def print_table(metrics: dict) -> None:
+    """The metrics of `write_metrics` as a table on stdout, reasons of missing ones below."""
+    from rich.console import Console
+    from rich.table import Table
+
+    digits = {"psnr": ".2f"}
+    names = [name for name in METRICS if metrics["mean"][name] is not None]
+    table = Table(title=f"{metrics['count']} {metrics['split']} views")
+    table.add_column("view")
+    for name in names:
+        table.add_column(name, justify="right")
+    for row in [*metrics["views"], {"name": "mean", **metrics["mean"]}]:
+        table.add_row(row["name"], *(f"{row[name]:{digits.get(name, '.4f')}}" for name in names))
+    console = Console()
+    console.print(table)
+    for name, reason in metrics["reasons"].items():
+        console.print(f"{name}: none ({reason})", highlight=False, soft_wrap=True)
+
+
+def save_png(path: Path, image: torch.Tensor) -> None:
+    """Write an (H, W, 3) image in [0, 1] as 8-bit PNG, atomically."""
+    import cv2
+
+    data = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()[..., ::-1]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
+    with atomic_write(path) as file:
+        file.write(encoded.tobytes())
+
+
+def _padded_ssim(image: torch.Tensor, target: torch.Tensor) -> float:
+    from drgs.losses import ssim as padded
+
+    return float(padded(image.double(), target.double()))
+
+
+def _file_name(name: str) -> str:
+    """A view's name as a file name: view names may hold folders."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)

@@ -1,0 +1,403 @@
+"""The float64 oracle: every ray against every Gaussian, from the equations, not from the fast code.
+
+All (ray, Gaussian) pairs are evaluated densely with torch in float64, so that torch.autograd gives
+the gradients; nothing is left out except where a setting says so. Ray ``o + t d`` with |d| = 1,
+local frame ``o' = S^-1 R^T (o - mu)``, ``d' = S^-1 R^T d``, peak ``t* = -o'.d' / d'.d'``,
+``rho^2 = |o' x d'|^2 / |d'|^2``, ``a`` opacity of a hit, ``w = a T`` its weight. Which hits exist
+and how they are ordered carries no gradient; results that hang on that are marked `ambiguous`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from types import SimpleNamespace as _Scene
+from typing import TYPE_CHECKING
+
+import torch
+from torch.utils.checkpoint import checkpoint
+
+if TYPE_CHECKING:
+    from drgs.settings import RenderSettings
+
+__all__ = ["EPS_ALPHA", "Output", "render", "sh_basis"]
+
+EPS_ALPHA = 1e-10
+"""Expected depth is divided by max(alpha, EPS_ALPHA)."""
+
+_EFFECT = 1e-7  # a near tie counts only if it can move a weight by more than this
+_TILE = 16  # pixels; both rasterizers' tile size
+_PAIRS = 1 << 19  # (ray, Gaussian) pairs held at once: about 0.3 GB of intermediates
+
+
+@dataclasses.dataclass
+class Output:
+    """What `render` returns; (H, W) stands for the shape of the rays where rays are given.
+
+    Attributes:
+        rgb: (H, W, 3), background included.
+        alpha: (H, W), 1 - T behind the last hit.
+        depth: (H, W) sum(w t*) / max(alpha, EPS_ALPHA), world units (`ewa`: t* is the order key).
+        median_depth: (H, W) t* of the hit where T first falls to 0.5 or below; 0 where never.
+        count: (H, W) int64, hits composited.
+        visibility: (N,) sum of w over all rays.
+        features: (H, W, D) composited like the color, without background; None without features.
+        ambiguous: (H, W) bool, the result hangs on a near tie (see `render`).
+    """
+
+    rgb: torch.Tensor
+    alpha: torch.Tensor
+    depth: torch.Tensor
+    median_depth: torch.Tensor
+    count: torch.Tensor
+    visibility: torch.Tensor
+    features: torch.Tensor | None
+    ambiguous: torch.Tensor
+
+
+def render(
+    g,
+    cam,
+    settings: RenderSettings,
+    rays: tuple[torch.Tensor, torch.Tensor] | None = None,
+    tolerance: float = 1e-5,
+) -> Output:
+    """Renders by brute force in float64.
+
+    Args:
+        g: Anything with `means` (N,3), `quats` (N,4) wxyz, `log_scales` (N,3), `logit_opacities`
+            (N,), `sh` (N,K,3), `features` (N,D) or None, and maybe `origin` (3,). Gradients reach
+            these tensors.
+        cam: Anything with `K`, `w2c`, `width`, `height` as `drgs.Camera`. A torch `w2c` (4,4) gets
+            a gradient; its part tangent to rigid motions is the meaningful one, as R^-1 is taken
+            to be R^T. With `rays` it only gives the center for `order="center"` and SH directions
+            and may be None: then that center is each ray's own origin.
+        settings: The `RenderSettings`; `traversal` plays no role here.
+        rays: Origins and directions, (..., 3) each, in place of the camera's; not for `ewa`.
+        tolerance: A pixel is `ambiguous` when rounding could move a weight by more than 1e-7:
+            neighbors in the order have keys closer than `tolerance` times the distance (exact ties
+            are safe, the index decides), or a hit or T is within a relative `tolerance` of a
+            cut-off, clamp, tile border or of T = 0.5.
+
+    Returns:
+        `Output` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
+
+    Raises:
+        ValueError: If `ewa` meets rays or distortion, or a camera is needed and missing.
+    """
+    s = settings
+    if s.response == "ewa" and (rays is not None or getattr(cam, "model", "pinhole") != "pinhole"):
+        raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")
+    if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
+        raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
+    scene = _activate(g, s)
+    rotation = center = None
+    offset = _float64(getattr(g, "origin", (0, 0, 0)))
+    if cam is not None:
+        w2c = _float64(cam.w2c)
+        rotation, center = w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3] - offset
+        scene = _cull_near(scene, rotation, center, s, tolerance)
+    if rays is None:
+        pixels, directions = _camera_rays(cam, rotation)
+        origins, shape = center.expand_as(directions), (cam.height, cam.width)
+    else:
+        pair = torch.broadcast_tensors(*map(_float64, rays))
+        shape = pair[0].shape[:-1]
+        origins, directions = pair[0].reshape(-1, 3) - offset, pair[1].reshape(-1, 3)
+        pixels = torch.zeros(len(directions), 2, dtype=torch.float64)
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    if s.response == "ewa":
+        scene.screen = _project(scene, cam, rotation, center, s, tolerance)
+    if s.sh_direction == "gaussian" and center is not None:
+        scene.colors = _colors(scene.sh, scene.means - center)
+
+    step = max(1, _PAIRS // max(len(scene.index), 1))
+    parts = []
+    for i in range(0, max(len(directions), 1), step):
+        part = (x[i : i + step] for x in (origins, directions, pixels))
+        args = (scene, s, rotation, center, *part, tolerance)
+        # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
+        if torch.is_grad_enabled() and len(directions) > step:
+            parts.append(checkpoint(_composite, *args, use_reentrant=False))
+        else:
+            parts.append(_composite(*args))
+    seen = sum(part.pop("visibility") for part in parts)
+    fields = dict.fromkeys(parts[0])
+    for name in fields:
+        if parts[0][name] is not None:
+            joined = torch.cat([part[name] for part in parts])
+            fields[name] = joined.reshape(*shape, *joined.shape[1:])
+    seen = torch.zeros(len(g.means), dtype=torch.float64).index_add(0, scene.index, seen)
+    return Output(visibility=seen, **fields)
+
+
+def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
+    """(..., K) real spherical harmonics of (..., 3) unit directions, K = 1, 4, 9 or 16.
+
+    3DGS order and sign: by degree, then m = -l..l; odd m carry the sign (-1)^m.
+    """
+    x, y, z = dirs.unbind(-1)
+    basis = [torch.full_like(x, math.sqrt(1 / (4 * math.pi)))]
+    if K > 1:
+        c = math.sqrt(3 / (4 * math.pi))
+        basis += [-c * y, c * z, -c * x]
+    if K > 4:
+        c = math.sqrt(15 / (4 * math.pi))
+        zonal = c / math.sqrt(12) * (2 * z * z - x * x - y * y)
+        basis += [c * x * y, -c * y * z, zonal, -c * x * z, c / 2 * (x * x - y * y)]
+    if K > 9:
+        c3, c2, c1, c0 = (math.sqrt(v / math.pi) for v in (35 / 32, 105 / 4, 21 / 32, 7 / 16))
+        outer = 4 * z * z - x * x - y * y
+        basis += [-c3 * y * (3 * x * x - y * y), c2 * x * y * z, -c1 * y * outer]
+        basis += [c0 * z * (2 * z * z - 3 * x * x - 3 * y * y), -c1 * x * outer]
+        basis += [c2 / 2 * z * (x * x - y * y), -c3 * x * (x * x - 3 * y * y)]
+    return torch.stack(basis, dim=-1)
+
+
+def _float64(x) -> torch.Tensor:
+    """On the CPU; a tensor keeps its graph, anything else is copied."""
+    x = x if isinstance(x, torch.Tensor) else torch.tensor(x)
+    return x.to("cpu", torch.float64)
+
+
+def _activate(g, s: RenderSettings) -> _Scene:
+    """Activated parameters in float64, relative to the Gaussians' origin."""
+    raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
+    means, quats, log_scales, logits, sh = map(_float64, raw)
+    n, features = len(means), getattr(g, "features", None)
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    rotation = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    extent = torch.full((n,), s.extent or 0.0, dtype=torch.float64)
+    if s.extent is None:
+        # The N tails beyond these radii add up to at most N * alpha exp(-extent^2 / 2) = 1e-5.
+        extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
+    return _Scene(
+        means=means,
+        axes=rotation * log_scales.exp()[:, None, :],  # columns are the semi-axes
+        whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
+        logits=logits,
+        sh=sh,
+        features=None if features is None else _float64(features),
+        extent=extent,
+        index=torch.arange(n),
+        colors=None,  # (N, 3), or None where the color depends on the ray
+        near_margin=None,  # (N,), set by `_cull_near`
+        screen=None,  # `_project`, for `ewa`
+    )
+
+
+def _intrinsics(cam) -> tuple[float, float, float, float]:
+    return float(cam.K[0][0]), float(cam.K[1][1]), float(cam.K[0][2]), float(cam.K[1][2])
+
+
+def _camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pixel centers (H*W, 2) and world directions (H*W, 3)."""
+    v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
+    u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)
+    if getattr(cam, "model", "pinhole") == "pinhole":
+        fx, fy, cx, cy = _intrinsics(cam)
+        local = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], dim=-1)
+    else:
+        # The lens acts in the camera frame: only the rotation out of it carries the pose gradient.
+        local = _float64(cam.pixel_directions()).reshape(-1, 3) @ rotation.detach().T
+    return torch.stack([u, v], dim=-1), local @ rotation
+
+
+def _cull_near(scene: _Scene, rotation, center, s: RenderSettings, tolerance: float) -> _Scene:
+    """Drops means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
+    z = ((scene.means - center) @ rotation[2]).detach()
+    if s.near > 0:
+        keep = z > s.near * (1 - tolerance)
+        scene.near_margin = z / s.near - 1
+    elif s.response == "ewa":
+        keep = z > 0
+    else:
+        return scene
+    return _Scene(**{k: v if v is None else v[keep] for k, v in vars(scene).items()})
+
+
+def _colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
+    """max(0.5 + SH, 0) of coefficients (N, K, 3) for directions (..., N, 3) of any length."""
+    length = towards.norm(dim=-1, keepdim=True)
+    if sh.shape[1] == 1:  # no direction, so no gradient to it either
+        towards, length = torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 1)
+    basis = sh_basis(towards / torch.where(length > 0, length, 1.0), sh.shape[1])
+    return (0.5 + (basis[..., None] * sh).sum(-2)).clamp(min=0)
+
+
+def _project(scene: _Scene, cam, rotation, center, s: RenderSettings, tolerance: float) -> tuple:
+    """Projected means (N, 2), rows of J W R S (N, 2, 3), diagonal of Sigma' (N, 2), tile bounds.
+
+    Tile bounds are three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk
+    by the tolerance, exact, grown by it. None without tile culling.
+    """
+    fx, fy, cx, cy = _intrinsics(cam)
+    x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
+    mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    slopes = []
+    for slope, f, c, size in ((x / z, fx, cx, cam.width), (y / z, fy, cy, cam.height)):
+        tan = size / (2 * f)
+        if s.fov_clamp == "inria":
+            slope = slope.clamp(-1.3 * tan, 1.3 * tan)
+        elif s.fov_clamp == "gsplat":
+            slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
+        slopes.append(slope)
+    zero = torch.zeros_like(z)
+    jacobian = [fx / z, zero, -fx * slopes[0] / z, zero, fy / z, -fy * slopes[1] / z]
+    rows = torch.stack(jacobian, dim=-1).reshape(-1, 2, 3) @ rotation @ scene.axes
+    diagonal = rows.square().sum(-1) + s.dilation
+    if s.culling == "extent":
+        return mean2d, rows, diagonal, None
+    m, cov, alpha = mean2d.detach(), diagonal.detach(), torch.sigmoid(scene.logits.detach())
+    bounds = []
+    for slack in (-tolerance, 0.0, tolerance):
+        if s.culling == "inria":
+            mid, det = cov.mean(-1), cov.prod(-1) - rows.detach().prod(1).sum(-1) ** 2
+            largest = mid + (mid * mid - det).clamp(min=0.1).sqrt()
+            radius = torch.ceil(3 * largest.sqrt() * (1 + slack))[:, None]
+            # A pixel is at its integer there, hence the half.
+            first = torch.floor((m - 0.5 - radius) / _TILE - slack)
+            last = torch.floor((m - 0.5 + radius + _TILE - 1) / _TILE + slack)
+        else:
+            sigmas = (2 * torch.log((255 * alpha).clamp(min=1))).sqrt().clamp(max=3.33)
+            radius = torch.ceil(sigmas[:, None] * cov.sqrt() * (1 + slack))
+            first = torch.floor((m - radius) / _TILE - slack)
+            last = torch.ceil((m + radius) / _TILE + slack)
+            last = torch.where((255 * alpha < 1 - slack)[:, None], first, last)
+        bounds.append((first, last))
+    return mean2d, rows, diagonal, bounds
+
+
+def _responses(scene: _Scene, s: RenderSettings, rotation, center, o, d, pixels) -> tuple:
+    """What is known of (P, N) pairs before ordering.
+
+    Returns: a, 1 - a, t; and without gradient: order key, exists (bool), margin (relative distance
+    to the nearest cut-off of existence, negative beyond it), distance from a to alpha_max, distance
+    to the mean.
+    """
+    alpha, away = torch.sigmoid(scene.logits), scene.means - o[:, None, :]
+    if s.response == "ewa":
+        mean2d, rows, diagonal, bounds = scene.screen
+        dx, dy = (pixels[:, None, :] - mean2d).unbind(-1)
+        b1, b2 = rows.unbind(1)
+        # det(B B^T + eps I) and the adjugate form as sums of squares: no cancellation when thin.
+        det = torch.linalg.cross(b1, b2).square().sum(-1)
+        det = det + s.dilation * (diagonal.sum(-1) - s.dilation)
+        form = (dx[..., None] * b2 - dy[..., None] * b1).square().sum(-1)
+        rho2 = (form + s.dilation * (dx * dx + dy * dy)) / det
+        t = away @ rotation[2] if s.depth_key == "z" else away.norm(dim=-1)
+    else:
+        local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
+        slope = torch.einsum("nij,pj->pni", scene.whiten, d)
+        length2 = slope.square().sum(-1)
+        t = -(local * slope).sum(-1) / length2
+        rho2 = torch.linalg.cross(local, slope).square().sum(-1) / length2
+    if s.response == "integral":
+        softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
+        behind = torch.special.erfc(-t * length2.sqrt() / math.sqrt(2)) / 2
+        tau = softplus * torch.exp(-rho2 / 2) * behind
+        a, rest = -torch.expm1(-tau), torch.exp(-tau)
+    else:
+        a = alpha * torch.exp(-rho2 / 2)
+        rest = torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
+    over, to_max = (a > s.alpha_max).detach(), (a / s.alpha_max - 1).abs().detach()
+    top, left = torch.full_like(a, s.alpha_max), torch.full_like(a, 1 - s.alpha_max)
+    if s.alpha_max_gradient == "pass":
+        top, left = a + (top - a).detach(), rest + (left - rest).detach()
+    a, rest = torch.where(over, top, a), torch.where(over, left, rest)
+
+    with torch.no_grad():
+        distance = away.norm(dim=-1)
+        exists, margin = torch.ones_like(over), torch.full_like(a, math.inf)
+
+        def cut(inside, relative):
+            exists.logical_and_(inside)
+            margin.copy_(torch.minimum(margin, relative))
+
+        if s.culling == "extent":
+            rho = rho2.sqrt()
+            cut(rho <= scene.extent, (scene.extent - rho) / scene.extent.clamp(min=1e-300))
+        else:
+            tile = torch.floor(pixels / _TILE)[:, None, :]
+            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in bounds)
+            cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
+        if s.response == "peak":
+            cut(t > 0, t / distance.clamp(min=1e-300))
+        if s.alpha_min > 0:
+            cut(a >= s.alpha_min, a / s.alpha_min - 1)
+        if scene.near_margin is not None:
+            cut(scene.near_margin > 0, scene.near_margin)
+        key = t.clamp(min=0) if s.response == "integral" else t
+        if s.order == "center":
+            reach = away if center is None else scene.means - center
+            key = reach @ rotation[2] if s.depth_key == "z" else reach.norm(dim=-1)
+        elif s.order == "entry":
+            key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length2.sqrt()
+    return a, rest, t, key.expand_as(a), exists, margin, to_max, distance
+
+
+def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, tolerance) -> dict:
+    """The fields of `Output` for one chunk of rays."""
+    a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels)
+    # Near misses are sorted in, without effect, to see what they would have done.
+    candidate = checks[0] | (checks[1] >= -tolerance)
+    key, order = torch.where(candidate, key, math.inf).sort(dim=1, stable=True)
+    sort = (a, rest, t, candidate, *checks)
+    a, rest, t, candidate, exists, margin, to_max, distance = (x.gather(1, order) for x in sort)
+    after = torch.where(exists, rest, 1.0).cumprod(dim=1)
+    before = _previous(after, 1.0)
+    tested = before if s.stop == "after" else after
+    stops = tested < s.transmittance_min
+    if s.stop == "before_eq":
+        stops = tested <= s.transmittance_min
+    alive = exists & ~stops
+    w = torch.where(alive, a * before, 0.0)
+    half = alive & (after <= 0.5) & (before > 0.5)
+    weights = torch.zeros_like(w).scatter(1, order, w)  # back in the caller's order
+    colors = scene.colors
+    if colors is None:
+        from_center = scene.means - (o[:, None, :] if center is None else center)
+        colors = _colors(scene.sh, d[:, None, :] if s.sh_direction == "ray" else from_center)
+    background = torch.tensor(s.background, dtype=torch.float64)
+    end = torch.where(alive, rest, 1.0).prod(dim=1)
+    alpha = w.sum(dim=1)  # equals 1 - end, without its cancellation
+
+    with torch.no_grad():
+        # T's relative error grows with that of each 1 - a in front.
+        slack = a / rest.clamp(min=1e-300)
+        slack = tolerance * (1 + torch.where(exists, slack, 0.0).cumsum(dim=1))
+        off = _previous(slack, tolerance) if s.stop == "after" else slack
+        to_stop = (tested - s.transmittance_min).abs() - off * tested
+        matters = candidate & (a * before > _EFFECT) & (~stops | (to_stop <= 0))
+        doubt = matters & ((margin.abs() <= tolerance) | (to_stop <= 0))
+        doubt |= alive & ((after - 0.5).abs() <= slack * after)
+        if s.alpha_max < 1:
+            doubt |= matters & (to_max <= tolerance)
+        # The previous hit that matters, and what of its weight swapping the two would move.
+        # Equal keys are no doubt: the index decides them in any precision.
+        last, place = torch.where(matters, key, -math.inf).cummax(dim=1)
+        place = _previous(place, 0)
+        gap = key - _previous(last, -math.inf)
+        swap = a * a.gather(1, place) * before.gather(1, place)
+        close = gap <= tolerance * torch.maximum(distance, key.abs())
+        doubt |= matters & (gap > 0) & close & (swap > _EFFECT)
+    return {
+        "rgb": (weights[:, :, None] * colors).sum(dim=1) + end[:, None] * background,
+        "alpha": alpha,
+        "depth": (w * t).sum(dim=1) / alpha.clamp(min=EPS_ALPHA),
+        "median_depth": torch.where(half, t, 0.0).sum(dim=1),
+        "count": alive.sum(dim=1),
+        "visibility": weights.sum(dim=0),
+        "features": None if scene.features is None else weights @ scene.features,
+        "ambiguous": doubt.any(dim=1),
+    }
+
+
+def _previous(x: torch.Tensor, first: float) -> torch.Tensor:
+    """(P, n) shifted by one along the order."""
+    return torch.cat([torch.full_like(x[:, :1], first), x[:, :-1]], dim=1)

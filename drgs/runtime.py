@@ -1,0 +1,349 @@
+"""The backend: which Dr.Jit variant computes, on which libLLVM, with how many threads.
+
+Three entry points, from cheap to complete. Nothing else in the package imports `drjit` or
+`mitsuba` before having called one of them, because the import itself loads libLLVM (libllvm.py).
+
+    prepare()    sets DRJIT_LIBLLVM_PATH; imports nothing; called by `import drgs`
+    backend()    Dr.Jit, its array types and thread counts; no Mitsuba
+    mitsuba()    the `mitsuba` module with a variant set: the user's if there is one
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from drgs.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
+
+__all__ = [
+    "VARIANTS",
+    "Backend",
+    "backend",
+    "cuda_status",
+    "dr_types",
+    "info",
+    "mitsuba",
+    "optix_status",
+    "prepare",
+    "setup",
+]
+
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+
+_PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "torch",
+    "numpy",
+    "pycolmap",
+    "opencv-contrib-python-headless",
+    "tyro",
+    "rich",
+    "plyfile",
+    "safetensors",
+    "torchmetrics",
+    "flip-evaluator",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Backend:
+    """What computes: one per process, chosen at first use.
+
+    Attributes:
+        variant: Mitsuba variant name, `llvm_ad_rgb` or `cuda_ad_rgb`.
+        name: `llvm` or `cuda`.
+        types: `drjit.llvm.ad` or `drjit.cuda.ad`, the namespace of differentiable array types.
+        llvm_path: The libLLVM that is loaded, None on CUDA or where the system does not tell.
+        llvm_version: (major, minor, patch) as Dr.Jit reports it, None on CUDA.
+        threads: Dr.Jit's thread count when the backend was chosen.
+    """
+
+    variant: str
+    name: str
+    types: ModuleType
+    llvm_path: str | None
+    llvm_version: tuple[int, ...] | None
+    threads: int
+
+
+_active: Backend | None = None
+
+
+def setup(variant: str | None = None, threads: int | None = None) -> Backend:
+    """Choose the backend and its thread counts; `backend()` returns the last one chosen.
+
+    Args:
+        variant: `llvm_ad_rgb`, `cuda_ad_rgb`, or None / `auto`: the variant that the user has set
+            in Mitsuba, else DRGS_VARIANT, else CUDA if a device and a CUDA build of torch are
+            there, else LLVM.
+        threads: Threads of Dr.Jit and torch, or None: DRGS_THREADS, else what both have, but at
+            most as many as this process may use.
+    Raises:
+        ValueError: If an argument or environment variable is bad, or a loaded libLLVM would abort.
+        FileNotFoundError: If no backend is usable.
+    """
+    global _active
+    wanted = _wanted_variant(variant)
+    count = _wanted_threads(threads)
+    if wanted == "llvm_ad_rgb" and "drjit" not in sys.modules:
+        require_llvm()
+    prepare()
+    import drjit as dr
+    import torch
+
+    if wanted is None:
+        # Parameters live in torch tensors: a CPU build of torch would copy every frame.
+        cuda = cuda_status()[0] and torch.version.cuda is not None
+        wanted = "cuda_ad_rgb" if cuda else "llvm_ad_rgb"
+    if wanted == "cuda_ad_rgb":
+        usable, reason = cuda_status()
+        if not usable:
+            raise ValueError(
+                f"drgs: variant cuda_ad_rgb must have a CUDA device, but {reason}; use llvm_ad_rgb."
+            )
+        import drjit.cuda.ad as types
+
+        version = None
+    else:
+        version = _loaded_llvm(dr)
+        import drjit.llvm.ad as types
+
+    # Left alone, both size their pools by the machine, which oversubscribes a container.
+    dr.set_thread_count(count or min(dr.thread_count(), _usable_cores()))
+    if count or torch.get_num_threads() > _usable_cores():
+        torch.set_num_threads(count or _usable_cores())
+    _active = Backend(
+        variant=wanted,
+        name=wanted.split("_")[0],
+        types=types,
+        llvm_path=_loaded_path() if version else None,
+        llvm_version=version,
+        threads=dr.thread_count(),
+    )
+    return _active
+
+
+def backend() -> Backend:
+    """The active backend, chosen by `setup()` at first use."""
+    return _active or setup()
+
+
+def dr_types() -> ModuleType:
+    """`drjit.llvm.ad` or `drjit.cuda.ad`: Float, UInt32, TensorXf, ... of the active backend."""
+    return backend().types
+
+
+def mitsuba() -> ModuleType:
+    """The `mitsuba` module. Sets the variant only if none is set: never replaces the user's.
+
+    Raises:
+        ValueError: If the user's variant is not the one that drgs computes with.
+    """
+    chosen = backend()
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant(chosen.variant)
+    elif mi.variant() != chosen.variant and mi.variant() in VARIANTS:
+        # The user has switched variants since the first use: follow.
+        setup(mi.variant())
+    elif mi.variant() != chosen.variant:
+        raise ValueError(
+            f"drgs: Mitsuba's variant must be one of {', '.join(VARIANTS)}, got {mi.variant()}; "
+            f"call mitsuba.set_variant({chosen.variant!r})."
+        )
+    return mi
+
+
+def cuda_status() -> tuple[bool, str | None]:
+    """Whether Dr.Jit can run on a CUDA device and, if not, why."""
+    prepare()
+    import drjit as dr
+
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return True, None
+    try:
+        code = ctypes.CDLL("libcuda.so.1").cuInit(0)
+    except OSError:
+        return False, "libcuda.so.1 (the NVIDIA driver) was not found"
+    if code:
+        return False, f"the NVIDIA driver reports no usable device (cuInit returned {code})"
+    return False, "the driver must be R535 or newer and the device of compute capability >= 7.5"
+
+
+def optix_status() -> tuple[bool, str | None]:
+    """Whether OptiX, which only `traversal="bvh"` needs on CUDA, can be loaded; if not, why."""
+    usable, reason = cuda_status()
+    if not usable:
+        return False, reason
+    name = os.environ.get("DRJIT_LIBOPTIX_PATH") or "libnvoptix.so.1"
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False, f"{name} was not found (containers: NVIDIA_DRIVER_CAPABILITIES=all)"
+    return True, None
+
+
+def info() -> dict:
+    """What a bug report or a run's env.json needs; never raises for want of a backend.
+
+    Returns:
+        JSON-serializable dict with keys drgs, commit, python, platform, cpu, cores, backend, llvm,
+        threads, cuda, optix, packages. `backend["error"]` is None or says why nothing can run.
+    """
+    import platform
+    from importlib import metadata
+
+    import drgs
+
+    def version(package: str) -> str | None:
+        try:
+            return metadata.version(package)
+        except metadata.PackageNotFoundError:
+            return None
+
+    report = {
+        "drgs": drgs.__version__,
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": _cpu_model(),
+        "cores": {"usable": _usable_cores(), "machine": os.cpu_count()},
+        "packages": {package: version(package) for package in _PACKAGES},
+    }
+    chosen, error = None, None
+    try:
+        chosen = backend()
+    except (ValueError, OSError, ImportError) as problem:
+        error = str(problem)
+    report["backend"] = {"variant": chosen.variant if chosen else None, "error": error}
+    llvm = chosen.llvm_version if chosen else None
+    environ = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
+    report["llvm"] = {
+        "path": chosen.llvm_path if chosen else None,
+        "version": dotted(llvm) if llvm else None,
+        "found": [{"path": x.path, "version": dotted(x.version)} for x in find_libraries(environ)],
+    }
+    if chosen:
+        import torch
+
+        report["threads"] = {"drjit": chosen.threads, "torch": torch.get_num_threads()}
+    else:
+        report["threads"] = {"drjit": None, "torch": None}
+    for key, status in (("cuda", cuda_status), ("optix", optix_status)):
+        try:
+            usable, reason = status()
+        except ImportError as problem:
+            usable, reason = False, f"drjit cannot be imported ({problem})"
+        report[key] = {"available": usable, "reason": reason}
+    report["cuda"]["device"] = _gpu_name() if report["cuda"]["available"] else None
+    return report
+
+
+def _wanted_variant(variant: str | None) -> str | None:
+    """The variant asked for by argument, by Mitsuba's current one or by environment; None: auto."""
+    where = "setup: variant"
+    if variant in (None, "auto") and "mitsuba" in sys.modules:
+        current = sys.modules["mitsuba"].variant()
+        variant = current if current in VARIANTS else None
+    if variant in (None, "auto"):
+        where, variant = "drgs: DRGS_VARIANT", os.environ.get("DRGS_VARIANT") or None
+    if variant in (None, "auto"):
+        return None
+    if variant not in VARIANTS:
+        raise ValueError(f"{where} must be one of auto, {', '.join(VARIANTS)}, got {variant!r}")
+    return variant
+
+
+def _wanted_threads(threads: int | None) -> int | None:
+    where, text = "setup: threads", threads
+    if threads is None:
+        where, text = "drgs: DRGS_THREADS", os.environ.get("DRGS_THREADS") or None
+    if text is None:
+        return None
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if not 1 <= count <= 4096:
+        raise ValueError(f"{where} must be a whole number in [1, 4096], got {text!r}")
+    return count
+
+
+def _loaded_llvm(dr: ModuleType) -> tuple[int, ...]:
+    """The LLVM version that Dr.Jit has loaded, once it is known not to abort."""
+    version = tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else ()
+    if version and version[0] >= MINIMUM_LLVM:
+        return version
+    require_llvm()  # when nothing on this machine would do, the error says what to install
+    # 15 and 16 pass has_backend and abort the process in the first kernel with a minimum.
+    raise ValueError(
+        f"drgs: Dr.Jit must run on libLLVM >= {MINIMUM_LLVM}, but has loaded "
+        f"{dotted(version) if version else 'none'}; import drgs before drjit and mitsuba, or set "
+        "DRJIT_LIBLLVM_PATH to a newer one."
+    )
+
+
+def _loaded_path() -> str | None:
+    """Path of the libLLVM in this process: Dr.Jit may have been imported before our choice."""
+    try:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+    except OSError:  # not Linux
+        return os.environ.get("DRJIT_LIBLLVM_PATH")
+    return next((x.split(maxsplit=5)[5] for x in lines if "/libLLVM" in x), None)
+
+
+def _usable_cores() -> int:
+    """Cores this process may use: affinity mask and, in a container, the CPU quota."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS
+        cores = os.cpu_count() or 1
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        return min(cores, max(1, -(-int(quota) // int(period))))
+    except (OSError, ValueError):  # no cgroup v2, or no quota ("max")
+        return cores
+
+
+def _cpu_model() -> str:
+    import platform
+
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:  # not Linux
+        pass
+    brand = (
+        _output("sysctl", "-n", "machdep.cpu.brand_string") if sys.platform == "darwin" else None
+    )
+    return brand or platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """Commit of the checkout that this package lies in, `-dirty` appended; None when installed."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    return _output("git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*")
+
+
+def _gpu_name() -> str | None:
+    return _output("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
+
+
+def _output(*command: str) -> str | None:
+    """First line that a command prints, or None when it fails or is not there."""
+    import subprocess
+
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return (done.stdout.splitlines() or [None])[0]

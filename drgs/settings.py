@@ -1,0 +1,180 @@
+"""Every choice the renderer makes, as one frozen record, and the presets that other systems correspond to.
+
+A field here is an accuracy/speed (or a compatibility) choice that a user can name, switch and measure. Nothing that
+changes an image lives anywhere else. Symbols: ``a`` opacity of one hit, ``alpha_i`` opacity of Gaussian i,
+``T`` transmittance in front of a hit, ``rho`` Mahalanobis distance of a ray to a mean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+__all__ = ["PRESETS", "RenderSettings", "legal"]
+
+PRESETS = ("exact", "fast", "inria", "gsplat", "mitsuba")
+
+_CHOICES = {
+    "response": ("peak", "integral", "ewa"),
+    "order": ("center", "ray", "entry"),
+    "traversal": ("tiles", "bvh"),
+    "depth_key": ("distance", "z"),
+    "alpha_max_gradient": ("zero", "pass"),
+    "stop": ("after", "before", "before_eq"),
+    "fov_clamp": ("none", "inria", "gsplat"),
+    "culling": ("extent", "inria", "gsplat"),
+    "sh_direction": ("gaussian", "ray"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderSettings:
+    """What `drgs.render` computes, and where it cuts off.
+
+    Attributes:
+        response: `peak` (a = alpha exp(-rho^2/2) at the ray's peak), `integral` (a = 1 - exp(-optical depth from the
+            camera on)) or `ewa` (the rasterizers' projected covariance).
+        order: `center` (one depth per Gaussian and view), `ray` (exact order of (t*, index) on each ray) or `entry`
+            (Mitsuba's order of entry points, `bvh` only).
+        traversal: `tiles` (pinhole cameras, the fast path) or `bvh` (Mitsuba's acceleration structure, any ray).
+        depth_key: Key of `order="center"`: `distance` to the camera center or camera-space `z`.
+        extent: Cut-off radius in standard deviations; None is the adaptive radius sqrt(2 ln max(alpha_i N / 1e-5, 1))
+            that bounds the sum of all N truncated tails by 1e-5.
+        alpha_min: Hits with a < alpha_min are skipped.
+        alpha_max: a is clamped to this value.
+        alpha_max_gradient: `zero` or `pass`: the derivative of the clamp.
+        transmittance_min: A ray ends once T falls below it; see `stop`.
+        stop: `after` composites the hit, then tests T; `before` tests T (1 - a) < transmittance_min and drops the hit
+            (INRIA), `before_eq` the same with <= (gsplat).
+        dilation: Added to the diagonal of the projected covariance, in px^2 (`ewa` only).
+        near: Gaussians whose mean has camera z <= near are left out; 0 leaves none out.
+        fov_clamp: Clamp of x/z and y/z in the `ewa` Jacobian: `none`, `inria` (symmetric) or `gsplat` (off-center).
+        culling: `extent` (the extent above), `inria` (16x16-pixel tiles touched by the square of the 3-sigma radius)
+            or `gsplat` (per-axis radius min(3.33, sqrt(2 ln(255 alpha))) sigma; no other cut than alpha_min).
+        sh_direction: SH are evaluated towards each Gaussian's mean (`gaussian`) or along each pixel's ray (`ray`).
+        background: RGB composited behind everything.
+    """
+
+    response: str = "peak"
+    order: str = "center"
+    traversal: str = "tiles"
+    depth_key: str = "distance"
+    extent: float | None = None
+    alpha_min: float = 0.0
+    alpha_max: float = 1.0
+    alpha_max_gradient: str = "zero"
+    transmittance_min: float = 1e-10
+    stop: str = "after"
+    dilation: float = 0.0
+    near: float = 0.0
+    fov_clamp: str = "none"
+    culling: str = "extent"
+    sh_direction: str = "gaussian"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        for name, allowed in _CHOICES.items():
+            value = getattr(self, name)
+            if value not in allowed:
+                raise ValueError(f"RenderSettings: {name} must be one of {', '.join(allowed)}, got {value!r}")
+        if self.extent is not None and not (0 < self.extent < 1e3):
+            raise ValueError(f"RenderSettings: extent must be in (0, 1000) sigma or None, got {self.extent!r}")
+        for name, low, high in (
+            ("alpha_min", 0.0, 1.0),
+            ("alpha_max", 0.0, 1.0),
+            ("transmittance_min", 0.0, 1.0),
+            ("dilation", 0.0, 1e3),
+            ("near", 0.0, math.inf),
+        ):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and low <= value <= high):
+                raise ValueError(f"RenderSettings: {name} must be in [{low}, {high}], got {value!r}")
+        if self.alpha_max == 0:
+            raise ValueError("RenderSettings: alpha_max must be > 0, got 0")
+        background = tuple(float(x) for x in self.background)
+        if len(background) != 3 or not all(map(math.isfinite, background)):
+            raise ValueError(f"RenderSettings: background must be 3 finite numbers, got {self.background!r}")
+        object.__setattr__(self, "background", background)
+        problem = legal(self)
+        if problem:
+            raise NotImplementedError(f"RenderSettings: {problem}")
+
+    @classmethod
+    def preset(cls, name: str, **overrides) -> RenderSettings:
+        """Settings of a named system.
+
+        `exact` is the claim of this package: within 1e-5 of the float64 oracle. `fast` has the cut-offs of Mitsuba's
+        `volprim_rf_basic` and is the default for training; `mitsuba` is the same on its acceleration structure and in
+        its order. `inria` and `gsplat` are those rasterizers' models, constant by constant (docs/conventions.md lists
+        each one's source line).
+
+        Args:
+            name: One of `PRESETS`.
+            **overrides: Fields that replace the preset's.
+        Raises:
+            ValueError: If the name or a field is unknown.
+        """
+        table = {
+            "exact": {"order": "ray"},
+            "fast": {"extent": 3.0, "transmittance_min": 0.01, "alpha_max": 0.9999},
+            "mitsuba": {
+                "order": "entry",
+                "traversal": "bvh",
+                "extent": 3.0,
+                "transmittance_min": 0.01,
+                "alpha_max": 0.9999,
+            },
+            "inria": {
+                "response": "ewa",
+                "depth_key": "z",
+                "alpha_min": 1 / 255,
+                "alpha_max": 0.99,
+                "alpha_max_gradient": "pass",
+                "transmittance_min": 1e-4,
+                "stop": "before",
+                "dilation": 0.3,
+                "near": 0.2,
+                "fov_clamp": "inria",
+                "culling": "inria",
+            },
+            "gsplat": {
+                "response": "ewa",
+                "depth_key": "z",
+                "alpha_min": 1 / 255,
+                "alpha_max": 0.999,
+                "transmittance_min": 1e-4,
+                "stop": "before_eq",
+                "dilation": 0.3,
+                "near": 0.01,
+                "fov_clamp": "gsplat",
+                "culling": "gsplat",
+            },
+        }
+        if name not in table:
+            raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
+        return cls().replace(**{**table[name], **overrides})
+
+    def replace(self, **fields) -> RenderSettings:
+        """A copy with the given fields replaced; unknown names raise ValueError."""
+        known = {f.name for f in dataclasses.fields(self)}
+        unknown = sorted(set(fields) - known)
+        if unknown:
+            raise ValueError(
+                f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}"
+            )
+        return dataclasses.replace(self, **fields)
+
+
+def legal(s: RenderSettings) -> str | None:
+    """Why a combination of response, order and traversal does not exist, or None when it does."""
+    if s.response == "ewa" and s.traversal == "bvh":
+        return "response='ewa' is defined on the image plane, use traversal='tiles' (got 'bvh')"
+    if s.response == "ewa" and s.order != "center":
+        return f"response='ewa' has one depth per Gaussian, use order='center' (got {s.order!r})"
+    if s.order == "entry" and s.traversal == "tiles":
+        return "order='entry' is Mitsuba's order of entry points, use traversal='bvh' (got 'tiles')"
+    if s.culling != "extent" and s.response != "ewa":
+        return f"culling={s.culling!r} belongs to response='ewa', use culling='extent' (got {s.response!r})"
+    if s.dilation > 0 and s.response != "ewa":
+        return f"dilation belongs to response='ewa', use dilation=0 (got {s.response!r})"
+    return None

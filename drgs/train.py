@@ -1,0 +1,282 @@
+"""`drgs fit`: Gaussians from photographs with known cameras (static scenes, color).
+
+The loop around `drgs.trainer`: run folder, checkpoints, progress, previews, and metrics of held-out views at the end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+import drgs
+from drgs import metrics
+from drgs.density import Model
+from drgs.files import Run, load_state, save_ply, save_state
+from drgs.frames import Frame, load_frames
+from drgs.trainer import FitConfig, Trainer
+
+if TYPE_CHECKING:
+    from drgs.cli import Fit
+    from drgs.data import Dataset
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["FitConfig", "FitResult", "Trainer", "fit", "run_fit"]
+
+_log = logging.getLogger(__name__)
+
+_PREVIEWS = 10
+_LOG_EVERY = 20  # steps whose loss and PSNR are averaged in one event
+
+
+@dataclasses.dataclass(frozen=True)
+class FitResult:
+    """What `fit` leaves behind.
+
+    Attributes:
+        gaussians: The Gaussians, also in `run.point_cloud`.
+        metrics: As in metrics.json.
+        run: The run folder.
+        seconds: Wall time of all steps, of resumed runs together.
+    """
+
+    gaussians: Gaussians
+    metrics: dict
+    run: Run
+    seconds: float
+
+
+def fit(
+    dataset: Dataset,
+    out_dir: str | Path,
+    config: FitConfig | None = None,
+    *,
+    resume: bool = False,
+    progress: bool = True,
+) -> FitResult:
+    """Fit Gaussians to a data set and write a run folder.
+
+    Args:
+        dataset: As `drgs.data.load` returns it.
+        out_dir: The run folder: new, or with `resume` one that a fit of the same config has begun.
+        config: What to do; the defaults if left out.
+        resume: Continue from the last checkpoint, or from the start if there is none yet.
+        progress: Show it on stderr: a bar on a terminal, a line for each preview elsewhere.
+    Raises:
+        ValueError: On a bad config, data set or run folder, and when losses stay not finite.
+        KeyboardInterrupt: Passed on after a checkpoint and the PLY have been written.
+    """
+    config = config or FitConfig()
+    if config.deterministic:
+        import drjit as dr
+
+        drgs.runtime.backend()
+        # Atomic additions of several threads come in any order, and float additions do not commute with that.
+        dr.set_thread_count(1)
+    train, test = dataset.split(config.test_every)
+    frames = load_frames(train, config.max_pixels, config.mask)
+    held_out = load_frames(test, config.max_pixels, config.mask)
+    run = Run(out_dir)
+    if resume and run.state.is_file():
+        tensors, header = load_state(run.state)
+        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path))
+        seconds, source = header["seconds"], header["point_source"]
+    else:
+        trainer, source = _start(dataset, train, frames, config)
+        seconds = 0.0
+    recorded = {
+        "command": "fit",
+        "data": str(Path(dataset.path).resolve()),
+        "format": dataset.format,
+        "split_rule": dataset.split_rule(config.test_every),
+        "train": [frame.name for frame in frames],
+        "test": [frame.name for frame in held_out],
+        "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
+        "masks": sorted({_mask_kind(frame) for frame in frames}),
+        "points": source,
+        "fit": config.to_json(),
+    }
+    run.start(recorded, resume=resume)
+    run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.model))
+    loop = _Loop(run, trainer, held_out, source, seconds)
+    with _Progress(config.max_steps, trainer.step_index, progress) as bar:
+        loop.run(bar)
+    g = trainer.gaussians()
+    result = metrics.evaluate(g, held_out, config.settings, pictures=run.renders / "test")
+    written = metrics.write_metrics(
+        run,
+        "test",
+        held_out,
+        result,
+        split_rule=recorded["split_rule"],
+        gaussians=len(g),
+        step=trainer.step_index,
+        seconds=loop.seconds,
+        bad_steps=trainer.bad_steps,
+    )
+    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"])
+    return FitResult(g, written, run, loop.seconds)
+
+
+def run_fit(args: Fit) -> None:
+    """`drgs fit DATA -o RUN`."""
+    from drgs.data import load
+
+    settings = args.settings().replace(background=args.background)
+    names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
+    config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
+    if not args.resume and (args.output / "config.json").exists():
+        # Found out before minutes of reading images and triangulating points.
+        raise ValueError(f"{args.output}: must be a new run folder, holds a run already; add --resume or choose another")
+    dataset = load(args.data, test_every=config.test_every, background=config.settings.background)
+    result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet)
+    metrics.print_table(result.metrics)
+    print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
+
+
+def _start(dataset: Dataset, train: list, frames: list[Frame], config: FitConfig) -> tuple[Trainer, str]:
+    """A trainer at step 0, and where its points come from."""
+    from drgs.data import initial_points, scene_extent
+
+    if not frames:
+        raise ValueError("fit: there must be at least one training view, got none; add photographs")
+    # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
+    given = config.init_points == "auto" and dataset.points is not None
+    points, colors, source = initial_points(
+        dataset if given else train, seed=config.seed, max_points=config.max_gaussians
+    )
+    extent = scene_extent([frame.camera for frame in frames], points)
+    model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), config.initial_opacity)
+    _log.info("%d initial points: %s", len(points), source)
+    return Trainer(config, frames, model, extent), source
+
+
+class _Loop:
+    """Steps, and the files that are due at them."""
+
+    def __init__(self, run: Run, trainer: Trainer, held_out: list[Frame], source: str, seconds: float):
+        self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
+        self.seconds = seconds
+        self._recent: list[dict] = []
+
+    def run(self, bar: _Progress) -> None:
+        trainer, config = self.trainer, self.trainer.config
+        preview_every = max(1, config.max_steps // _PREVIEWS)
+        try:
+            while trainer.step_index < config.max_steps:
+                began = time.perf_counter()
+                row = trainer.step()
+                self.seconds += time.perf_counter() - began
+                done = trainer.step_index
+                self._log(row)
+                bar.update(done, row["psnr"], len(trainer.model))
+                if done % preview_every == 0:
+                    self._preview(bar)
+                if done % config.save_every == 0 and done < config.max_steps:
+                    self.save()
+        except KeyboardInterrupt:
+            self.run_folder.log("interrupted", step=trainer.step_index)
+            self.save()
+            raise
+        self.save()
+
+    def save(self) -> None:
+        """The PLY, then the checkpoint."""
+        tensors, header = self.trainer.state()
+        save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
+        header |= {"seconds": self.seconds, "point_source": self.source}
+        save_state(self.run_folder.state, tensors, header)
+        self.run_folder.log("checkpoint", step=self.trainer.step_index)
+
+    def _log(self, row: dict) -> None:
+        done = self.trainer.step_index
+        for event in row["events"]:
+            self.run_folder.log(event.pop("event"), step=done - 1, **event)
+        self._recent.append(row)
+        if done % _LOG_EVERY == 0 or done == self.trainer.config.max_steps:
+            psnr = [r["psnr"] for r in self._recent if r["psnr"] is not None]
+            loss = [r["loss"] for r in self._recent if math.isfinite(r["loss"])]
+            self.run_folder.log(
+                "train",
+                step=done,
+                loss=float(np.mean(loss)) if loss else None,
+                psnr=float(np.mean(psnr)) if psnr else None,
+                gaussians=len(self.trainer.model),
+                seconds=self.seconds,
+            )
+            self._recent = []
+
+    def _preview(self, bar: _Progress) -> None:
+        """One picture, and the PSNR of all held-out views."""
+        trainer, done = self.trainer, self.trainer.step_index
+        frames = self.held_out or trainer.frames[:1]
+        values = []
+        for i, frame in enumerate(frames):
+            with torch.no_grad():
+                image = drgs.render(trainer.gaussians(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
+            values.append(metrics.psnr(image, frame.image(), frame.mask))
+            if i == 0:
+                pair = torch.cat([frame.image(), image], dim=1)
+                metrics.save_png(self.run_folder.renders / f"preview_{done:06d}.png", pair)
+        psnr = float(np.mean(values)) if self.held_out else None
+        self.run_folder.log("preview", step=done, test_psnr=psnr, gaussians=len(trainer.model), seconds=self.seconds)
+        bar.report(done, psnr, len(trainer.model), self.seconds)
+
+
+class _Progress:
+    """A bar on a terminal, lines elsewhere, nothing when not asked for; always on stderr."""
+
+    def __init__(self, total: int, done: int, show: bool):
+        self._show, self._total, self._done = show, total, done
+        self._bar = self._psnr = None
+
+    def __enter__(self) -> _Progress:
+        if self._show and sys.stderr.isatty():
+            from rich import progress
+            from rich.console import Console
+
+            self._bar = progress.Progress(
+                progress.TextColumn("fit"),
+                progress.BarColumn(),
+                progress.MofNCompleteColumn(),
+                progress.TextColumn("{task.fields[psnr]} dB  {task.fields[count]} Gaussians  {task.fields[rate]} it/s"),
+                progress.TimeRemainingColumn(),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self._bar.start()
+            self._task = self._bar.add_task("fit", total=self._total, completed=self._done, psnr="", count="", rate="")
+        self._began = time.perf_counter()
+        return self
+
+    def __exit__(self, *_) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def update(self, done: int, psnr: float | None, count: int) -> None:
+        if not self._bar:
+            return
+        if psnr is not None:
+            self._psnr = psnr if self._psnr is None else 0.98 * self._psnr + 0.02 * psnr
+        rate = (done - self._done) / (time.perf_counter() - self._began)
+        shown = "" if self._psnr is None else f"{self._psnr:.2f}"
+        self._bar.update(self._task, completed=done, psnr=shown, count=count, rate=f"{rate:.1f}")
+
+    def report(self, done: int, psnr: float | None, count: int, seconds: float) -> None:
+        if self._show and not self._bar:
+            held_out = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
+            text = f"step {done} of {self._total}: {count} Gaussians{held_out}, {seconds:.0f} s"
+            print(text, file=sys.stderr, flush=True)
+
+
+def _mask_kind(frame: Frame) -> str:
+    if frame.mask is None:
+        return "none"
+    return "object" if frame.is_object else "valid"

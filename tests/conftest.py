@@ -1,0 +1,91 @@
+"""What every test gets: fixed seeds, two threads, a clean slate afterwards, and skips that say why.
+
+The suite runs on the backend that DRGS_VARIANT names (default LLVM, so that a machine with a card
+tests the CPU unless asked otherwise). Nothing heavy is imported until a test does so itself.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+import zlib
+from pathlib import Path
+
+import pytest
+
+# Before torch or Dr.Jit is imported, and inherited by the processes that tests start.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"):
+    os.environ.setdefault(_name, "2")
+os.environ.setdefault("DRGS_VARIANT", "llvm_ad_rgb")
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser):
+    """`--slow` runs the tests marked slow as well."""
+    parser.addoption("--slow", action="store_true", help="run tests marked slow")
+
+
+@pytest.fixture(autouse=True)
+def _skip_by_marker(request):
+    if request.node.get_closest_marker("slow") and not request.config.getoption("--slow"):
+        pytest.skip("slow: run with --slow")
+    if request.node.get_closest_marker("cuda"):
+        from drgs import runtime
+
+        usable, reason = runtime.cuda_status()
+        if not usable:
+            pytest.skip(f"no CUDA: {reason}")
+
+
+@pytest.fixture(autouse=True)
+def _isolated(request):
+    """Seed everything from the test's own name; put back what a test may change."""
+    seed = zlib.crc32(request.node.nodeid.encode())
+    random.seed(seed)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(seed)
+    environ, directory, path = dict(os.environ), os.getcwd(), list(sys.path)
+    flags = _flags()
+    yield
+    os.environ.clear()
+    os.environ.update(environ)
+    os.chdir(directory)
+    sys.path[:] = path
+    if "drjit" in sys.modules:
+        # A kernel still running would write into buffers that the next test reuses.
+        sys.modules["drjit"].sync_thread()
+        for flag, value in flags.items():
+            sys.modules["drjit"].set_flag(flag, value)
+    if "torch" in sys.modules:
+        torch = sys.modules["torch"]
+        torch.set_grad_enabled(True)
+        torch.set_default_dtype(torch.float32)
+        torch.use_deterministic_algorithms(False)
+
+
+def _flags() -> dict:
+    """Dr.Jit's settings that a test may switch; empty while Dr.Jit is not imported."""
+    if "drjit" not in sys.modules:
+        return {}
+    dr = sys.modules["drjit"]
+    names = ("Debug", "FastMath", "KernelHistory", "OptimizeLoops", "SymbolicLoops")
+    return {getattr(dr.JitFlag, name): dr.flag(getattr(dr.JitFlag, name)) for name in names}
+
+
+@pytest.fixture
+def rng(request):
+    """A NumPy generator whose seed is the test's name: the same numbers alone and in the suite."""
+    import numpy as np
+
+    return np.random.default_rng(zlib.crc32(request.node.nodeid.encode()))
+
+
+@pytest.fixture(scope="session")
+def data_dir():
+    """Folder of real data sets: DRGS_DATA, or ../shared/data beside the checkout."""
+    folder = Path(os.environ.get("DRGS_DATA") or ROOT.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no real data: {folder} does not exist (set DRGS_DATA)")
+    return folder

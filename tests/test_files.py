@@ -1,0 +1,289 @@
+"""Claims of drgs.files: bit-exact PLY, headers that lie are refused before reading, atomic files, run folders."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+
+from drgs import files
+from drgs.ellipsoids import Gaussians
+from drgs.files import Run, load_ply, load_state, save_ply, save_state
+
+INRIA_HEADER = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex {n}\n"
+    + "".join(
+        f"property float {c}\n"
+        for c in (
+            *"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45)),
+            "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+        )
+    )
+    + "end_header\n"
+)  # fmt: skip
+
+
+def inria_bytes(rng, n=7):
+    """A file as INRIA's trainer writes it, from random bit patterns that are finite."""
+    data = rng.standard_normal((n, 62)).astype("<f4")
+    data[:, 3:6] = 0
+    return INRIA_HEADER.format(n=n).encode() + data.tobytes(), data
+
+
+def gaussians(n=5, degree=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(normal(n, 3), normal(n, 4), normal(n, 3), normal(n), normal(n, (degree + 1) ** 2, 3))
+
+
+def write(path, header, body=b""):
+    path.write_bytes(header.encode() + body)
+    return path
+
+
+def header(columns, n=1, kind="float", form="binary_little_endian", element="vertex"):
+    lines = [f"property {kind} {c}\n" for c in columns]
+    return f"ply\nformat {form} 1.0\nelement {element} {n}\n{''.join(lines)}end_header\n"
+
+
+BASE = [*"xyz", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3))]
+BASE += [f"rot_{i}" for i in range(4)]
+
+
+def test_inria_file_round_trips_byte_for_byte(tmp_path, rng):
+    """Load and save give back INRIA's file, header included, and f_rest is read channel by channel."""
+    data, table = inria_bytes(rng)
+    (tmp_path / "a.ply").write_bytes(data)
+    g = load_ply(tmp_path / "a.ply")
+    save_ply(g, tmp_path / "b.ply")
+    assert (tmp_path / "b.ply").read_bytes() == data
+    assert g.sh_degree == 3
+    assert np.array_equal(g.sh[:, 1, :].numpy(), table[:, [9, 24, 39]])
+    assert np.array_equal(g.quats.numpy(), table[:, 58:62])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_degree_round_trips_bit_for_bit(tmp_path, degree):
+    """float32 bits survive, denormals and negative zero included."""
+    g = gaussians(degree=degree)
+    g.means[0] = torch.tensor([-0.0, 1e-42, 3e38])
+    save_ply(g, tmp_path / "a.ply")
+    back = load_ply(tmp_path / "a.ply")
+    for name, value in g.parameters().items():
+        assert torch.equal(value.view(torch.int32), back.parameters()[name].view(torch.int32)), name
+
+
+def test_columns_in_any_order_without_normals_and_with_extras(tmp_path, rng, caplog):
+    """gsplat's layout has no normals; columns of others are reported and left out; doubles are rounded."""
+    columns = [*BASE[::-1], "semantic_0"]
+    table = rng.standard_normal((4, len(columns)))
+    write(tmp_path / "a.ply", header(columns, 4, "double"), table.astype("<f8").tobytes())
+    with caplog.at_level(logging.WARNING):
+        g = load_ply(tmp_path / "a.ply")
+    assert "left out 1 columns that are not 3DGS: semantic_0" in caplog.text
+    assert np.array_equal(g.means.numpy(), table[:, [columns.index(c) for c in "xyz"]].astype(np.float32))
+    assert g.sh.shape == (4, 1, 3)
+
+
+def test_ascii_and_big_endian_files_load(tmp_path):
+    """PLY is PLY: text and big-endian files carry the same Gaussians."""
+    values = np.arange(1, 15, dtype=np.float32)
+    write(tmp_path / "a.ply", header(BASE, form="ascii"), " ".join(map(str, values)).encode() + b"\n")
+    write(tmp_path / "b.ply", header(BASE, form="binary_big_endian"), values.astype(">f4").tobytes())
+    a, b = load_ply(tmp_path / "a.ply"), load_ply(tmp_path / "b.ply")
+    assert torch.equal(a.quats, b.quats)
+    assert a.quats[0].tolist() == [11, 12, 13, 14]
+
+
+def test_origin_is_added_on_saving(tmp_path):
+    """Means relative to an origin are stored in the world."""
+    g = gaussians(2).replace(origin=np.array([100.0, 0, -5]))
+    save_ply(g, tmp_path / "a.ply")
+    want = (g.means.double().numpy() + g.origin).astype(np.float32)
+    assert np.array_equal(load_ply(tmp_path / "a.ply").means.numpy(), want)
+
+
+def test_zero_gaussians_round_trip(tmp_path):
+    """An empty scene is a scene."""
+    save_ply(gaussians(0), tmp_path / "a.ply")
+    assert len(load_ply(tmp_path / "a.ply")) == 0
+
+
+@pytest.mark.parametrize("n", [10**12, 10**30])
+def test_claimed_vertices_allocate_nothing(tmp_path, n):
+    """A header that claims 10^12 vertices is refused from the file's size alone."""
+    write(tmp_path / "a.ply", header(BASE, n), b"\0" * 560)
+    load = pytest.raises(ValueError, match=rf"claims {n} vertex .* the file holds 560 bytes; it is truncated")
+    tracemalloc.start()
+    with load:
+        load_ply(tmp_path / "a.ply")
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+
+
+def test_bad_files_are_refused_in_one_line(tmp_path, rng):
+    """Each bad input names the file, what must hold, what was got and what to do."""
+    good, _ = inria_bytes(rng)
+    point_cloud = header([*"xyz", "red", "green", "blue"], 1), b"\0" * 24
+    packed = header(["packed_position", "packed_rotation"], 1, "uint"), b"\0" * 8
+    nan = np.ones(14, "<f4")
+    nan[7] = np.nan
+    cases = {
+        "not a PLY": (good[10:], r"must be a PLY file, got b'"),
+        "empty": (b"", r"must be a PLY file, got b''"),
+        "truncated": (good[:-1], r"claims 7 vertex \(1736 bytes\), the file holds 1735 bytes"),
+        "text truncated": (header(BASE, 3, form="ascii").encode() + b"1 2 3\n", r"claims 3 vertex \(84 bytes\)"),
+        "text of words": (header(BASE, form="ascii").encode() + b"a " * 14, r"must be a readable PLY, got"),
+        "missing": (header(BASE[:-2]).encode() + b"\0" * 48, r"vertex columns .*rot_2, rot_3 missing; export"),
+        "points": (point_cloud[0].encode() + point_cloud[1], r"plain point cloud, fit Gaussians with `drgs fit`"),
+        "packed": (packed[0].encode() + packed[1], r"PlayCanvas' compressed layout"),
+        "no vertex": (header(BASE, element="face").encode() + b"\0" * 56, r"must have an element `vertex`"),
+        "f_rest": (header([*BASE, "f_rest_0"]).encode() + b"\0" * 60, r"0, 9, 24 or 45 columns .*, got 1;"),
+        "header": (b"ply\nformat binary_little_endian 1.0\nelement vertex -3\nend_header\n", r"well-formed, got 'ele"),
+        "NaN": (header(BASE).encode() + nan.tobytes(), r"log_scales must be finite, got .* at index 0"),
+        "quaternion": (header(BASE).encode() + b"\0" * 56, r"quats must not be 0"),
+    }  # fmt: skip
+    for name, (data, message) in cases.items():
+        path = tmp_path / "bad.ply"
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=message) as caught:
+            load_ply(path)
+        assert str(caught.value).startswith(str(path)), name
+        assert "\n" not in str(caught.value), name
+    with pytest.raises(FileNotFoundError, match=r"none\.ply: must be a PLY file, found none"):
+        load_ply(tmp_path / "none.ply")
+
+
+def test_saving_refuses_what_is_not_finite_and_keeps_the_old_file(tmp_path):
+    """A bad save leaves the file that was there."""
+    g = gaussians()
+    save_ply(g, tmp_path / "a.ply")
+    before = (tmp_path / "a.ply").read_bytes()
+    bad = g.replace(means=g.means.clone())
+    bad.means[3, 1] = torch.inf
+    with pytest.raises(ValueError, match="save_ply: means must be finite, got .* at index 3"):
+        save_ply(bad, tmp_path / "a.ply")
+    assert (tmp_path / "a.ply").read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.ply"]
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("wolf/wolf.ply", 90_586),
+        ("train_1000/train-1000.ply", 1_000),
+        ("pc_short/pc_short.ply", 100),
+        ("three_points/test-splat.3-points-from-train.ply", 3),
+    ],
+)
+def test_real_files_round_trip(data_dir, tmp_path, name, count):
+    """Files that other programs wrote come back bit for bit, all columns of them."""
+    path = data_dir / "splats" / name
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    g = load_ply(path)
+    assert (len(g), g.sh_degree) == (count, 3)
+    save_ply(g, tmp_path / "a.ply")
+    body = path.read_bytes().split(b"end_header\n", 1)[1]
+    table = np.frombuffer(body[: count * 248], "<f4").reshape(count, 62).copy()  # pc_short goes on
+    table[:, 3:6] = 0  # normals, which mean nothing here; 0 in INRIA's own files
+    assert (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)[1] == table.tobytes()
+
+
+@pytest.mark.real_data
+def test_other_formats_are_refused(data_dir):
+    """A .splat file is no PLY, and the error says so."""
+    path = data_dir / "splats" / "minimal" / "minimal.splat"
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    with pytest.raises(ValueError, match="must be a PLY file"):
+        load_ply(path)
+
+
+def test_state_round_trips(tmp_path):
+    """Tensors come back bit for bit, generator states included, with their header."""
+    state = {"means": torch.randn(3, 3), "rng": torch.get_rng_state()}
+    save_state(tmp_path / "s.safetensors", state, {"step": 7})
+    tensors, head = load_state(tmp_path / "s.safetensors")
+    assert head == {"schema": files.SCHEMA, "step": 7}
+    assert all(torch.equal(tensors[name], value) for name, value in state.items())
+
+
+def test_bad_states_are_refused(tmp_path):
+    """Missing, damaged and foreign checkpoints each have their line."""
+    path = tmp_path / "s.safetensors"
+    with pytest.raises(FileNotFoundError, match="must be a checkpoint, found none"):
+        load_state(path)
+    save_state(path, {"x": torch.zeros(100)}, {})
+    path.write_bytes(path.read_bytes()[:-8])
+    with pytest.raises(ValueError, match="must be a checkpoint, got"):
+        load_state(path)
+    path.write_bytes((10**12).to_bytes(8, "little") + b"{}")
+    with pytest.raises(ValueError, match="must be a checkpoint, got"):
+        load_state(path)
+    from safetensors.torch import save_file
+
+    save_file({"x": torch.zeros(2)}, path)
+    with pytest.raises(ValueError, match="checkpoint schema must be 1, got None"):
+        load_state(path)
+
+
+def test_killed_writer_leaves_the_old_file(tmp_path):
+    """A process that dies in the middle of a write leaves the complete old file under its name."""
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    code = (
+        "import os, sys; from drgs.files import atomic_write\n"
+        "with atomic_write(sys.argv[1]) as f:\n"
+        "    f.write(b'n' * 100000); f.flush(); os._exit(9)"
+    )
+    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == 9
+    assert path.read_bytes() == b"old"
+
+
+def test_run_folder(tmp_path):
+    """Config and environment are recorded, events appended, and a run is not overwritten by accident."""
+    run = Run(tmp_path / "runs" / "a")
+    run.start({"seed": 3})
+    run.log("step", step=1, loss=0.5)
+    with (run.path / "log.jsonl").open("ab") as file:
+        file.write(b'{"schema": 1, "eve')  # killed while writing
+    assert [e["event"] for e in run.events()] == ["step"]
+    with pytest.raises(ValueError, match="must be a new run folder, holds a run already; add --resume"):
+        run.start({"seed": 4})
+    assert run.config() == {"schema": 1, "seed": 3}
+    run.start({"seed": 3}, resume=True)
+    run.log("resume", step=1)
+    assert [e["event"] for e in run.events()] == ["step", "resume"]
+    assert {"backend", "packages", "cpu", "commit"} <= set(json.loads((run.path / "env.json").read_text()))
+
+
+def test_bad_run_folders_are_refused(tmp_path):
+    """No run, a damaged config and a newer schema each have their line."""
+    with pytest.raises(FileNotFoundError, match="must be a run folder, found no config.json"):
+        Run(tmp_path).config()
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(ValueError, match="must be valid JSON"):
+        Run(tmp_path).config()
+    (tmp_path / "config.json").write_text('{"schema": 99}')
+    with pytest.raises(ValueError, match="schema must be 1, got 99"):
+        Run(tmp_path).config()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="must be a folder, is a file"):
+        Run(tmp_path / "file").start({})
+
+
+def test_json_refuses_nan(tmp_path):
+    """A metric that is not a number must be null with a reason, never NaN in a file."""
+    with pytest.raises(ValueError, match="Out of range float"):
+        files.write_json(tmp_path / "a.json", {"psnr": float("nan")})
+    assert not (tmp_path / "a.json").exists()

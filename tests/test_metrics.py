@@ -1,0 +1,147 @@
+"""Claims of drgs.metrics: values against their definitions, masks, and what is missing is null with a reason."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from drgs import metrics
+from drgs.cameras import orbit
+from drgs.frames import Frame
+from drgs.settings import RenderSettings
+
+
+def images(rng, height=40, width=50):
+    a, b = (torch.from_numpy(rng.random((height, width, 3), dtype=np.float32)) for _ in range(2))
+    return a, 0.8 * a + 0.2 * b
+
+
+def test_psnr_is_its_definition(rng):
+    """-10 log10(MSE), inside the mask where there is one, and 100 for equal images."""
+    a, b = images(rng)
+    assert metrics.psnr(a, b) == pytest.approx(-10 * math.log10(float(((a - b) ** 2).mean())), abs=1e-4)
+    mask = torch.zeros(40, 50)
+    mask[:, :10] = 1
+    inside = float(((a - b)[:, :10] ** 2).mean())
+    assert metrics.psnr(a, b, mask) == pytest.approx(-10 * math.log10(inside), abs=1e-4)
+    assert metrics.psnr(a, a) == 100
+    with pytest.raises(ValueError, match="the mask must keep at least one pixel"):
+        metrics.psnr(a, b, torch.zeros(40, 50))
+
+
+def test_ssim_is_the_published_window(rng):
+    """Equals SSIM written out in float64 with an 11x11 window of sigma 1.5, without padding, to 1e-4."""
+    a, b = images(rng)
+    kernel = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
+    kernel = torch.outer(kernel, kernel)[None, None] / kernel.sum() ** 2
+
+    def blur(x):
+        return torch.nn.functional.conv2d(x.double().permute(2, 0, 1)[:, None], kernel)
+
+    ma, mb = blur(a), blur(b)
+    va, vb, vab = blur(a * a) - ma**2, blur(b * b) - mb**2, blur(a * b) - ma * mb
+    value = (2 * ma * mb + 1e-4) * (2 * vab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+    assert metrics.ssim(a, b) == pytest.approx(float(value.mean()), abs=1e-4)
+    assert metrics.ssim(a, a) == pytest.approx(1, abs=1e-5)
+
+
+def test_flip_orders_errors(rng):
+    """0 for equal images, larger for a larger error, in [0, 1]."""
+    a, b = images(rng)
+    small, large = metrics.flip(0.9 * a + 0.1 * b, a), metrics.flip(b, a)
+    assert metrics.flip(a, a) == pytest.approx(0, abs=1e-4)
+    assert 0 < small < large < 1
+
+
+class Rendered:
+    def __init__(self, rgb):
+        self.rgb = rgb
+
+
+def evaluate(monkeypatch, image, frames, **options):
+    monkeypatch.setattr("drgs.render", lambda g, camera, settings: Rendered(image), raising=False)
+    return metrics.evaluate(None, frames, RenderSettings.preset("fast"), **options)
+
+
+def frame(pixels, mask=None, name="a/b 1"):
+    height, width = pixels.shape[:2]
+    return Frame(name, orbit((0, 0, 0), 3, 1, width=width, height=height)[0], pixels, mask)
+
+
+def test_evaluation_is_per_view_and_mean_with_pictures(rng, monkeypatch, tmp_path):
+    """Means over views, pictures by name, LPIPS null with its reason."""
+    a, b = images(rng)
+    result = evaluate(monkeypatch, b, [frame(a), frame(b, name="c")], pictures=tmp_path)
+    psnr = metrics.psnr(b, a)
+    assert [v["psnr"] for v in result["views"]] == [pytest.approx(psnr), 100]
+    assert result["mean"]["psnr"] == pytest.approx((psnr + 100) / 2)
+    assert result["mean"]["lpips"] is None
+    assert "--lpips-weights" in result["reasons"]["lpips"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a_b_1.png", "c.png"]
+    assert set(result["variants"]) == set(metrics.METRICS) == set(result["mean"])
+
+
+def test_masked_evaluation_ignores_what_is_outside(rng, monkeypatch):
+    """Errors outside the mask change nothing."""
+    a, b = images(rng)
+    mask = torch.zeros(40, 50)
+    mask[5:35, 5:45] = 1
+    inside = torch.where(mask[..., None] > 0, a, b)
+    row = evaluate(monkeypatch, inside, [frame(a, mask)])["views"][0]
+    assert row["psnr"] == 100
+    assert row["ssim"] == pytest.approx(1, abs=1e-5)
+    assert row["flip"] == pytest.approx(0, abs=1e-4)
+
+
+def test_missing_metrics_say_why(rng, monkeypatch):
+    """No held-out view, or images smaller than a window: None and a reason, never a number."""
+    empty = evaluate(monkeypatch, None, [])
+    assert set(empty["mean"].values()) == {None}
+    assert empty["reasons"]["psnr"] == "no view is held out"
+    a, b = images(rng, 8, 8)
+    result = evaluate(monkeypatch, b, [frame(a)])
+    assert result["mean"]["ssim"] is None
+    assert "smaller than the 11x11 window" in result["reasons"]["ssim"]
+
+
+@pytest.mark.parametrize("name", ["alex", "vgg"])
+def test_lpips_reads_a_backbone_from_a_file(tmp_path, rng, name):
+    """Random weights with torchvision's names load without a download, and give 0 for equal images."""
+    pytest.importorskip("lpips")
+    torchvision = pytest.importorskip("torchvision")
+    build = {"alex": torchvision.models.alexnet, "vgg": torchvision.models.vgg16}[name]
+    state = {k: v for k, v in build(weights=None).state_dict().items() if k.startswith("features")}
+    torch.save(state, tmp_path / "w.pth")
+    lpips = metrics.Lpips(tmp_path / "w.pth")
+    a, b = images(rng, 64, 64)
+    assert lpips.backbone == name
+    assert lpips(a, a) == 0
+    assert lpips(b, a) > 0
+    first = next(lpips._model.net.parameters())
+    assert torch.equal(first, state["features.0.weight"])
+
+
+def test_bad_weights_are_refused(tmp_path):
+    """Missing, damaged, foreign and incomplete files each have their line; nothing is unpickled."""
+    pytest.importorskip("lpips")
+    path = tmp_path / "w.pth"
+    with pytest.raises(FileNotFoundError, match="must be weights of AlexNet or VGG16, found none"):
+        metrics.Lpips(path)
+    path.write_bytes(b"garbage")
+    with pytest.raises(ValueError, match="must be readable weights"):
+        metrics.Lpips(path)
+    torch.save({"x": torch.zeros(1)}, path)
+    with pytest.raises(ValueError, match="must be the state dictionary of torchvision's AlexNet or VGG16"):
+        metrics.Lpips(path)
+    torch.save({"features.0.weight": torch.zeros(64, 3, 11, 11)}, path)
+    with pytest.raises(ValueError, match="must hold every convolution of alex"):
+        metrics.Lpips(path)
+    torch.save({"x": Malicious()}, path)
+    with pytest.raises(ValueError, match="must be readable weights"):
+        metrics.Lpips(path)
+
+
+class Malicious:
+    def __reduce__(self):
+        return (print, ("unpickled",))
