@@ -5,14 +5,16 @@ Conventions, stated once for the whole project:
 - Camera axes are OpenCV's: +x right, +y down, +z forward (COLMAP and gsplat agree).
 - ``w2c`` (4,4) maps homogeneous world points to camera points, ``c2w`` is its inverse.
 - ``K`` (3,3) is ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels. The image spans
-  [0, width] x [0, height]; the center of pixel (column i, row j) lies at (i + 0.5, j + 0.5). Resizing an image
-  by s therefore multiplies fx, cx (and fy, cy) by s exactly. OpenCV functions that resample images count pixel
-  centers at integers, so they get ``cx - 0.5, cy - 0.5``; functions on points need no shift.
-- Distortion is OpenCV's: model ``opencv`` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model ``opencv_fisheye`` with
-  (k1, k2, k3, k4) on the angle; ``pinhole`` has none.
-- Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right,
-  +y up, looking along -z), LLFF ``poses_bounds`` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
-  looking along +z). World axes never change, only the camera's.
+  [0, width] x [0, height]; the center of pixel (column i, row j) lies at (i + 0.5, j + 0.5).
+  Resizing an image by s therefore multiplies fx, cx (and fy, cy) by s exactly. OpenCV functions
+  that resample images count pixel centers at integers, so they get ``cx - 0.5, cy - 0.5``;
+  functions on points need no shift.
+- Distortion is OpenCV's: model ``opencv`` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model
+  ``opencv_fisheye`` with (k1, k2, k3, k4) on the angle; ``pinhole`` has none.
+- Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio
+  cameras (+x right, +y up, looking along -z), LLFF ``poses_bounds`` columns (down, right, backward)
+  and Mitsuba cameras (+x left, +y up, looking along +z). World axes never change, only the
+  camera's.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ __all__ = [
 
 _OPENCV_LENGTHS = (4, 5, 8)
 _ROTATION_TOLERANCE = 1e-4
-# An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
+# An undistorted pixel must come back to itself; beyond this many pixels the lens model has no
+# inverse there.
 _INVERSE_TOLERANCE = 1e-3
 
 
@@ -60,7 +63,8 @@ class Camera:
 
     Attributes:
         K: (3,3) float64 intrinsics in pixels.
-        w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that gradients reach it.
+        w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that
+            gradients reach it.
         width, height: image size in pixels.
         model: ``pinhole``, ``opencv`` or ``opencv_fisheye``.
         distortion: coefficients in OpenCV's order; empty for ``pinhole``.
@@ -89,7 +93,8 @@ class Camera:
             value = getattr(self, axis)
             if int(value) != value or value < 1:
                 raise ValueError(
-                    f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct it"
+                    f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct "
+                    "it"
                 )
             put(axis, int(value))
         put("distortion", _checked_distortion(where, self.model, self.distortion))
@@ -139,17 +144,19 @@ class Camera:
             points: (P,3) world points.
 
         Returns:
-            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses, which may
-            see behind themselves.
+            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye
+            lenses, which may see behind themselves.
         """
         w2c = _as_numpy(self.w2c).astype(np.float64)
         local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ w2c[:3, :3].T + w2c[:3, 3]
         return self._project_local(local), local[:, 2]
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
-        """A Mitsuba ``perspective`` sensor as a dictionary for ``mi.load_dict`` (box filter, one sample a pixel).
+        """A Mitsuba ``perspective`` sensor as a dictionary for ``mi.load_dict`` (box filter, one
+        sample a pixel).
 
-        Mitsuba's film has square pixels, so fx and fy may differ by no more than 0.1 pixel at the image border.
+        Mitsuba's film has square pixels, so fx and fy may differ by no more than 0.1 pixel at the
+        image border.
 
         Args:
             near, far: clip distances in scene units. Mitsuba's rays start at the near plane.
@@ -205,7 +212,8 @@ class Camera:
             bad = int(np.count_nonzero(~(error < _INVERSE_TOLERANCE)))
             if bad:
                 warnings.warn(
-                    f"Camera {self.name!r}: the {self.model} lens cannot be inverted at {bad} of {len(pixels)} pixels; "
+                    f"Camera {self.name!r}: the {self.model} lens cannot be inverted at {bad} of "
+                    f"{len(pixels)} pixels; "
                     "their rays are approximate, mask them or check the coefficients",
                     stacklevel=3,
                 )
@@ -253,7 +261,9 @@ def c2w_to_opengl(c2w: np.ndarray) -> np.ndarray:
 
 
 def c2w_from_llff(pose: np.ndarray) -> np.ndarray:
-    """LLFF pose (3,4) or (3,5), camera axes in columns (down, right, backward), to an OpenCV camera-to-world (4,4)."""
+    """LLFF pose (3,4) or (3,5), camera axes in columns (down, right, backward), to an OpenCV
+    camera-to-world (4,4).
+    """
     pose = np.asarray(pose, dtype=np.float64)
     c2w = np.eye(4)
     c2w[:3, 0], c2w[:3, 1], c2w[:3, 2], c2w[:3, 3] = pose[:, 1], pose[:, 0], -pose[:, 2], pose[:, 3]
@@ -265,7 +275,8 @@ def c2w_to_mitsuba(c2w: np.ndarray) -> np.ndarray:
     return np.asarray(c2w, dtype=np.float64) @ _MITSUBA_FLIP
 
 
-# ------------------------------------------------------------------------------------------------- making cameras
+# -------------------------------------------------------------------------------------------------
+# making cameras
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -292,13 +303,16 @@ def intrinsics_from_fov(fov: float, width: int, height: int, axis: str = "x") ->
 
 
 def look_at(eye: Any, target: Any, up: Any = (0.0, 0.0, 1.0)) -> np.ndarray:
-    """(4,4) float64 w2c of a camera at ``eye`` looking at ``target``, ``up`` (world) pointing up in its image."""
+    """(4,4) float64 w2c of a camera at ``eye`` looking at ``target``, ``up`` (world) pointing up
+    in its image.
+    """
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     forward = target - eye
     right = np.cross(forward, up)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
         raise ValueError(
-            f"look_at: eye, target and up must not lie on one line, got {eye}, {target}, {up}; move one of them"
+            f"look_at: eye, target and up must not lie on one line, got {eye}, {target}, {up}; "
+            "move one of them"
         )
     forward /= np.linalg.norm(forward)
     right /= np.linalg.norm(right)
@@ -328,7 +342,8 @@ def orbit(
         elevation: degrees above the plane through ``center`` that is orthogonal to ``up``.
         width, height: image size in pixels.
         fov: horizontal field of view in degrees.
-        up: (3,) world direction that points up; scenes straight out of COLMAP usually have (0, -1, 0).
+        up: (3,) world direction that points up; scenes straight out of COLMAP usually have (0, -1,
+            0).
     """
     if n < 1 or not radius > 0:
         raise ValueError(
@@ -336,7 +351,8 @@ def orbit(
         )
     center = np.asarray(center, dtype=np.float64)
     axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    # Any direction orthogonal to up serves as azimuth 0; the world axis least aligned with up is the stable choice.
+    # Any direction orthogonal to up serves as azimuth 0; the world axis least aligned with up is
+    # the stable choice.
     first = np.cross(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]), axis)
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
@@ -365,7 +381,8 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
     for index, camera in enumerate(cameras):
         if camera.is_distorted or camera.K[0, 1] != 0.0:
             raise ValueError(
-                f"{path}: cameras.json holds pinhole cameras without skew, camera {index} ({camera.name!r}) is not one; "
+                f"{path}: cameras.json holds pinhole cameras without skew, camera {index} "
+                f"({camera.name!r}) is not one; "
                 "use camera.undistorted()"
             )
         c2w = camera.c2w
@@ -390,7 +407,8 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
 
 
 def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
-    """Read cameras in INRIA's layout: a list of id, img_name, width, height, position, rotation (c2w), fx, fy[, cx, cy].
+    """Read cameras in INRIA's layout: a list of id, img_name, width, height, position, rotation
+    (c2w), fx, fy[, cx, cy].
 
     Raises:
         FileNotFoundError: no such file.
@@ -405,7 +423,8 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
         raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
     if not isinstance(entries, list) or not entries:
         raise ValueError(
-            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see INRIA's layout"
+            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see "
+            "INRIA's layout"
         )
     cameras = []
     for index, entry in enumerate(entries):
@@ -414,7 +433,8 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
             K = intrinsics(entry["fx"], entry["fy"], entry.get("cx", w / 2), entry.get("cy", h / 2))
             c2w = np.eye(4)
             c2w[:3, :3], c2w[:3, 3] = entry["rotation"], entry["position"]
-            # The rotation's transpose stands for its inverse; Camera refuses what is not a rotation.
+            # The rotation's transpose stands for its inverse; Camera refuses what is not a
+            # rotation.
             w2c = np.eye(4)
             w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
             name = str(entry.get("img_name", entry.get("id", index)))
@@ -454,7 +474,8 @@ def _checked_intrinsics(where: str, K: Any) -> np.ndarray:
         )
     if not np.isfinite(K).all():
         raise ValueError(
-            f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct it"
+            f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct "
+            "it"
         )
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ValueError(
@@ -462,7 +483,8 @@ def _checked_intrinsics(where: str, K: Any) -> np.ndarray:
         )
     if K[1, 0] != 0 or tuple(K[2]) != (0.0, 0.0, 1.0):
         raise ValueError(
-            f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct it"
+            f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct "
+            "it"
         )
     return K
 
@@ -476,18 +498,21 @@ def _checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
     if not np.isfinite(w2c).all():
         row, column = np.argwhere(~np.isfinite(w2c))[0]
         raise ValueError(
-            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop this view"
+            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop "
+            "this view"
         )
     if np.abs(w2c[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise ValueError(
-            f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?"
+            f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it "
+            "transposed?"
         )
     rotation = w2c[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         got = f"an error of {error:.2g}" if error > _ROTATION_TOLERANCE else "a reflection"
         raise ValueError(
-            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove scale and flips"
+            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove "
+            "scale and flips"
         )
     return w2c
 
@@ -503,7 +528,8 @@ def _checked_distortion(where: str, model: str, distortion: Any) -> tuple[float,
         )
     if len(values) not in lengths:
         raise ValueError(
-            f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion coefficients, got {len(values)}; "
+            f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion "
+            f"coefficients, got {len(values)}; "
             "pad with zeros"
         )
     return values

@@ -100,7 +100,9 @@ class Model:
             [m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2] for k in range(3)] for v in (w, d)
         )
         c = (a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0)
-        inverse = dr.rcp(d0 * d0 + d1 * d1 + d2 * d2)
+        squared = d0 * d0 + d1 * d1 + d2 * d2
+        # Lanes without a candidate read zeros: 0 / 0 would spoil their (masked) derivatives.
+        inverse = dr.rcp(dr.select(squared > 0, squared, 1))
         rho2 = (c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) * inverse
         key = t0 - (a0 * d0 + a1 * d1 + a2 * d2) * inverse
         u = key * dr.rsqrt(inverse) if self.s.response == "integral" else None

@@ -10,7 +10,7 @@ import math
 
 import torch
 
-__all__ = ["photometric_loss", "ssim"]
+__all__ = ["photometric_loss", "ssim", "ssim_map"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -67,22 +67,21 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return _Ssim.apply(planes, target.permute(2, 0, 1).contiguous())
 
 
+def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """(H, W, C) structural similarity of each window, centered at each pixel; windows are zero-padded at the border."""
+    planes = (x.detach().permute(2, 0, 1).contiguous() for x in (image, target))
+    return _ssim_parts(*planes)[-1].permute(1, 2, 0)
+
+
 class _Ssim(torch.autograd.Function):
     """Mean SSIM of (C, H, W) planes; S = A1 A2 / (B1 B2) with A, B as in the paper."""
 
     @staticmethod
     def forward(ctx, x, y):
         x = x.contiguous()
-        mean_x, mean_y, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
-        product = mean_x * mean_y
-        squares = mean_x.square().add_(mean_y * mean_y)
-        a1 = 2 * product + _C1
-        a2 = 2 * (xy - product) + _C2
-        b1 = squares + _C1
-        b2 = (xx + yy).sub_(squares).add_(_C2)
-        bottom = b1 * b2
-        value = (a1 * a2).div_(bottom)
-        ctx.save_for_backward(x, y, mean_x, mean_y, a1, a2, b1, b2, bottom, value)
+        parts = _ssim_parts(x, y)
+        ctx.save_for_backward(x, y, *parts)
+        value = parts[-1]
         return value.mean()
 
     @staticmethod
@@ -94,6 +93,19 @@ class _Ssim(torch.autograd.Function):
         d_mean = (2 * mean_y * (a2 - a1)).div_(bottom).sub_(2 * mean_x * value * (1 / b1 - 1 / b2))
         d_mean, d_xx, d_xy = _blur(torch.cat([d_mean, d_xx, d_xy])).chunk(3)
         return (d_mean + 2 * x * d_xx + y * d_xy) * (grad / value.numel()), None
+
+
+def _ssim_parts(x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Blurred x and y, then a1, a2, b1, b2, b1 b2 and S = a1 a2 / (b1 b2) of (C, H, W) planes."""
+    mean_x, mean_y, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    product = mean_x * mean_y
+    squares = mean_x.square().add_(mean_y * mean_y)
+    a1 = 2 * product + _C1
+    a2 = 2 * (xy - product) + _C2
+    b1 = squares + _C1
+    b2 = (xx + yy).sub_(squares).add_(_C2)
+    bottom = b1 * b2
+    return mean_x, mean_y, a1, a2, b1, b2, bottom, (a1 * a2).div_(bottom)
 
 
 def _blur(planes: torch.Tensor) -> torch.Tensor:

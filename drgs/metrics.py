@@ -25,7 +25,7 @@ __all__ = ["METRICS", "VARIANTS", "Lpips", "evaluate", "flip", "print_table", "p
 
 VARIANTS = {
     "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
-    "ssim": "torchmetrics, 11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
+    "ssim": "11x11 Gaussian window, sigma 1.5, no padding (torchmetrics); both images black outside the mask",
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
@@ -54,11 +54,8 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Structural similarity of (H, W, 3) images in [0, 1], at least 11x11 pixels; torchmetrics' variant."""
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
-    planes = (x.permute(2, 0, 1)[None].float() for x in (image, target))
-    return float(structural_similarity_index_measure(*planes, sigma=1.5, kernel_size=11, data_range=1.0))
+    """Structural similarity of (H, W, 3) images in [0, 1], at least 11x11 pixels, see `VARIANTS`."""
+    return float(_ssim_map(image, target)[5:-5, 5:-5].mean())
 
 
 def flip(image: torch.Tensor, target: torch.Tensor) -> float:
@@ -86,8 +83,12 @@ class Lpips:
             raise FileNotFoundError(f"{weights}: must be weights of AlexNet or VGG16, found none; check --lpips-weights")
         try:
             import lpips
-        except ImportError:
-            raise FileNotFoundError("eval: LPIPS needs the package lpips, found none; pip install lpips") from None
+        except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision built for another torch
+            text = " ".join(str(error).split())
+            raise FileNotFoundError(
+                f"eval: LPIPS must have the packages lpips and torchvision, importing them failed ({text}); "
+                "install versions that belong to this torch"
+            ) from None
         state = _read_weights(weights)
         first = state.get("features.0.weight")
         shape = tuple(first.shape) if isinstance(first, torch.Tensor) else None
@@ -160,7 +161,7 @@ def evaluate(
         height, width = target.shape[:2]
         row = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
         row["psnr"] = psnr(image, frame.image(), frame.mask)
-        row["ssim_padded"] = _padded_ssim(shown, target)
+        row["ssim_padded"] = float(_ssim_map(shown, target).mean())
         row["flip"] = flip(shown, target)
         if min(height, width) >= _SSIM_MIN_SIDE:
             row["ssim"] = ssim(shown, target)
@@ -244,10 +245,10 @@ def save_png(path: Path, image: torch.Tensor) -> None:
         file.write(encoded.tobytes())
 
 
-def _padded_ssim(image: torch.Tensor, target: torch.Tensor) -> float:
-    from drgs.losses import ssim as padded
+def _ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    from drgs.losses import ssim_map
 
-    return float(padded(image.double(), target.double()))
+    return ssim_map(image.double(), target.double())
 
 
 def _file_name(name: str) -> str:

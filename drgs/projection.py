@@ -52,10 +52,12 @@ class Projected:
         bounds: Four (N,) floats x0, y0, x1, y1, in pixels, outside of which the Gaussian has no hit; detached.
         lower: (N,) float, no hit has an order key below it; detached.
         alive: (N,) mask of Gaussians that can have a hit.
+        ellipsoids: World records only: mean (3), quaternion wxyz (4) and half axes of the extent (3); detached.
     """
 
-    def __init__(self, record, key, bounds, lower, alive):
+    def __init__(self, record, key, bounds, lower, alive, ellipsoids=None):
         self.record, self.key, self.bounds, self.lower, self.alive = record, key, bounds, lower, alive
+        self.ellipsoids = ellipsoids
 
 
 def sh_basis(direction, coefficients: int) -> list:
@@ -128,7 +130,8 @@ class _Activated:
         # Dividing by the largest component first keeps the square of tiny or huge quaternions finite.
         big = dr.detach(dr.maximum(dr.maximum(abs(q[0]), abs(q[1])), dr.maximum(abs(q[2]), abs(q[3]))))
         q = _scaled(q, dr.rcp(big))
-        w, x, y, z = _scaled(q, dr.rsqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
+        self.quat = _scaled(q, dr.rsqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
+        w, x, y, z = self.quat
         self.rotation = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -420,4 +423,7 @@ def project_world(t, p, w2c, settings: RenderSettings, coefficients: int):
     if settings.near > 0:
         alive &= z > settings.near
     key = z if settings.depth_key == "z" else distance
-    return Projected(record, Float(key), None, None, alive)
+    # The proxies of `bvh` may stop where alpha_min cuts.
+    extent = _listed_extent(g, settings)
+    ellipsoids = [*g.mean, *g.quat, *[dr.detach(s) * extent for s in g.scale]]
+    return Projected(record, Float(key), None, None, alive & (extent > 0), [dr.detach(x) for x in ellipsoids])

@@ -123,10 +123,9 @@ def render(
             parts.append(_composite(*args))
     seen = sum(part.pop("visibility") for part in parts)
     fields = dict.fromkeys(parts[0])
-    for name in fields:
-        if parts[0][name] is not None:
-            joined = torch.cat([part[name] for part in parts])
-            fields[name] = joined.reshape(*shape, *joined.shape[1:])
+    for name in (name for name in fields if parts[0][name] is not None):
+        joined = torch.cat([part[name] for part in parts])
+        fields[name] = joined.reshape(*shape, *joined.shape[1:])
     seen = torch.zeros(len(g.means), dtype=torch.float64).index_add(0, scene.index, seen)
     return Output(visibility=seen, **fields)
 
@@ -155,16 +154,17 @@ def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
 
 
 def _float64(x) -> torch.Tensor:
-    """On the CPU; a tensor keeps its graph, anything else is copied."""
-    x = x if isinstance(x, torch.Tensor) else torch.tensor(x)
-    return x.to("cpu", torch.float64)
+    """A tensor keeps its graph, anything else is copied."""
+    if isinstance(x, torch.Tensor):
+        return x.to("cpu", torch.float64)
+    return torch.tensor(x, dtype=torch.float64)
 
 
 def _activate(g, s: RenderSettings) -> _Scene:
     """Activated parameters in float64, relative to the Gaussians' origin."""
     raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
     means, quats, log_scales, logits, sh = map(_float64, raw)
-    n, features = len(means), getattr(g, "features", None)
+    n = len(means)
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -182,7 +182,7 @@ def _activate(g, s: RenderSettings) -> _Scene:
         whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
         logits=logits,
         sh=sh,
-        features=None if features is None else _float64(features),
+        features=None if g.features is None else _float64(g.features),
         extent=extent,
         index=torch.arange(n),
         colors=None,  # (N, 3), or None where the color depends on the ray
@@ -198,7 +198,7 @@ def _intrinsics(cam) -> tuple[float, float, float, float]:
 def _camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixel centers (H*W, 2) and world directions (H*W, 3)."""
     v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
-    u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)
+    u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
     if getattr(cam, "model", "pinhole") == "pinhole":
         fx, fy, cx, cy = _intrinsics(cam)
         local = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], dim=-1)
@@ -233,8 +233,8 @@ def _colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
 def _project(scene: _Scene, cam, rotation, center, s: RenderSettings, tolerance: float) -> tuple:
     """Projected means (N, 2), rows of J W R S (N, 2, 3), diagonal of Sigma' (N, 2), tile bounds.
 
-    Tile bounds are three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk
-    by the tolerance, exact, grown by it. None without tile culling.
+    Tile bounds: three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by
+    the tolerance, exact, grown by it. None without tile culling.
     """
     fx, fy, cx, cy = _intrinsics(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
@@ -247,8 +247,7 @@ def _project(scene: _Scene, cam, rotation, center, s: RenderSettings, tolerance:
         elif s.fov_clamp == "gsplat":
             slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
         slopes.append(slope)
-    zero = torch.zeros_like(z)
-    jacobian = [fx / z, zero, -fx * slopes[0] / z, zero, fy / z, -fy * slopes[1] / z]
+    jacobian = [fx / z, 0 * z, -fx * slopes[0] / z, 0 * z, fy / z, -fy * slopes[1] / z]
     rows = torch.stack(jacobian, dim=-1).reshape(-1, 2, 3) @ rotation @ scene.axes
     diagonal = rows.square().sum(-1) + s.dilation
     if s.culling == "extent":
@@ -310,7 +309,6 @@ def _responses(scene: _Scene, s: RenderSettings, rotation, center, o, d, pixels)
     if s.alpha_max_gradient == "pass":
         top, left = a + (top - a).detach(), rest + (left - rest).detach()
     a, rest = torch.where(over, top, a), torch.where(over, left, rest)
-
     with torch.no_grad():
         distance = away.norm(dim=-1)
         exists, margin = torch.ones_like(over), torch.full_like(a, math.inf)
@@ -338,7 +336,7 @@ def _responses(scene: _Scene, s: RenderSettings, rotation, center, o, d, pixels)
             key = reach @ rotation[2] if s.depth_key == "z" else reach.norm(dim=-1)
         elif s.order == "entry":
             key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length2.sqrt()
-    return a, rest, t, key.expand_as(a), exists, margin, to_max, distance
+    return a, rest, t, key.detach().expand_as(a), exists, margin, to_max, distance
 
 
 def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, tolerance) -> dict:
@@ -361,16 +359,14 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
     weights = torch.zeros_like(w).scatter(1, order, w)  # back in the caller's order
     colors = scene.colors
     if colors is None:
-        from_center = scene.means - (o[:, None, :] if center is None else center)
-        colors = _colors(scene.sh, d[:, None, :] if s.sh_direction == "ray" else from_center)
-    background = torch.tensor(s.background, dtype=torch.float64)
-    end = torch.where(alive, rest, 1.0).prod(dim=1)
-    alpha = w.sum(dim=1)  # equals 1 - end, without its cancellation
-
+        towards = d[:, None, :] if s.sh_direction == "ray" else scene.means - o[:, None, :]
+        colors = _colors(scene.sh, towards)
+    background = torch.where(alive, rest, 1.0).prod(dim=1)[:, None] * _float64(s.background)
+    alpha = w.sum(dim=1)  # equals 1 - T_end, without its cancellation
     with torch.no_grad():
         # T's relative error grows with that of each 1 - a in front.
-        slack = a / rest.clamp(min=1e-300)
-        slack = tolerance * (1 + torch.where(exists, slack, 0.0).cumsum(dim=1))
+        growth = torch.where(exists, a / rest.clamp(min=1e-300), 0.0).cumsum(dim=1)
+        slack = tolerance * (1 + growth)
         off = _previous(slack, tolerance) if s.stop == "after" else slack
         to_stop = (tested - s.transmittance_min).abs() - off * tested
         matters = candidate & (a * before > _EFFECT) & (~stops | (to_stop <= 0))
@@ -378,8 +374,7 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
         doubt |= alive & ((after - 0.5).abs() <= slack * after)
         if s.alpha_max < 1:
             doubt |= matters & (to_max <= tolerance)
-        # The previous hit that matters, and what of its weight swapping the two would move.
-        # Equal keys are no doubt: the index decides them in any precision.
+        # The previous hit that matters; equal keys are safe, the index decides in any precision.
         last, place = torch.where(matters, key, -math.inf).cummax(dim=1)
         place = _previous(place, 0)
         gap = key - _previous(last, -math.inf)
@@ -387,7 +382,7 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
         close = gap <= tolerance * torch.maximum(distance, key.abs())
         doubt |= matters & (gap > 0) & close & (swap > _EFFECT)
     return {
-        "rgb": (weights[:, :, None] * colors).sum(dim=1) + end[:, None] * background,
+        "rgb": (weights[:, :, None] * colors).sum(dim=1) + background,
         "alpha": alpha,
         "depth": (w * t).sum(dim=1) / alpha.clamp(min=EPS_ALPHA),
         "median_depth": torch.where(half, t, 0.0).sum(dim=1),

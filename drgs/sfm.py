@@ -59,8 +59,9 @@ def run_sfm(
 ) -> SfmSummary:
     """Find camera poses and points from photos; afterwards ``drgs.data.load(out_dir)`` works.
 
-    Writes ``out_dir/{database.db, sparse/0, images}``; ``images`` is a link to ``image_dir`` where links work, a copy
-    elsewhere. An existing result is replaced, and only once the new one is complete.
+    Writes ``out_dir/{database.db, sparse/0, images}``; ``images`` is a link to ``image_dir`` where
+    links work, a copy elsewhere. An existing result is replaced, and only once the new one is
+    complete.
 
     Args:
         image_dir: folder of photos.
@@ -68,8 +69,8 @@ def run_sfm(
         progress: called with (stage, done, total); stages are features, matching and mapping.
         camera_model: COLMAP's name of the lens. Photos of one size share one camera.
         max_image_size: pixels on the longer side that features are found at; 0 for the photos' own.
-        matching: ``exhaustive``, ``sequential`` (photos in the order of a walk or video) or ``auto`` (exhaustive up to
-            60 photos).
+        matching: ``exhaustive``, ``sequential`` (photos in the order of a walk or video) or
+            ``auto`` (exhaustive up to 60 photos).
         seed: of all random sampling.
 
     Raises:
@@ -93,11 +94,13 @@ def run_sfm(
         )
     if camera_model not in _CAMERA_MODELS:
         raise ValueError(
-            f"run_sfm: camera_model must be one of {', '.join(_CAMERA_MODELS)}, got {camera_model!r}"
+            f"run_sfm: camera_model must be one of {', '.join(_CAMERA_MODELS)}, got "
+            f"{camera_model!r}"
         )
     if matching not in ("auto", "exhaustive", "sequential"):
         raise ValueError(
-            f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one"
+            f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose "
+            "one"
         )
     if out_dir.exists() and not out_dir.is_dir():
         raise ValueError(f"{out_dir}: must be a folder, found a file; choose another output")
@@ -183,7 +186,8 @@ def _reconstruct(
         marks.append(time.perf_counter())
     if not models:
         raise ValueError(
-            f"{image_dir}: the photos must overlap and show texture, no two of {len(names)} could be connected; "
+            f"{image_dir}: the photos must overlap and show texture, no two of {len(names)} could "
+            "be connected; "
             "take more photos with smaller steps, or try --camera-model OPENCV"
         )
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
@@ -208,7 +212,9 @@ def _reconstruct(
 
 
 def _install(partial: Path, out_dir: Path, image_dir: Path) -> None:
-    """Move the finished result to its place; the model, which makes the folder a data set, comes last."""
+    """Move the finished result to its place; the model, which makes the folder a data set, comes
+    last.
+    """
     out_dir.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(out_dir / "sparse", ignore_errors=True)
     images = out_dir / "images"

@@ -46,12 +46,34 @@ def test_ssim_is_the_published_window(rng):
     assert metrics.ssim(a, a) == pytest.approx(1, abs=1e-5)
 
 
+def test_ssim_equals_torchmetrics(rng):
+    """The number that others print, to 1e-5."""
+    try:
+        from torchmetrics.functional.image import structural_similarity_index_measure
+    except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision built for another torch
+        pytest.skip(f"torchmetrics: {error}")
+    a, b = images(rng)
+    planes = [x.permute(2, 0, 1)[None] for x in (a, b)]
+    want = float(structural_similarity_index_measure(*planes, sigma=1.5, kernel_size=11, data_range=1.0))
+    assert metrics.ssim(a, b) == pytest.approx(want, abs=1e-5)
+
+
 def test_flip_orders_errors(rng):
     """0 for equal images, larger for a larger error, in [0, 1]."""
     a, b = images(rng)
     small, large = metrics.flip(0.9 * a + 0.1 * b, a), metrics.flip(b, a)
     assert metrics.flip(a, a) == pytest.approx(0, abs=1e-4)
     assert 0 < small < large < 1
+
+
+def lpips_packages():
+    """torchvision; skips where it or lpips cannot be imported."""
+    try:
+        import lpips  # noqa: F401
+        import torchvision
+    except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision built for another torch
+        pytest.skip(f"no LPIPS: {error}")
+    return torchvision
 
 
 class Rendered:
@@ -108,8 +130,7 @@ def test_missing_metrics_say_why(rng, monkeypatch):
 @pytest.mark.parametrize("name", ["alex", "vgg"])
 def test_lpips_reads_a_backbone_from_a_file(tmp_path, rng, name):
     """Random weights with torchvision's names load without a download, and give 0 for equal images."""
-    pytest.importorskip("lpips")
-    torchvision = pytest.importorskip("torchvision")
+    torchvision = lpips_packages()
     build = {"alex": torchvision.models.alexnet, "vgg": torchvision.models.vgg16}[name]
     state = {k: v for k, v in build(weights=None).state_dict().items() if k.startswith("features")}
     torch.save(state, tmp_path / "w.pth")
@@ -124,7 +145,7 @@ def test_lpips_reads_a_backbone_from_a_file(tmp_path, rng, name):
 
 def test_bad_weights_are_refused(tmp_path):
     """Missing, damaged, foreign and incomplete files each have their line; nothing is unpickled."""
-    pytest.importorskip("lpips")
+    lpips_packages()
     path = tmp_path / "w.pth"
     with pytest.raises(FileNotFoundError, match="must be weights of AlexNet or VGG16, found none"):
         metrics.Lpips(path)

@@ -16,7 +16,7 @@ from drgs.density import Model, add_gaussians, divide, explore, relocate
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state
 from drgs.frames import load_frames
-from drgs.losses import photometric_loss, ssim
+from drgs.losses import photometric_loss, ssim, ssim_map
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 32
@@ -370,16 +370,21 @@ def test_ssim_gradient_is_the_derivative(rng):
     assert torch.autograd.gradcheck(lambda a: ssim(a, y), x)
 
 
-def test_ssim_equals_torchmetrics_inside(rng):
-    """Away from the border both SSIM variants agree to 1e-5; ours adds the zero-padded border."""
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
+def test_ssim_is_zero_padded(rng):
+    """The loss equals SSIM written out with a padded 11x11 convolution, to 1e-5."""
     x, y = (torch.from_numpy(rng.random((40, 50, 3), dtype=np.float32)) for _ in range(2))
     y = 0.7 * x + 0.3 * y
-    planes = [torch.nn.functional.pad(a.permute(2, 0, 1)[None], (5,) * 4) for a in (x, y)]
-    # torchmetrics leaves out a border of 5 pixels: padded by 5, what is left is the zero-padded variant.
-    want = structural_similarity_index_measure(*planes, sigma=1.5, kernel_size=11, data_range=1.0)
+    kernel = torch.exp(-((torch.arange(11.0) - 5) ** 2) / (2 * 1.5**2))
+    kernel = torch.outer(kernel, kernel)[None, None] / kernel.sum() ** 2
+
+    def blur(a):
+        return torch.nn.functional.conv2d(a.permute(2, 0, 1)[:, None], kernel, padding=5)
+
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    want = ((2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
     assert float(ssim(x, y)) == pytest.approx(float(want), abs=1e-5)
+    assert torch.equal(ssim(x, y), ssim_map(x, y).permute(2, 0, 1).mean())
 
 
 def test_loss_sees_only_the_mask(rng):

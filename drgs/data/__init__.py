@@ -1,4 +1,6 @@
-"""Data sets: ``drgs.data.load(path)`` finds out which format a folder has and returns a `Dataset`."""
+"""Data sets: ``drgs.data.load(path)`` finds out which format a folder has and returns a
+`Dataset`.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,10 @@ def load(
 ) -> Dataset:
     """Load a data set; its format is found out from its files. No image is decoded.
 
-    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json``; a COLMAP model in ``.``,
-    ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``. A JSON or npy file may be named itself.
+    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json``; a COLMAP
+        model in ``.``,
+    ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``. A JSON or npy file may be
+    named itself.
 
     Args:
         path: folder or file.

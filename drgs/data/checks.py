@@ -1,4 +1,6 @@
-"""Reading files that may lie: sizes are compared with what the file holds before anything is allocated."""
+"""Reading files that may lie: sizes are compared with what the file holds before anything is
+allocated.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ def read_json(path: Path) -> Any:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read a plain numeric ``.npy`` array; the shape in its header is checked against the file size first.
+    """Read a plain numeric ``.npy`` array; the shape in its header is checked against the file
+    size first.
 
     Raises:
         FileNotFoundError: no such file.
@@ -70,7 +73,8 @@ def read_npy(path: Path) -> np.ndarray:
     actual = path.stat().st_size - start
     if any(side < 0 for side in shape) or claimed > actual:
         raise ValueError(
-            f"{path}: the header claims shape {shape} ({claimed} bytes), the file holds {actual} bytes; "
+            f"{path}: the header claims shape {shape} ({claimed} bytes), the file holds {actual} "
+            "bytes; "
             "it is truncated or damaged, copy it again"
         )
     return np.load(path, allow_pickle=False)
@@ -95,7 +99,8 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Decode an image as stored: (H,W) or (H,W,C), its own bit depth, channels in RGB order, EXIF rotation ignored.
+    """Decode an image as stored: (H,W) or (H,W,C), its own bit depth, channels in RGB order, EXIF
+    rotation ignored.
 
     Poses and intrinsics belong to the stored pixels, hence no rotation.
 
@@ -137,7 +142,8 @@ def _jpeg_size(file: Any) -> tuple[int, int] | None:
         length = file.read(2)
         if len(length) < 2:
             return None
-        # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC (arithmetic).
+        # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC
+        # (arithmetic).
         if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
             body = file.read(5)
             if len(body) < 5:

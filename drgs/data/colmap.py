@@ -1,4 +1,6 @@
-"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have been checked."""
+"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have
+been checked.
+"""
 
 from __future__ import annotations
 
@@ -34,20 +36,23 @@ def find_model(path: Path) -> Path | None:
 
 
 def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
-    """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a folder).
+    """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a
+    folder).
 
     Args:
         path: the data set, or the model's own folder.
         background: color that images with alpha are composited on.
 
     Raises:
-        FileNotFoundError: no model, no ``images`` folder, or an image that the model lists is missing.
+        FileNotFoundError: no model, no ``images`` folder, or an image that the model lists is
+            missing.
         ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
     """
     model = find_model(path)
     if model is None:
         raise FileNotFoundError(
-            f"{path}: must hold a COLMAP model, found no cameras.bin or cameras.txt in . or {', '.join(MODEL_FOLDERS)}; "
+            f"{path}: must hold a COLMAP model, found no cameras.bin or cameras.txt in . or "
+            f"{', '.join(MODEL_FOLDERS)}; "
             "run `drgs sfm`"
         )
     reconstruction = _read(model)
@@ -69,7 +74,8 @@ def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 
         w2c[:3] = image.cam_from_world().matrix()
         if not np.isfinite(w2c).all():
             raise ValueError(
-                f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model"
+                f"{where}: the pose must be finite, got NaN or Inf; remove this image from the "
+                "model"
             )
         camera = _camera(reconstruction.cameras[image.camera_id], w2c, image.name, where)
         views.append(
@@ -102,7 +108,8 @@ def _image_folder(path: Path, model: Path) -> Path:
             return folder
         tried.append(str(folder))
     raise FileNotFoundError(
-        f"{path}: the photos must lie in a folder named images, found none (looked at {', '.join(dict.fromkeys(tried))}); "
+        f"{path}: the photos must lie in a folder named images, found none (looked at "
+        f"{', '.join(dict.fromkeys(tried))}); "
         "move or link them there"
     )
 
@@ -151,16 +158,20 @@ def _points(reconstruction: object, model: Path) -> tuple[np.ndarray, np.ndarray
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise ValueError(
-            f"{model}: points must be finite, got {points[bad[0]]} at index {bad[0]}; run `drgs sfm` again"
+            f"{model}: points must be finite, got {points[bad[0]]} at index {bad[0]}; run `drgs "
+            "sfm` again"
         )
     return points, colors
 
 
-# ------------------------------------------------------------------------------------ checks before pycolmap reads
+# ------------------------------------------------------------------------------------ checks before
+# pycolmap reads
 
 
 def _read(model: Path) -> object:
-    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file does not hold."""
+    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file
+    does not hold.
+    """
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name in _REQUIRED:
         if not (model / f"{name}{suffix}").is_file():
@@ -181,7 +192,8 @@ def _read(model: Path) -> object:
     except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
         text = str(error).strip().splitlines()
         raise ValueError(
-            f"{model}: must be a COLMAP model that pycolmap reads, got {text[-1][:160] if text else type(error).__name__}; "
+            f"{model}: must be a COLMAP model that pycolmap reads, got "
+            f"{text[-1][:160] if text else type(error).__name__}; "
             "export it again"
         ) from None
     finally:
@@ -198,7 +210,8 @@ class _Walk:
     def need(self, size: int, what: str) -> None:
         if self.at + size > len(self.data):
             raise ValueError(
-                f"{self.path}: must hold {what} ({size} bytes from byte {self.at}), the file ends at byte "
+                f"{self.path}: must hold {what} ({size} bytes from byte {self.at}), the file ends "
+                "at byte "
                 f"{len(self.data)}; it is truncated or damaged, copy it again"
             )
 
@@ -273,7 +286,8 @@ def _parameter_count(path: Path, number: int) -> int:
 
 def _unsupported(path: Path, name: str) -> ValueError:
     return ValueError(
-        f"{path}: the camera model must be one of {', '.join(_MODELS)}, got {name}; undistort the images with "
+        f"{path}: the camera model must be one of {', '.join(_MODELS)}, got {name}; undistort the "
+        "images with "
         "`colmap image_undistorter`, or run `drgs sfm` again"
     )
 
@@ -310,7 +324,8 @@ def _check_text(path: Path, kind: str) -> None:
                     "a track of pairs IMAGE_ID, POINT2D_IDX",
                     f"{len(words) - 8} numbers",
                 )
-        # Rigs and frames mix words and numbers; they are small, and pycolmap reports what it cannot parse.
+        # Rigs and frames mix words and numbers; they are small, and pycolmap reports what it cannot
+        # parse.
 
 
 def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
@@ -349,5 +364,6 @@ def _numbers(path: Path, line: int, words: list[str], least: int, exact: bool = 
 
 def _bad_line(path: Path, line: int, needs: str, got: str) -> ValueError:
     return ValueError(
-        f"{path}: line {line} must hold {needs}, got {got}; it is truncated or damaged, export it again"
+        f"{path}: line {line} must hold {needs}, got {got}; it is truncated or damaged, export it "
+        "again"
     )

@@ -1,4 +1,6 @@
-"""LLFF data sets: ``poses_bounds.npy`` and the photos in ``images``, paired in the order of their names."""
+"""LLFF data sets: ``poses_bounds.npy`` and the photos in ``images``, paired in the order of their
+names.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ __all__ = ["load_llff"]
 
 
 def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
-    """Load an LLFF data set: (N,17) rows of a 3x5 matrix [pose | height, width, focal] and two depth bounds.
+    """Load an LLFF data set: (N,17) rows of a 3x5 matrix [pose | height, width, focal] and two
+    depth bounds.
 
     Args:
         path: the folder, or the ``.npy`` file.
@@ -36,7 +39,8 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
     images = list_images(folder)
     if len(images) != len(rows):
         raise ValueError(
-            f"{file}: must have one row an image, got {len(rows)} rows and {len(images)} images; match them"
+            f"{file}: must have one row an image, got {len(rows)} rows and {len(images)} images; "
+            "match them"
         )
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):

@@ -1,4 +1,6 @@
-"""Local features and their matches, by pycolmap on the CPU, in steps small enough to report progress."""
+"""Local features and their matches, by pycolmap on the CPU, in steps small enough to report
+progress.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ def extract(
         shared_camera: one camera for all images, or one each.
         masks: folder of ``NAME.EXT.png``; features on black are dropped. Every image needs one.
         max_image_size: pixels on the longer side above which images are shrunk; 0 for never.
-        wide_baseline: affine shapes and pooled scales: connects views further apart, at 2.5 times the cost.
+        wide_baseline: affine shapes and pooled scales: connects views further apart, at 2.5 times
+            the cost.
         progress: called with ("features", done, total).
     """
     import pycolmap
@@ -124,7 +127,9 @@ def match(
 
 
 def sequential_pairs(names: list[str], window: int) -> list[tuple[str, str]]:
-    """Each name with the ``window`` names after it, and with powers of two beyond, to bridge gaps."""
+    """Each name with the ``window`` names after it, and with powers of two beyond, to bridge
+    gaps.
+    """
     steps = set(range(1, window + 1)) | {2**k for k in range(16) if 2**k > window}
     return [
         (names[i], names[i + s])
@@ -149,7 +154,8 @@ def nearby_pairs(centers: np.ndarray, axes: np.ndarray, neighbors: int) -> list[
     if count <= neighbors + 1:
         return list(itertools.combinations(range(count), 2))
     distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
-    # One median distance counts as much as turning by 60 degrees; cameras back to back share nothing.
+    # One median distance counts as much as turning by 60 degrees; cameras back to back share
+    # nothing.
     cost = distance / max(float(np.median(distance)), 1e-12) + 2.0 * (1.0 - axes @ axes.T)
     np.fill_diagonal(cost, np.inf)
     nearest = np.argsort(cost, axis=1, kind="stable")[:, :neighbors]

@@ -1,4 +1,6 @@
-"""Initial points of a scene: the data set's own, from depth maps, triangulated, or random; and the scene extent."""
+"""Initial points of a scene: the data set's own, from depth maps, triangulated, or random; and the
+scene extent.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ _PLY_BYTES = {
 def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
     """1.1 x the largest distance of a camera center to their mean (3DGS), in scene units.
 
-    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to it; 1.0 without points.
+    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to
+    it; 1.0 without points.
 
     Args:
         cameras: at least one.
@@ -39,7 +42,8 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
     """
     if not cameras:
         raise ValueError(
-            "scene_extent: there must be at least one camera, got none; pass the training views' cameras"
+            "scene_extent: there must be at least one camera, got none; pass the training views' "
+            "cameras"
         )
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(axis=0)
@@ -59,8 +63,9 @@ def initial_points(
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points to start Gaussians from, by the first way that works.
 
-    The data set's own points; back-projected depth maps; SIFT features triangulated with the given poses; random points
-    where the cameras look. Given a list of views, nothing but these views is read, as active runs need it.
+    The data set's own points; back-projected depth maps; SIFT features triangulated with the given
+    poses; random points where the cameras look. Given a list of views, nothing but these views is
+    read, as active runs need it.
 
     Args:
         data: a data set, or views (then there are no given points).
@@ -104,7 +109,8 @@ def initial_points(
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P,3) float64 and colors (P,3) float32 of a PLY point cloud; gray where it has no colors.
+    """Points (P,3) float64 and colors (P,3) float32 of a PLY point cloud; gray where it has no
+    colors.
 
     Raises:
         FileNotFoundError: no such file.
@@ -140,7 +146,9 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_ply_size(path: Path) -> None:
-    """Compare the least size that a PLY header claims with the file's, before anything is allocated."""
+    """Compare the least size that a PLY header claims with the file's, before anything is
+    allocated.
+    """
     with path.open("rb") as file:
         head = file.read(_MAX_PLY_HEADER)
     end = head.find(b"end_header")
@@ -185,7 +193,8 @@ def _from_depth(
         pixels = np.flatnonzero(valid)
         if not len(pixels):
             continue
-        # A random phase on a regular step through the valid pixels: even, without the grid's moire between views.
+        # A random phase on a regular step through the valid pixels: even, without the grid's moire
+        # between views.
         step = max(1.0, len(pixels) / share)
         chosen = pixels[
             np.arange(rng.uniform(0, min(step, len(pixels))), len(pixels), step).astype(np.int64)
@@ -262,9 +271,11 @@ def _triangulated(
             name = f"{index:06d}.png"
             _write_png(base / "images" / name, np.round(image[..., ::-1] * 255).astype(np.uint8))
             if masked:
-                # COLMAP skips images without a mask as soon as there is a mask folder, so that all get one.
+                # COLMAP skips images without a mask as soon as there is a mask folder, so that all
+                # get one.
                 mask = np.ones(image.shape[:2]) if mask is None else mask
-                # Features reach past their center; a few pixels of margin keep the outline itself out.
+                # Features reach past their center; a few pixels of margin keep the outline itself
+                # out.
                 inside = cv2.erode((mask > _MASK_KEEP).astype(np.uint8), np.ones((5, 5), np.uint8))
                 _write_png(base / "masks" / f"{name}.png", inside * 255)
             names.append(name)
@@ -299,7 +310,9 @@ def _triangulated(
 
 
 def _posed_model(database: Path, names: list[str], cameras: list[Camera]) -> object:
-    """A reconstruction with the given poses, its numbers those of the database, whose intrinsics are set too."""
+    """A reconstruction with the given poses, its numbers those of the database, whose intrinsics
+    are set too.
+    """
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
@@ -341,7 +354,9 @@ def _write_png(path: Path, data: np.ndarray) -> None:
 def _random(
     views: list[View], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points along random pixels' rays, kept where at least half as many cameras look as look at the best point."""
+    """Points along random pixels' rays, kept where at least half as many cameras look as look at
+    the best point.
+    """
     cameras = [view.camera.undistorted() for view in views]
     distance = _focus_distance(cameras)
     masks = [view.mask() if view.mask_path is not None else None for view in views]
@@ -356,7 +371,8 @@ def _random(
         if not len(allowed) or not number:
             continue
         pixels = rng.choice(allowed, number)
-        # Uniform in disparity between half and three times the distance: near things need more points.
+        # Uniform in disparity between half and three times the distance: near things need more
+        # points.
         depth = 1.0 / rng.uniform(1 / (3 * distance), 2 / distance, number)
         points.append(_back_project(camera, pixels, depth))
         view = views[index]
@@ -379,7 +395,9 @@ def _random(
 
 
 def _focus_distance(cameras: list[Camera]) -> float:
-    """How far the cameras look: to the point nearest to all optical axes, if it lies before them, else their extent."""
+    """How far the cameras look: to the point nearest to all optical axes, if it lies before them,
+    else their extent.
+    """
     centers = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.c2w[:3, 2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

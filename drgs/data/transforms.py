@@ -1,4 +1,6 @@
-"""Nerfstudio, instant-ngp and Blender data sets: ``transforms.json`` or ``transforms_{train,val,test}.json``."""
+"""Nerfstudio, instant-ngp and Blender data sets: ``transforms.json`` or
+``transforms_{train,val,test}.json``.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +45,11 @@ def load_transforms(
 ) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 
-    Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
-    camera_model and k1, k2, k3, k4, p1, p2. Frames may name ``mask_path`` and ``depth_file_path`` (z-depth; unit from
-    ``depth_unit_scale_factor``, else millimeters for images and scene units for ``.npy``).
+    Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x;
+        lens from
+    camera_model and k1, k2, k3, k4, p1, p2. Frames may name ``mask_path`` and ``depth_file_path``
+    (z-depth; unit from ``depth_unit_scale_factor``, else millimeters for images and scene units for
+    ``.npy``).
 
     Args:
         path: the folder, or one JSON file.
@@ -58,7 +62,8 @@ def load_transforms(
     files = find_transforms(path)
     if not files:
         raise FileNotFoundError(
-            f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
+            f"{path}: must hold transforms.json or transforms_train.json, found none; check the "
+            "path"
         )
     views: list[View] = []
     points = colors = None
@@ -68,7 +73,8 @@ def load_transforms(
         frames = data.get("frames") if isinstance(data, dict) else None
         if not isinstance(frames, list) or not frames:
             raise ValueError(
-                f"{file}: must be an object with a list `frames` of at least one frame; check the file"
+                f"{file}: must be an object with a list `frames` of at least one frame; check the "
+                "file"
             )
         named = _named_splits(data)
         sizes: dict[tuple[int, int], int] = {}
@@ -89,7 +95,8 @@ def load_transforms(
             (first, i), (second, j) = list(sizes.items())[:2]
             raise ValueError(
                 f"{file}: images must have one size unless every frame has its own intrinsics, got "
-                f"{first[0]}x{first[1]} at frame {i} and {second[0]}x{second[1]} at frame {j}; write fl_x, w, h a frame"
+                f"{first[0]}x{first[1]} at frame {i} and {second[0]}x{second[1]} at frame {j}; "
+                "write fl_x, w, h a frame"
             )
         if points is None and isinstance(data.get("ply_file_path"), str):
             ply = file.parent / data["ply_file_path"]
@@ -106,7 +113,8 @@ def _view(
     image = _image_file(folder, frame["file_path"])
     if image is None:
         raise FileNotFoundError(
-            f"{where}: the image {folder / frame['file_path']} must exist, found none; restore it or drop the frame"
+            f"{where}: the image {folder / frame['file_path']} must exist, found none; restore it "
+            "or drop the frame"
         )
     own = any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
     merged = {**{key: value for key, value in data.items() if key != "frames"}, **frame}
@@ -142,7 +150,8 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path) -> Camera:
         fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
     else:
         raise ValueError(
-            f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; add one"
+            f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; "
+            "add one"
         )
     K = intrinsics(
         fx, fy, _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
@@ -150,7 +159,8 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path) -> Camera:
     kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if kind not in _LENSES:
         raise ValueError(
-            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort the images"
+            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort "
+            "the images"
         )
     k1, k2, k3, k4, p1, p2 = (
         _number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -180,7 +190,8 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
         c2w = np.empty(0)
     if c2w.shape not in ((4, 4), (3, 4)):
         raise ValueError(
-            f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct it"
+            f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct "
+            "it"
         )
     if not np.isfinite(c2w).all():
         raise ValueError(

@@ -25,7 +25,8 @@ class View:
     Attributes:
         camera: the camera as calibrated, of the size of the image file, lens included.
         name: unique in the data set; the image's path below the image folder without its suffix.
-        image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0 is unknown.
+        image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0
+            is unknown.
         depth_scale: scene units in one unit of the depth file.
         background: color in [0,1] that images with an alpha channel are composited on.
         split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
@@ -41,7 +42,8 @@ class View:
     split: str = ""
 
     def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
-        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted, area-resized.
+        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted,
+        area-resized.
 
         The result belongs to ``camera.undistorted().resized(width, height)``.
 
@@ -49,7 +51,8 @@ class View:
             width, height: pixels; the camera's own size if left out.
 
         Raises:
-            FileNotFoundError, ValueError: the file is missing, no image, or not of the camera's size.
+            FileNotFoundError, ValueError: the file is missing, no image, or not of the camera's
+                size.
         """
         import cv2
 
@@ -73,7 +76,8 @@ class View:
     def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.
 
-        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask file.
+        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask
+        file.
         """
         if self.mask_path is None and not (
             self.camera.is_distorted and _lens_maps(self.camera)[2] is not None
@@ -95,7 +99,9 @@ class View:
         return _resize_area(data, *self._size(width, height))
 
     def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map."""
+        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is
+        no depth map.
+        """
         import cv2
 
         if self.depth_path is None:
@@ -109,7 +115,8 @@ class View:
             raw = raw[..., 0]
         if raw.ndim != 2:
             raise ValueError(
-                f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; convert it"
+                f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; "
+                "convert it"
             )
         data = raw.astype(np.float32) * np.float32(self.depth_scale)
         data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
@@ -137,7 +144,8 @@ class View:
         height, width = data.shape
         if abs(width * self.camera.height / (height * self.camera.width) - 1) > _ASPECT_TOLERANCE:
             raise ValueError(
-                f"{path}: must have the shape of its image ({self.camera.width}x{self.camera.height}), "
+                f"{path}: must have the shape of its image "
+                f"({self.camera.width}x{self.camera.height}), "
                 f"got {width}x{height}; export it again"
             )
         size = (self.camera.width, self.camera.height)
@@ -224,7 +232,8 @@ def fit_to_image(camera: Camera, path: Path, where: str) -> Camera:
         return camera
     if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
         raise ValueError(
-            f"{where}: the image {path} must have the shape of its camera ({camera.width}x{camera.height}), "
+            f"{where}: the image {path} must have the shape of its camera "
+            f"({camera.width}x{camera.height}), "
             f"got {width}x{height}; give this view its own intrinsics"
         )
     return camera.resized(width, height)
@@ -255,7 +264,9 @@ def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the photo did not see."""
+    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the
+    photo did not see.
+    """
     return _cached_lens_maps(
         camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion
     )
@@ -273,7 +284,8 @@ def _cached_lens_maps(
     pixels = lens.project(rays)[0].reshape(height, width, 2)
     x, y = pixels[..., 0], pixels[..., 1]
     unseen = ~((x > -_BORDER) & (x < width + _BORDER) & (y > -_BORDER) & (y < height + _BORDER))
-    # Past the radius where the lens polynomial turns back, rays land on pixels that show something else.
+    # Past the radius where the lens polynomial turns back, rays land on pixels that show something
+    # else.
     radius = np.hypot(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]).reshape(height, width)
     probe = np.linspace(0.0, radius.max(), 1024)
     spread = lens.project(np.stack([probe, np.zeros(1024), np.ones(1024)], axis=-1))[0][:, 0]
