@@ -91,7 +91,7 @@ class Camera:
             put("w2c", pose)
         for axis in ("width", "height"):
             value = getattr(self, axis)
-            if int(value) != value or value < 1:
+            if not (np.isfinite(value) and value >= 1 and int(value) == value):
                 raise ValueError(
                     f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct "
                     "it"
@@ -244,7 +244,7 @@ class Camera:
         return np.stack([x, y], axis=-1)
 
 
-# ---------------------------------------------------------------------------------------------------------- frames
+# -------------------------------------------------- frames
 
 _OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _MITSUBA_FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -368,7 +368,7 @@ def orbit(
     return cameras
 
 
-# ------------------------------------------------------------------------------------------------------------ files
+# -------------------------------------------------- files
 
 
 def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:

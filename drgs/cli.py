@@ -123,8 +123,8 @@ class Fit(_Settings):
     """Images are reduced to at most this many pixels."""
     max_gaussians: int = 60_000
     """Budget of the density control."""
-    init_points: str = "auto"
-    """Where the initial points come from."""
+    init_points: Literal["auto", "views"] = "auto"
+    """Initial points: the data set's if it has any, or only what the training views show."""
     test_every: int = 8
     """Every n-th view, by name, is held out; 0 holds out none."""
     seed: int = 0
@@ -137,8 +137,8 @@ class Fit(_Settings):
     """Continue from the last checkpoint in the run folder."""
     save_every: int = 1000
     """Steps between checkpoints."""
-    mask: Literal["auto", "ignore"] = "auto"
-    """Use the data set's masks, or do not."""
+    mask: Literal["auto", "object", "valid", "ignore"] = "auto"
+    """Outside a mask is nothing (object; auto, if there are mask files), anything (valid), or the image (ignore)."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """RGB in [0, 1] behind everything."""
 

@@ -198,3 +198,34 @@ def _check_range(name: str, x: torch.Tensor, low: float, high: float, hint: str)
                 f"Gaussians.from_arrays: {name} must be in ({low:g}, {high:g}), got "
                 f"{x[i].reshape(-1).tolist()} at index {i}; {hint}"
             )
+
+
+def ellipsoids_shape(gaussians: Gaussians, extent: float = 3.0) -> dict:
+    """The Gaussians as a Mitsuba `ellipsoids` shape, for `mi.load_dict`.
+
+    Args:
+        gaussians: At least one.
+        extent: Radius in standard deviations that Mitsuba bounds them by (the integrator `drgs` uses its own).
+    Returns:
+        A dict with centers, scales, quaternions (xyzw, normalized) and the attributes `opacities` (N, 1) and
+        `sh_coeffs` (N, 3 K) that the integrators `drgs` and `volprim_rf_basic` read. Values are detached.
+    Raises:
+        ValueError: If there are no Gaussians (Mitsuba refuses an empty shape).
+    """
+    if len(gaussians) == 0:
+        raise ValueError("ellipsoids_shape: Mitsuba must have at least one Gaussian, got 0")
+    from drgs import runtime
+
+    mi = runtime.mitsuba()
+    g = gaussians.detach()
+    quats = torch.nn.functional.normalize(g.quats.double(), dim=1)[:, [1, 2, 3, 0]]
+    means = g.means.double() + torch.from_numpy(np.asarray(g.origin, np.float64))
+    arrays = {
+        "centers": means,
+        "scales": g.scales,
+        "quaternions": quats,
+        "opacities": g.opacities[:, None],
+        "sh_coeffs": g.sh.reshape(len(g), -1),
+    }
+    tensors = {k: mi.TensorXf(np.ascontiguousarray(v.cpu().numpy(), np.float32)) for k, v in arrays.items()}
+    return {"type": "ellipsoids", "extent": extent, **tensors}

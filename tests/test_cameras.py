@@ -124,7 +124,9 @@ def test_lenses_agree_with_opencv(model, distortion, rng):
 
 
 def test_fisheye_sees_beyond_180_degrees():
-    camera = make(K=intrinsics(25, 25, 64, 40), w2c=np.eye(4), model="opencv_fisheye", distortion=(0,) * 4)
+    camera = make(
+        K=intrinsics(25, 25, 64, 40), w2c=np.eye(4), model="opencv_fisheye", distortion=(0,) * 4
+    )
     directions = camera.pixel_directions()
     assert directions[40, 0, 2] < 0
     np.testing.assert_allclose(np.arccos(directions[40, 127, 2]), np.hypot(63.5, 0.5) / 25)
@@ -176,7 +178,9 @@ def test_orbit_looks_at_its_center_from_its_radius(up):
     cameras = orbit((1, 2, 3), 4.0, 7, elevation=30.0, up=up, width=64, height=48)
     assert len(cameras) == 7
     for camera in cameras:
-        np.testing.assert_allclose(camera.project(np.array([[1.0, 2, 3]]))[0][0], [32, 24], atol=1e-9)
+        np.testing.assert_allclose(
+            camera.project(np.array([[1.0, 2, 3]]))[0][0], [32, 24], atol=1e-9
+        )
         offset = camera.center - (1, 2, 3)
         np.testing.assert_allclose(np.linalg.norm(offset), 4.0)
         np.testing.assert_allclose(offset @ up / np.linalg.norm(up), 2.0)
@@ -242,7 +246,10 @@ FLIPPED = np.diag([1.0, 1.0, -1.0, 1.0])
         ({"height": 2.5}, "height must be a whole number of pixels >= 1, got 2.5"),
         ({"width": float("nan")}, "width must be a whole number of pixels >= 1, got nan"),
         ({"model": "fov"}, "model must be pinhole, opencv or opencv_fisheye, got 'fov'"),
-        ({"model": "opencv", "distortion": (1, 2)}, "takes 4 or 5 or 8 distortion coefficients, got 2"),
+        (
+            {"model": "opencv", "distortion": (1, 2)},
+            "takes 4 or 5 or 8 distortion coefficients, got 2",
+        ),
         ({"distortion": (0.1,)}, "pinhole takes 0 distortion coefficients, got 1"),
     ],
 )

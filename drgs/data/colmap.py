@@ -102,7 +102,7 @@ def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 
 def _image_folder(path: Path, model: Path) -> Path:
     """``images`` beside the model or above it."""
     tried = []
-    for base in (path, model, model.parent, model.parent.parent):
+    for base in (path, model, *model.parents[:3]):
         folder = base / "images"
         if folder.is_dir():
             return folder

@@ -176,7 +176,7 @@ def _subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
     return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))
 
 
-# ---------------------------------------------------------------------------------------------------------- depth
+# -------------------------------------------------- depth
 
 
 def _from_depth(
@@ -242,7 +242,7 @@ def _thin(
     return mean(points), mean(colors).astype(np.float32)
 
 
-# --------------------------------------------------------------------------------------------------- triangulation
+# -------------------------------------------------- triangulation
 
 
 def _triangulated(
@@ -348,7 +348,7 @@ def _write_png(path: Path, data: np.ndarray) -> None:
         )
 
 
-# ----------------------------------------------------------------------------------------------------------- random
+# -------------------------------------------------- random
 
 
 def _random(

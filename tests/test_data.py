@@ -1,0 +1,354 @@
+"""Views and formats, on data sets a few pixels large that the tests write themselves."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
+from drgs.data import Dataset, View, load, scene_extent
+
+cv2 = pytest.importorskip("cv2")
+WIDTH, HEIGHT = 24, 16
+K = intrinsics(20, 22, 11.0, 8.5)
+BARREL = (-0.2, 0.05, 1e-3, -2e-3)
+
+
+def poses(count: int) -> list[np.ndarray]:
+    angles = np.linspace(0, 1.5, count)
+    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0)) for a in angles]
+
+
+def gradient(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """An image whose red is the column and whose green is the row."""
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = np.linspace(0, 255, width)[None]
+    image[..., 1] = np.linspace(0, 255, height)[:, None]
+    return image
+
+
+def write_image(path, image) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    order = [2, 1, 0, 3][: image.shape[2]] if image.ndim == 3 else ...
+    assert cv2.imwrite(str(path), image[..., order] if image.ndim == 3 else image)
+
+
+def write_colmap(folder, text: bool = False, count: int = 4, model: str = "PINHOLE", params=None):
+    """A model of ``count`` images that see the same 5 points, and its images."""
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction()
+    params = params or [20, 22, 11.0, 8.5]
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    points = np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2], [0.1, 0.1, 0.1]])
+    for index, pose in enumerate(poses(count)):
+        image = pycolmap.Image(
+            name=f"im{index}.png", keypoints=np.zeros((5, 2)), camera_id=1, image_id=index + 1
+        )
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        write_image(folder / "images" / f"im{index}.png", gradient())
+    for index, point in enumerate(points):
+        track = pycolmap.Track()
+        for image_id in range(1, count + 1):
+            track.add_element(image_id, index)
+        reconstruction.add_point3D(point, track, np.array([255, 51 * index, 0], np.uint8))
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True)
+    (reconstruction.write_text if text else reconstruction.write_binary)(target)
+    return target
+
+
+def write_transforms(folder, count: int = 3, extra: dict | None = None, **top) -> dict:
+    frames = []
+    for index, pose in enumerate(poses(count)):
+        write_image(folder / "images" / f"{index}.png", gradient())
+        c2w = c2w_to_opengl(np.linalg.inv(pose))
+        frame = {"file_path": f"images/{index}.png", "transform_matrix": c2w.tolist()}
+        frames.append({**frame, **(extra or {})})
+    data = {"fl_x": 20, "fl_y": 22, "cx": 11.0, "cy": 8.5, "w": WIDTH, "h": HEIGHT, **top}
+    data = {key: value for key, value in data.items() if value is not None}
+    data["frames"] = frames
+    save(folder, data)
+    return data
+
+
+def save(folder, data, name: str = "transforms.json") -> None:
+    (folder / name).write_text(json.dumps(data))
+
+
+def write_llff(folder, count: int = 3) -> np.ndarray:
+    rows = []
+    for index, pose in enumerate(poses(count)):
+        c2w = np.linalg.inv(pose)
+        matrix = np.stack(
+            [c2w[:3, 1], c2w[:3, 0], -c2w[:3, 2], c2w[:3, 3], (HEIGHT, WIDTH, 20.0)], axis=1
+        )
+        rows.append([*matrix.ravel(), 0.5, 9.0])
+        write_image(folder / "images" / f"{index}.png", gradient())
+    rows = np.array(rows)
+    np.save(folder / "poses_bounds.npy", rows)
+    return rows
+
+
+# --------------------------------------------------------------------------- formats
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_binary_and_text(tmp_path, text):
+    write_colmap(tmp_path, text)
+    # A folder may hold more photos than the model lists.
+    write_image(tmp_path / "images" / "unlisted.png", gradient())
+    dataset = load(tmp_path)
+    assert (dataset.format, len(dataset.views)) == ("colmap", 4)
+    assert [view.name for view in dataset.views] == ["im0", "im1", "im2", "im3"]
+    for view, pose in zip(dataset.views, poses(4), strict=True):
+        np.testing.assert_allclose(view.camera.w2c, pose, atol=1e-9)
+        np.testing.assert_allclose(view.camera.K, K)
+        assert view.camera.model == "pinhole"
+    np.testing.assert_allclose(sorted(dataset.points[:, 0]), [0, 0, 0, 0.1, 0.2])
+    np.testing.assert_allclose(dataset.colors[1], [1, 0.2, 0])
+    assert "5 points" in dataset.point_source
+
+
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
+def test_colmap_places(tmp_path, place):
+    target = write_colmap(tmp_path)
+    moved = tmp_path / "moved"
+    target.rename(moved)
+    (tmp_path / "sparse").rmdir()
+    final = tmp_path / place
+    final.parent.mkdir(parents=True, exist_ok=True)
+    if place == ".":
+        for file in moved.iterdir():
+            file.rename(tmp_path / file.name)
+    else:
+        moved.rename(final)
+    assert len(load(tmp_path).views) == 4
+    assert len(load(final).views) == 4  # the model's own folder may be named
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "lens", "distortion"),
+    [
+        ("SIMPLE_PINHOLE", [20, 12, 8], "pinhole", ()),
+        ("SIMPLE_RADIAL", [20, 12, 8, 0.1], "opencv", (0.1, 0, 0, 0)),
+        ("SIMPLE_RADIAL", [20, 12, 8, 0.0], "pinhole", ()),
+        ("RADIAL", [20, 12, 8, 0.1, 0.02], "opencv", (0.1, 0.02, 0, 0)),
+        ("OPENCV", [20, 20, 12, 8, 0.1, 0.02, 1e-3, 2e-3], "opencv", (0.1, 0.02, 1e-3, 2e-3)),
+        (
+            "OPENCV_FISHEYE",
+            [20, 20, 12, 8, 0.1, 0.02, 1e-3, 2e-3],
+            "opencv_fisheye",
+            (0.1, 0.02, 1e-3, 2e-3),
+        ),
+    ],
+)
+def test_colmap_lenses_project_as_pycolmap_does(tmp_path, model, params, lens, distortion):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_colmap(tmp_path, model=model, params=params)
+    camera = load(tmp_path).views[0].camera
+    assert (camera.model, camera.distortion) == (lens, distortion)
+    local = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.2]])
+    theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
+    world = (local - camera.w2c[:3, 3]) @ camera.w2c[:3, :3]
+    np.testing.assert_allclose(camera.project(world)[0], theirs.img_from_cam(local), atol=1e-9)
+
+
+def test_transforms_with_masks_and_depth(tmp_path):
+    write_transforms(tmp_path, extra={"mask_path": "m.png", "depth_file_path": "d.png"})
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, 12:] = 255
+    write_image(tmp_path / "m.png", mask)
+    write_image(tmp_path / "d.png", np.full((HEIGHT, WIDTH), 2500, np.uint16))
+    dataset = load(tmp_path)
+    view = dataset.views[1]
+    assert (dataset.format, view.name, view.camera.model) == ("transforms", "1", "pinhole")
+    np.testing.assert_allclose(view.camera.w2c, poses(3)[1], atol=1e-9)
+    np.testing.assert_allclose(view.camera.K, K)
+    np.testing.assert_allclose(view.image() * 255, gradient(), atol=1e-4)
+    np.testing.assert_array_equal(view.mask(12, 8), np.repeat([[0.0] * 6 + [1.0] * 6], 8, axis=0))
+    np.testing.assert_allclose(view.depth(6, 4), 2.5)
+    assert view.image(12, 8).dtype == view.depth().dtype == view.mask().dtype == np.float32
+
+
+def test_transforms_depth_units(tmp_path):
+    data = write_transforms(tmp_path, extra={"depth_file_path": "d.npy"})
+    np.save(tmp_path / "d.npy", np.full((HEIGHT, WIDTH), 2.5, np.float32))
+    np.testing.assert_allclose(load(tmp_path).views[0].depth(), 2.5)
+    save(tmp_path, {**data, "depth_unit_scale_factor": 0.1})
+    np.testing.assert_allclose(load(tmp_path).views[0].depth(), 0.25)
+
+
+def test_transforms_blender_split_without_suffix(tmp_path):
+    angle = 2 * np.arctan(0.5 * WIDTH / 20)
+    for split in ("train", "test", "val"):
+        write_image(tmp_path / split / "r_0.png", gradient())
+        frame = {"file_path": f"./{split}/r_0", "transform_matrix": np.eye(4).tolist()}
+        data = {"camera_angle_x": angle, "frames": [frame]}
+        save(tmp_path, data, f"transforms_{split}.json")
+    dataset = load(tmp_path)
+    train, test = dataset.split()
+    assert [view.name for view in train] == ["train/r_0"]
+    assert [view.name for view in test] == ["test/r_0"]
+    assert dataset.split_rule() == "as the data set's files say"
+    np.testing.assert_allclose(train[0].camera.K, intrinsics(20, 20, 12, 8))
+    np.testing.assert_allclose(train[0].camera.c2w[:3, 2], [0, 0, -1])
+
+
+def test_transforms_lenses(tmp_path):
+    data = write_transforms(tmp_path, k1=0.1, k2=0.02, p1=1e-3, p2=2e-3)
+    camera = load(tmp_path).views[0].camera
+    assert (camera.model, camera.distortion) == ("opencv", (0.1, 0.02, 1e-3, 2e-3, 0.0))
+    save(tmp_path, {**data, "camera_model": "OPENCV_FISHEYE", "k4": 0.5})
+    camera = load(tmp_path).views[0].camera
+    assert (camera.model, camera.distortion) == ("opencv_fisheye", (0.1, 0.02, 0.0, 0.5))
+    save(tmp_path, {**data, "camera_model": "PINHOLE"})
+    assert load(tmp_path).views[0].camera.model == "pinhole"
+
+
+def test_transforms_scale_k_to_smaller_images(tmp_path):
+    write_transforms(tmp_path, w=2 * WIDTH, h=2 * HEIGHT)
+    camera = load(tmp_path).views[0].camera
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    np.testing.assert_allclose(camera.K[:2, 2], [5.5, 4.25])
+
+
+def test_transforms_mixed_sizes_with_their_own_intrinsics(tmp_path):
+    own = {"fl_x": 20, "w": WIDTH, "h": HEIGHT, "cx": 12, "cy": 8}
+    data = write_transforms(tmp_path, extra=own)
+    write_image(tmp_path / "images" / "1.png", gradient(30, 10))
+    data["frames"][1].update({"w": 30, "h": 10, "cx": 15, "cy": 5})
+    save(tmp_path, data)
+    assert [view.camera.width for view in load(tmp_path).views] == [WIDTH, 30, WIDTH]
+
+
+def test_transforms_points(tmp_path):
+    write_transforms(tmp_path, ply_file_path="points.ply")
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
+        "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    )
+    (tmp_path / "points.ply").write_text(header + "0 1 2 255 0 51\n3 4 5 0 0 0\n")
+    dataset = load(tmp_path)
+    np.testing.assert_allclose(dataset.points, [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_allclose(dataset.colors[0], [1, 0, 0.2])
+    assert dataset.point_source == "points.ply, 2 points"
+
+
+def test_llff(tmp_path):
+    write_llff(tmp_path)
+    dataset = load(tmp_path)
+    assert (dataset.format, len(dataset.views)) == ("llff", 3)
+    for view, pose in zip(dataset.views, poses(3), strict=True):
+        np.testing.assert_allclose(view.camera.w2c, pose, atol=1e-9)
+        np.testing.assert_allclose(view.camera.K, intrinsics(20, 20, WIDTH / 2, HEIGHT / 2))
+    assert len(load(tmp_path / "poses_bounds.npy").views) == 3
+
+
+# ----------------------------------------------------------------------------- views
+
+
+def test_split_is_every_eighth_by_name():
+    views = [View(Camera(K, np.eye(4), WIDTH, HEIGHT), name=f"{i:02d}") for i in range(17)]
+    dataset = Dataset("x", "test", views[::-1])
+    train, test = dataset.split()
+    assert [view.name for view in test] == ["00", "08", "16"]
+    assert len(train) == 14
+    assert dataset.split_rule() == "views sorted by name, index % 8 == 0 held out"
+    assert len(dataset.split(test_every=0)[0]) == 17
+    assert [view.name for view in dataset.split(test_every=5)[1]] == ["00", "05", "10", "15"]
+    with pytest.raises(ValueError, match=r"test_every must be 0 \(none\) or >= 2, got 1"):
+        dataset.split(test_every=1)
+    assert len(Dataset("x", "test", views[:1]).split()[0]) == 1
+
+
+def test_load_reads_no_pixels(tmp_path):
+    write_transforms(tmp_path)
+    image = tmp_path / "images" / "1.png"
+    image.write_bytes(image.read_bytes()[:40])  # the header survives, the pixels do not
+    views = load(tmp_path).views
+    views[0].image()
+    with pytest.raises(ValueError, match="1.png: must be an image, could not be decoded"):
+        views[1].image()
+
+
+def test_image_composites_alpha_and_reads_16_bits(tmp_path):
+    write_transforms(tmp_path)
+    image = np.dstack([gradient(), np.full((HEIGHT, WIDTH), 51, np.uint8)])
+    write_image(tmp_path / "images" / "0.png", image)
+    write_image(tmp_path / "images" / "1.png", gradient().astype(np.uint16) * 257)
+    views = load(tmp_path, background=(1.0, 0.0, 0.5)).views
+    expected = gradient() / 255 * 0.2 + np.array([0.8, 0, 0.4])
+    np.testing.assert_allclose(views[0].image(), expected, atol=1e-6)
+    np.testing.assert_allclose(views[1].image(), gradient() / 255, atol=1e-6)
+
+
+def test_image_resizes_by_area(tmp_path):
+    write_transforms(tmp_path)
+    expected = gradient().reshape(8, 2, 12, 2, 3).mean(axis=(1, 3)) / 255
+    np.testing.assert_allclose(load(tmp_path).views[0].image(12, 8), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"), [("opencv", BARREL), ("opencv_fisheye", (0.05, 0.01, 0.0, 0.0))]
+)
+def test_undistorted_image_shows_the_right_rays(tmp_path, model, distortion):
+    """A photo whose colors are its ray directions, undistorted, must show a pinhole's directions."""
+    width, height = 120, 80
+    camera = Camera(intrinsics(100, 105, 58.5, 41.25), np.eye(4), width, height, model, distortion)
+    to_color = lambda camera: camera.pixel_directions() * [0.8, 0.8, 0] + 0.5  # noqa: E731
+    write_image(tmp_path / "a.png", np.round(to_color(camera) * 65535).astype(np.uint16))
+    view = View(camera, "a", image_path=tmp_path / "a.png")
+    image, mask = view.image(), view.mask()
+    seen = slice(None) if mask is None else mask > 0
+    expected = to_color(camera.undistorted())
+    # One pixel off would be 0.008; borders interpolate against repeated pixels.
+    inner = np.zeros((height, width), bool)
+    inner[4:-4, 4:-4] = True
+    inner &= True if mask is None else seen
+    assert np.abs(image - expected)[inner].max() < 1e-3
+
+
+def test_undistorted_masks_and_depths_stay_unmixed_and_unseen_pixels_are_masked(tmp_path):
+    camera = Camera(K, np.eye(4), WIDTH, HEIGHT, "opencv", (0.5, 0.0, 0.0, 0.0))
+    depth = np.where(np.arange(WIDTH) < 12, 1000, 3000)[None].repeat(HEIGHT, 0)
+    write_image(tmp_path / "d.png", depth.astype(np.uint16))
+    write_image(tmp_path / "m.png", (depth > 2000).astype(np.uint8))  # stored as 0 and 1
+    view = View(camera, "a", depth_path=tmp_path / "d.png", depth_scale=1e-3)
+    assert set(np.unique(view.depth(10, 7).round(5))) <= {0.0, 1.0, 3.0}
+    assert view.mask()[0, 0] == 0  # pincushion: the corner lies outside the photo
+    assert view.mask()[8, 11] == 1
+    assert view.depth()[0, 0] == 0
+    view.mask_path = tmp_path / "m.png"
+    assert set(np.unique(view.mask())) == {0.0, 1.0}
+    assert view.mask()[8, 5] == 0
+
+
+def test_scene_extent():
+    cameras = [Camera(K, pose, WIDTH, HEIGHT) for pose in poses(5)]
+    centers = np.array([camera.center for camera in cameras])
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    assert scene_extent(cameras) == pytest.approx(1.1 * spread)
+    assert scene_extent(cameras[:1]) == 1.0
+    points = cameras[0].center + [[0, 0, 2], [0, 3, 0], [5, 0, 0]]
+    assert scene_extent(cameras[:1], points) == pytest.approx(3.3)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".bmp"])
+def test_image_size_agrees_with_decoding(tmp_path, suffix):
+    from drgs.data.checks import image_size
+
+    write_image(tmp_path / f"a{suffix}", gradient(37, 21))
+    assert image_size(tmp_path / f"a{suffix}") == (37, 21)
+
+
+def test_barrel_lens_that_folds_back_is_masked():
+    camera = Camera(intrinsics(20, 20, 12, 8), np.eye(4), WIDTH, HEIGHT, "opencv", (-1.0, 0, 0, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mask = View(camera, "a").mask()
+    assert mask[0, 0] == 0
+    assert mask[8, 12] == 1

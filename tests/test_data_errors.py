@@ -1,0 +1,259 @@
+"""Bad data sets: every one is refused in one line that says where, what and what to do."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from test_data import (
+    HEIGHT,
+    WIDTH,
+    gradient,
+    poses,
+    save,
+    write_colmap,
+    write_image,
+    write_llff,
+    write_transforms,
+)
+
+from drgs.data import load
+
+
+def one_line(error) -> None:
+    assert "\n" not in str(error.value)
+
+
+def test_says_where_it_looked(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere: must be a data set"):
+        load(tmp_path / "nowhere")
+    with pytest.raises(
+        FileNotFoundError, match=r"looked for transforms.json.*sparse/0.*npy"
+    ) as error:
+        load(tmp_path)
+    one_line(error)
+    write_image(tmp_path / "images" / "a.png", gradient())
+    with pytest.raises(FileNotFoundError, match="found 1 photos without; run `drgs sfm"):
+        load(tmp_path)
+    (tmp_path / "x.txt").write_text("")
+    with pytest.raises(ValueError, match="must be a folder, a transforms .json or an LLFF .npy"):
+        load(tmp_path / "x.txt")
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_colmap_lying_counts_allocate_nothing(tmp_path, name):
+    path = write_colmap(tmp_path) / f"{name}.bin"
+    path.write_bytes(struct.pack("<Q", 10**12) + path.read_bytes()[8:])
+    with pytest.raises(ValueError, match=f"{name}.bin: must hold the 1000000000000") as error:
+        load(tmp_path)
+    one_line(error)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_colmap_truncated_binaries(tmp_path, name):
+    path = write_colmap(tmp_path) / f"{name}.bin"
+    whole = path.read_bytes()
+    for length in sorted({4, len(whole) // 2, len(whole) - 1}):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=f"{name}.bin: must hold .* truncated") as error:
+            load(tmp_path)
+        one_line(error)
+
+
+def test_colmap_lying_lengths_inside_records(tmp_path):
+    target = write_colmap(tmp_path)
+    points = target / "points3D.bin"
+    data = bytearray(points.read_bytes())
+    data[8 + 43 : 8 + 51] = struct.pack("<Q", 10**12)
+    points.write_bytes(data)
+    with pytest.raises(ValueError, match="the 1000000000000 track elements of points3D record 0"):
+        load(tmp_path)
+    images = target / "images.bin"
+    data = images.read_bytes()
+    end = data.index(b"im0.png\0") + 8
+    images.write_bytes(data[:end] + struct.pack("<Q", 10**12) + data[end + 8 :])
+    with pytest.raises(ValueError, match="the 1000000000000 observations of images record 0"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames"])
+def test_colmap_truncated_text(tmp_path, name):
+    path = write_colmap(tmp_path, text=True) / f"{name}.txt"
+    text = path.read_text().rstrip()
+    path.write_text(text[: text.rindex(" ")])
+    with pytest.raises(ValueError, match="must (hold|be)") as error:
+        load(tmp_path)
+    one_line(error)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_refuses_other_lenses_by_name(tmp_path, text):
+    write_colmap(tmp_path, text, model="FOV", params=[20, 20, 12, 8, 0.5])
+    with pytest.raises(ValueError, match="must be one of SIMPLE_PINHOLE.*, got FOV") as error:
+        load(tmp_path)
+    one_line(error)
+
+
+def test_colmap_bad_poses_and_missing_files(tmp_path):
+    target = write_colmap(tmp_path)
+    frames = target / "frames.bin"
+    whole = frames.read_bytes()
+    size = (len(whole) - 8) // 4  # of a frame: two numbers, quaternion, translation, its image
+    at = 8 + size + 8 + 4 * 8
+    data = bytearray(whole)
+    data[at : at + 8] = struct.pack("<d", np.nan)
+    frames.write_bytes(data)
+    with pytest.raises(ValueError, match=r"image 1 \(im1.png\): the pose must be finite") as error:
+        load(tmp_path)
+    one_line(error)
+    frames.write_bytes(whole)
+    (tmp_path / "images" / "im2.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"image 2 \(im2.png\): the image .* must exist"):
+        load(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "photos")
+    with pytest.raises(FileNotFoundError, match="must lie in a folder named images"):
+        load(tmp_path)
+    (target / "points3D.bin").unlink()
+    with pytest.raises(FileNotFoundError, match=r"must hold points3D.bin, found none"):
+        load(tmp_path)
+
+
+def test_colmap_image_of_another_shape(tmp_path):
+    write_colmap(tmp_path)
+    write_image(tmp_path / "images" / "im3.png", gradient(30, 10))
+    with pytest.raises(ValueError, match=r"image 3 .*\(24x16\), got 30x10"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fl_x": None, "fl_y": None}, "frame 0: must have fl_x or camera_angle_x"),
+        ({"fl_x": "wide"}, "frame 0: fl_x must be a finite number, got 'wide'"),
+        ({"fl_x": float("nan")}, "frame 0: fl_x must be a finite number, got nan"),
+        ({"fl_x": -3}, "focal lengths must be positive"),
+        (
+            {"camera_model": "EQUIRECTANGULAR"},
+            "camera_model must be one of .*got 'EQUIRECTANGULAR'",
+        ),
+        ({"k4": 0.1}, "OPENCV takes k1, k2, k3, p1, p2, got k4 = 0.1"),
+        ({"w": 100}, r"must have the shape of its camera \(100x16\), got 24x16"),
+        ({"ply_file_path": "gone.ply"}, "must be a PLY point cloud, found none"),
+    ],
+)
+def test_transforms_bad_fields(tmp_path, change, message):
+    write_transforms(tmp_path, **change)
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+        load(tmp_path)
+    one_line(error)
+
+
+def test_transforms_bad_frames(tmp_path):
+    good = write_transforms(tmp_path)
+
+    def attempt(message, kind=ValueError, **frame):
+        data = json.loads(json.dumps(good))
+        data["frames"][1].update(frame)
+        save(tmp_path, data)
+        with pytest.raises(kind, match=message) as error:
+            load(tmp_path)
+        one_line(error)
+
+    pose = np.array(good["frames"][1]["transform_matrix"])
+    bad = pose.copy()
+    bad[0, 3] = np.inf
+    attempt("frame 1: transform_matrix must be finite", transform_matrix=bad.tolist())
+    attempt("frame 1: .*orthonormal to 1e-4", transform_matrix=(pose * 2).tolist())
+    attempt("frame 1: transform_matrix must be 4x4", transform_matrix=[[1, 2], [3]])
+    attempt("frame 1: the image .* must exist", FileNotFoundError, file_path="images/9.png")
+    attempt("frame 1: mask_path names", FileNotFoundError, mask_path="gone.png")
+    attempt("frame 1: must be an object with a file_path", file_path=7)
+    for text, message in [
+        ("{", "must be valid JSON"),
+        ("[]", "list `frames`"),
+        ('{"frames": []}', "list `frames`"),
+    ]:
+        (tmp_path / "transforms.json").write_text(text)
+        with pytest.raises(ValueError, match=message) as error:
+            load(tmp_path)
+        one_line(error)
+
+
+def test_transforms_rounded_poses_are_repaired(tmp_path):
+    data = write_transforms(tmp_path)
+    for frame in data["frames"]:
+        frame["transform_matrix"] = np.round(frame["transform_matrix"], 3).tolist()
+    save(tmp_path, data)
+    np.testing.assert_allclose(load(tmp_path).views[2].camera.w2c, poses(3)[2], atol=5e-3)
+
+
+def test_transforms_mixed_sizes_need_their_own_intrinsics(tmp_path):
+    data = write_transforms(tmp_path)
+    write_image(tmp_path / "images" / "2.png", gradient(WIDTH // 2, HEIGHT // 2))
+    with pytest.raises(ValueError, match="one size unless every frame.*12x8 at frame 2") as error:
+        load(tmp_path)
+    one_line(error)
+    assert data["frames"]
+
+
+def test_points_ply_that_lies(tmp_path):
+    write_transforms(tmp_path, ply_file_path="points.ply")
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\n"
+        "property float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    (tmp_path / "points.ply").write_bytes(header.encode() + bytes(24))
+    with pytest.raises(ValueError, match="claims at least 12000000000000 bytes.*holds 24") as error:
+        load(tmp_path)
+    one_line(error)
+    nan = header.replace("1000000000000", "2").encode() + struct.pack("<6f", 0, 0, 0, np.nan, 0, 0)
+    (tmp_path / "points.ply").write_bytes(nan)
+    with pytest.raises(ValueError, match="points must be finite, got NaN or Inf at index 1"):
+        load(tmp_path)
+    (tmp_path / "points.ply").write_bytes(b"solid")
+    with pytest.raises(ValueError, match="must be a PLY point cloud"):
+        load(tmp_path)
+
+
+def test_llff_bad_input(tmp_path):
+    rows = write_llff(tmp_path)
+    path = tmp_path / "poses_bounds.npy"
+
+    def attempt(message):
+        with pytest.raises(ValueError, match=message) as error:
+            load(tmp_path)
+        one_line(error)
+
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"(3, 17)", b"(3000000000, 17)").replace(b"         ", b"", 1))
+    attempt(r"the header claims shape \(3000000000, 17\)")
+    path.write_bytes(whole[:-8])
+    attempt("it is truncated or damaged")
+    path.write_bytes(b"\x93NUMPY")
+    attempt("must be a .npy file")
+    np.save(path, rows[:2])
+    attempt("got 2 rows and 3 images")
+    np.save(path, rows[:, :16])
+    attempt(r"must have shape \(N, 17\), got \(3, 16\)")
+    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    attempt("must hold plain numbers, got dtype object")
+    bad = rows.copy()
+    bad[1, 3] = np.nan
+    np.save(path, bad)
+    attempt("got NaN or Inf in row 1")
+
+
+def test_view_files_that_do_not_fit(tmp_path):
+    write_transforms(tmp_path, extra={"mask_path": "m.png", "depth_file_path": "d.png"})
+    write_image(tmp_path / "m.png", np.zeros((10, 30), np.uint8))
+    write_image(tmp_path / "d.png", gradient())
+    view = load(tmp_path).views[0]
+    with pytest.raises(ValueError, match=r"must have the shape of its image \(24x16\), got 30x10"):
+        view.mask()
+    with pytest.raises(ValueError, match="a depth map must have one channel"):
+        view.depth()
+    write_image(tmp_path / "images" / "0.png", gradient(20, 20))
+    with pytest.raises(ValueError, match="must be 24x16 pixels as its camera, got 20x20"):
+        view.image()

@@ -1,0 +1,192 @@
+"""Initial points: given, from depth, triangulated, random; and the views that they may look at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drgs.cameras import Camera, intrinsics, look_at
+from drgs.data import Dataset, View, initial_points, load
+from drgs.data.matching import nearby_pairs, sequential_pairs
+
+cv2 = pytest.importorskip("cv2")
+WIDTH, HEIGHT = 320, 240
+
+
+def texture(rng) -> np.ndarray:
+    """Blobs of several sizes: what SIFT finds."""
+    layers = [
+        cv2.resize(
+            rng.uniform(0, 1, (n, n, 3)).astype(np.float32),
+            (512, 512),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        for n in (16, 48, 128)
+    ]
+    image = sum(layers)
+    return np.clip((image - image.min()) / np.ptp(image), 0, 1)
+
+
+def render_plane(
+    camera: Camera, image: np.ndarray, half: float = 2.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The textured square |x|, |y| <= half in the plane z = 0: image and z-depth (0 where missed)."""
+    directions = camera.pixel_directions()
+    t = -camera.center[2] / directions[..., 2]
+    points = camera.center + t[..., None] * directions
+    u = ((points[..., :2] / half + 1) * 0.5 * 511).astype(np.float32)
+    hit = (t > 0) & (np.abs(points[..., :2]) <= half).all(axis=-1)
+    color = cv2.remap(image, u[..., 0].copy(), u[..., 1].copy(), cv2.INTER_LINEAR)
+    depth = ((points - camera.center) @ camera.c2w[:3, 2]) * hit
+    return color * hit[..., None], depth
+
+
+def plane_views(folder, rng, count: int = 5, depth: bool = False, mask=None) -> list[View]:
+    image, views = texture(rng), []
+    for index in range(count):
+        angle = -0.3 + 0.6 * index / max(count - 1, 1)
+        w2c = look_at((4 * np.sin(angle), -0.6, 4 * np.cos(angle)), (0, 0, 0), (0, 1, 0))
+        # The principal point is off center on purpose.
+        camera = Camera(intrinsics(300, 300, 150.5, 128.0), w2c, WIDTH, HEIGHT, name=f"{index}")
+        color, z = render_plane(camera, image)
+        path = folder / f"{index}.png"
+        assert cv2.imwrite(str(path), np.round(color[..., ::-1] * 255).astype(np.uint8))
+        view = View(camera, f"{index}", image_path=path)
+        if depth:
+            view.depth_path, view.depth_scale = folder / f"{index}_depth.png", 1e-3
+            assert cv2.imwrite(str(view.depth_path), np.round(z * 1000).astype(np.uint16))
+        if mask is not None:
+            view.mask_path = folder / f"{index}_mask.png"
+            inside = (z > 0) & (mask(camera, z)) if callable(mask) else mask
+            assert cv2.imwrite(str(view.mask_path), inside.astype(np.uint8) * 255)
+        views.append(view)
+    return views
+
+
+def test_given_points_come_first_and_are_thinned_by_seed(tmp_path, rng):
+    points, colors = rng.normal(size=(100, 3)), rng.uniform(size=(100, 3)).astype(np.float32)
+    views = plane_views(tmp_path, rng, count=1)
+    dataset = Dataset(tmp_path, "test", views, points, colors, "cloud, 100 points")
+    got, got_colors, source = initial_points(dataset)
+    np.testing.assert_array_equal(got, points)
+    np.testing.assert_array_equal(got_colors, colors)
+    assert source == "cloud, 100 points"
+    few, _, source = initial_points(dataset, seed=3, max_points=10)
+    assert (len(few), source) == (10, "cloud, 100 points, 10 kept")
+    np.testing.assert_array_equal(few, initial_points(dataset, seed=3, max_points=10)[0])
+
+
+def test_depth_maps_give_the_surface_with_its_colors(tmp_path, rng):
+    views = plane_views(tmp_path, rng, count=3, depth=True)
+    points, colors, source = initial_points(views, max_points=3000)
+    assert source == f"back-projected from 3 depth maps, {len(points)} points"
+    assert 1500 < len(points) <= 3000
+    assert np.abs(points[:, 2]).max() < 2e-3
+    assert colors.dtype == np.float32
+    # The colors are the picture's where the points project to.
+    dense, dense_colors, _ = initial_points(views[:1], max_points=10**6)
+    pixels, _ = views[0].camera.project(dense)
+    columns, rows = pixels.astype(int).T
+    np.testing.assert_allclose(views[0].image()[rows, columns], dense_colors, atol=1e-6)
+
+
+def test_depth_respects_masks(tmp_path, rng):
+    left = np.zeros((HEIGHT, WIDTH), bool)
+    left[:, :100] = True
+    views = plane_views(tmp_path, rng, count=1, depth=True, mask=left)
+    points, _, _ = initial_points(views)
+    assert views[0].camera.project(points)[0][:, 0].max() <= 100
+
+
+def test_triangulates_with_the_given_poses(tmp_path, rng):
+    pytest.importorskip("pycolmap")
+    stages = []
+    views = plane_views(tmp_path, rng)
+    points, colors, source = initial_points(views, progress=lambda *step: stages.append(step))
+    assert source.startswith("triangulated from 5 given poses")
+    assert len(points) >= 50
+    assert np.median(np.abs(points[:, 2])) < 0.01
+    assert np.abs(points[:, :2]).max() < 2.1
+    assert (colors >= 0).all()
+    assert (colors <= 1).all()
+    assert ("features", 5, 5) in stages
+    assert ("matching", 10, 10) in stages
+
+
+def test_triangulation_stays_inside_the_masks(tmp_path, rng):
+    pytest.importorskip("pycolmap")
+
+    def left_half(camera, z):
+        directions = camera.pixel_directions()
+        t = -camera.center[2] / directions[..., 2]
+        return (camera.center + t[..., None] * directions)[..., 0] < 0
+
+    points, _, source = initial_points(plane_views(tmp_path, rng, mask=left_half))
+    assert source.startswith("triangulated")
+    assert np.quantile(points[:, 0], 0.98) < 0.0
+
+
+def test_random_points_lie_in_the_common_view(tmp_path, rng):
+    views = plane_views(tmp_path, rng)
+    for view in views:  # nothing to match
+        assert cv2.imwrite(str(view.image_path), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    points, colors, source = initial_points(views, max_points=500)
+    assert source == "random where 5 cameras look, 500 points (triangulation gave 0)"
+    assert len(points) == 500
+    np.testing.assert_allclose(colors, 128 / 255, atol=1e-6)
+    seen = np.zeros(500)
+    for view in views:
+        pixels, _ = view.camera.project(points)
+        seen += (pixels >= 0).all(axis=1) & (pixels < (WIDTH, HEIGHT)).all(axis=1)
+    assert seen.min() >= 2
+    assert np.linalg.norm(np.median(points, axis=0)) < 1.5
+
+
+def test_points_of_a_view_list_read_only_these_views(tmp_path, rng):
+    views = plane_views(tmp_path, rng, count=3, depth=True)
+    views[2].image_path.unlink()
+    views[2].depth_path.unlink()
+    points, _, source = initial_points(views[:2], max_points=100)
+    assert len(points) <= 100
+    assert "2 depth maps" in source
+    with pytest.raises(ValueError, match="there must be at least one view, got none"):
+        initial_points([])
+
+
+def test_pairs():
+    assert sequential_pairs(list("abcd"), 1) == [
+        ("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d")
+    ]  # fmt: skip
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    outward = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
+    pairs = nearby_pairs(4 * outward, -outward, 2)
+    assert pairs == sorted({tuple(sorted((i, (i + 1) % 12))) for i in range(12)})
+    assert len(nearby_pairs(4 * outward[:4], -outward[:4], 5)) == 6
+
+
+def test_real_office_depth_agrees_between_views(data_dir):
+    if not (data_dir / "office").is_dir():
+        pytest.skip(f"no office data set in {data_dir}")
+    views = load(data_dir / "office").views
+    assert len(views) == 47
+    # Two views of one place, a step apart: the depth of one predicts the other's.
+    first, second = views[33], views[34]
+    points, _, _ = initial_points([first], max_points=20_000)
+    pixels, z = second.camera.project(points)
+    inside = (pixels >= 0).all(axis=1) & (pixels < (540, 360)).all(axis=1)
+    columns, rows = pixels[inside].astype(int).T
+    depth = second.depth()[rows, columns]
+    known = depth > 0
+    error = np.abs(depth[known] - z[inside][known])
+    assert known.sum() > 2000
+    assert np.median(error) < 0.05
+
+
+def test_real_banana_and_head_load(data_dir):
+    for name, kind, count in (("banana", "colmap", 14), ("head", "transforms", 33)):
+        if not (data_dir / name).is_dir():
+            pytest.skip(f"no {name} data set in {data_dir}")
+        dataset = load(data_dir / name)
+        assert (dataset.format, len(dataset.views)) == (kind, count)
+        assert dataset.views[0].image(90, 60).shape == (60, 90, 3)
+    assert 0.1 < dataset.views[0].mask(90, 90).mean() < 0.9

@@ -1,0 +1,122 @@
+"""Structure from motion: on a small rendered scene, on real photos when present, and its bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_data_points import plane_views
+
+from drgs.data import load
+from drgs.sfm import run_sfm
+
+pytest.importorskip("pycolmap")
+cv2 = pytest.importorskip("cv2")
+
+
+def aligned_error(found: np.ndarray, true: np.ndarray) -> float:
+    """Largest distance between two point lists after the best similarity, relative to the spread."""
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(sign)).sum() / (a**2).sum()
+    return np.linalg.norm(scale * a @ (u @ sign @ vt).T - b, axis=1).max() / np.abs(b).max()
+
+
+@pytest.fixture(scope="module")
+def bumpy(tmp_path_factory):
+    """Photos of two textured planes, one before the other, as structure from motion needs depth."""
+    from test_data_points import HEIGHT, WIDTH, render_plane, texture
+
+    from drgs.cameras import Camera, intrinsics, look_at
+
+    folder = tmp_path_factory.mktemp("bumpy")
+    rng = np.random.default_rng(5)
+    back, front = texture(rng), texture(rng)
+    cameras = []
+    for index in range(7):
+        angle = -0.45 + 0.15 * index
+        eye = np.array([4 * np.sin(angle), 0.3 * (index % 3), 4 * np.cos(angle)])
+        K = intrinsics(384, 384, WIDTH / 2, HEIGHT / 2)
+        camera = Camera(K, look_at(eye, (0, 0, 0.3), (0, 1, 0)), WIDTH, HEIGHT)
+        color, _ = render_plane(camera, back, half=3.0)
+        raised = Camera(K, look_at(eye - [0, 0, 0.8], (0, 0, -0.5), (0, 1, 0)), WIDTH, HEIGHT)
+        near, depth = render_plane(raised, front, half=0.6)
+        color = np.where(depth[..., None] > 0, near, color)
+        assert cv2.imwrite(str(folder / f"{index}.png"), np.round(color * 255).astype(np.uint8))
+        cameras.append(camera)
+    return folder, cameras
+
+
+def test_recovers_poses_and_loads(bumpy, tmp_path):
+    folder, cameras = bumpy
+    stages = []
+    out = tmp_path / "out"
+    summary = run_sfm(folder, out, progress=lambda *step: stages.append(step))
+    assert (summary.registered, summary.total, summary.missing) == (7, 7, ())
+    assert summary.points > 100
+    assert summary.reprojection_error < 1.0
+    assert {stage for stage, _, _ in stages} == {"features", "matching", "mapping"}
+    assert all(done <= total for _, done, total in stages)
+    assert (out / "database.db").is_file()
+    assert not (tmp_path / "out.partial").exists()
+    dataset = load(out)
+    assert len(dataset.views) == 7
+    found = np.stack([view.camera.center for view in dataset.views])
+    assert aligned_error(found, np.stack([camera.center for camera in cameras])) < 0.05
+    assert dataset.views[0].image().shape == (240, 320, 3)
+    assert len(dataset.points) == summary.points
+    # Again onto the same place: replaced, whole.
+    again = run_sfm(folder, out, matching="sequential")
+    assert again.registered == 7
+    assert len(load(out).views) == 7
+
+
+def test_photos_that_do_not_connect(tmp_path, rng):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for index in range(3):
+        assert cv2.imwrite(str(photos / f"{index}.png"), np.full((60, 80, 3), 90 * index, np.uint8))
+    out = tmp_path / "out"
+    with pytest.raises(ValueError, match="no two of 3 could be connected") as error:
+        run_sfm(photos, out)
+    assert "\n" not in str(error.value)
+    assert not out.exists()
+    assert not (tmp_path / "out.partial").exists()
+
+
+def test_bad_input(tmp_path, rng):
+    with pytest.raises(FileNotFoundError, match="must be a folder of photos"):
+        run_sfm(tmp_path / "gone", tmp_path / "out")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    with pytest.raises(ValueError, match="must hold at least 2 photos, got 0"):
+        run_sfm(photos, tmp_path / "out")
+    plane_views(photos, rng, count=2)
+    with pytest.raises(ValueError, match="camera_model must be one of .*, got 'FOV'"):
+        run_sfm(photos, tmp_path / "out", camera_model="FOV")
+    with pytest.raises(ValueError, match="matching must be auto, exhaustive or sequential"):
+        run_sfm(photos, tmp_path / "out", matching="all")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="must be a folder, found a file"):
+        run_sfm(photos, tmp_path / "file")
+    (tmp_path / "mine" / "images").mkdir(parents=True)
+    with pytest.raises(ValueError, match="must not hold other photos in images"):
+        run_sfm(photos, tmp_path / "mine")
+    (photos / "1.png").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="1.png: must be an image, could not be decoded"):
+        run_sfm(photos, tmp_path / "out")
+    (photos / "a b.png").write_bytes(b"")
+    with pytest.raises(ValueError, match="must be without spaces for COLMAP, got 'a b.png'"):
+        run_sfm(photos, tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_real_banana(data_dir, tmp_path):
+    photos = data_dir / "banana" / "images"
+    if not photos.is_dir():
+        pytest.skip(f"no banana data set in {data_dir}")
+    summary = run_sfm(photos, tmp_path / "out")
+    assert summary.total == 16
+    assert summary.registered >= 14
+    assert summary.reprojection_error < 0.5
+    assert len(load(tmp_path / "out").views) == summary.registered
