@@ -84,7 +84,14 @@ def proxy_scene(t, means, quats, radii, alive, origins) -> Proxies | None:
     scene = mi.load_dict({"type": "scene", "gaussians": shape})
     scale = dr.opaque(t.Float, float(np.median(radii.min(1))))
     step = dr.opaque(t.Float, _STEP * size)
-    return Proxies(scene, t.UInt32(members.astype(np.uint32)), t.UInt32(first.astype(np.uint32)), dr.opaque(t.Float, back), scale, step)
+    return Proxies(
+        scene,
+        t.UInt32(members.astype(np.uint32)),
+        t.UInt32(first.astype(np.uint32)),
+        dr.opaque(t.Float, back),
+        scale,
+        step,
+    )
 
 
 class _Stream:
@@ -125,7 +132,10 @@ class _Stream:
         again = found & (primitive == last)
         fresh = found & ~again
         entry = at + dr.select(found, pi.t, 0) * p.scale
-        first, behind = dr.gather(t.UInt32, p.first, primitive, fresh), dr.gather(t.UInt32, p.first, primitive + 1, fresh)
+        first, behind = (
+            dr.gather(t.UInt32, p.first, primitive, fresh),
+            dr.gather(t.UInt32, p.first, primitive + 1, fresh),
+        )
         member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
         step = dr.select(again, 2 * step, dr.select(fresh, p.step, step))
         # Far along the ray the step is less than one unit in the last place.

@@ -171,9 +171,9 @@ class Camera:
         if self.is_distorted:
             problem = f"an undistorted camera, got model {self.model}; use camera.undistorted()"
         elif self.K[0, 1] != 0.0:
-            problem = f"zero skew, got {self.K[0, 1]:g}; trace camera.pixel_directions() instead"
+            problem = f"zero skew, got {self.K[0, 1]:g}; trace camera.pixel_directions()"
         elif abs(fx / fy - 1.0) * self.height / 2 > 0.1:
-            problem = f"square pixels, got fx {fx:g} and fy {fy:g}; trace camera.pixel_directions() instead"
+            problem = f"square pixels, got fx {fx:g}, fy {fy:g}; trace camera.pixel_directions()"
         if problem:
             raise ValueError(f"Camera.to_mitsuba: Mitsuba's perspective sensor needs {problem}")
         return {

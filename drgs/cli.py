@@ -88,7 +88,7 @@ class Render(_Settings):
     scene: Positional[Path]
     """A 3DGS point_cloud.ply or a run folder."""
     cameras: str = "orbit"
-    """A data set folder, a cameras.json, or orbit."""
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit."""
     output: _Output = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None
@@ -97,10 +97,18 @@ class Render(_Settings):
     """Image height in pixels; default the camera's."""
     frames: int = 60
     """Views of an orbit."""
+    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
+    """World direction that is up on an orbit; auto: as a run's photographs, else minus-y."""
+    elevation: float | None = None
+    """Degrees of an orbit above its center; default as a run's photographs, else 20."""
+    fov: float = 45.0
+    """Horizontal field of view of an orbit in degrees."""
     format: str = "png"
     """Comma-separated list of png, exr, webm."""
+    fps: float = 24.0
+    """Frames a second of the video."""
     depth: bool = False
-    """Write depth too."""
+    """Write color-mapped depth too; exr files hold it anyway."""
     split: Literal["all", "train", "test"] = "all"
     """Which views of a data set."""
     limit: int | None = None
@@ -183,6 +191,8 @@ class Demo(_Common):
 
     output: _Output = Path("out/demo")
     """Folder for pictures and tables."""
+    quick: bool = False
+    """Half a minute with poor pictures, to see that everything runs."""
 
 
 # Command -> (its options, module, function). Modules load only when their command runs.

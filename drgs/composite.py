@@ -66,9 +66,7 @@ class Composite(dr.CustomOp):
         visibility = dr.zeros(t.Float, len_of(record)) if "visibility" in view.want else None
         share = 4 if view.settings.order == "center" and not view.world and not view.basis else 1
         self.passes = [self._source(color=True)]
-        self.passes += [
-            self._source(first=k, channels=min(CHUNK, view.width - k)) for k in range(0, view.width, CHUNK)
-        ]
+        self.passes += [self._source(first=k, channels=min(CHUNK, view.width - k)) for k in range(0, view.width, CHUNK)]
         self.parts = {share: view.parts_of(view, self.model, buffers["record"], self._ray, share)}
         if view.width and share != 1:
             self.parts[1] = view.parts_of(view, self.model, buffers["record"], self._ray, 1)
@@ -119,9 +117,8 @@ class Composite(dr.CustomOp):
                 parts += self._redo(part)
                 check = False
             states = part.run(kernel, check=check)
-            dr.eval(states)
+            dr.eval(states, part.failed if check else None)  # together: one kernel
             if check:
-                dr.eval(part.failed)
                 parts += self._redo(part)
             done.append((part, states))
         for part in parts[len(done) :]:
@@ -159,6 +156,7 @@ class Composite(dr.CustomOp):
         return {name: dr.zeros(self.view.t.Float, dr.width(x)) for name, x in self.buffers.items()}
 
     def backward(self):
+        """Replay every traversal with the cotangents of its outputs."""
         t, view = self.view.t, self.view
         g, grads = self.grad_out(), self._grads()
         lanes = [dr.zeros(t.Float, view.pixels) for _ in self.lanes]
@@ -180,8 +178,10 @@ class Composite(dr.CustomOp):
                             "lanes": len(self.lanes),
                         }
                     )
+                # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
+                mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
                 with dr.suspend_grad():
-                    kernel = Adjoint(self.model, source, grads, finals, cotangents, depth, dr.ReduceMode.Local)
+                    kernel = Adjoint(self.model, source, grads, finals, cotangents, depth, mode)
                     states = part.run(kernel)
                     for st, at, inside in zip(states, part.flat, part.inside, strict=True):
                         for total, x in zip(lanes, st["lane"], strict=True):

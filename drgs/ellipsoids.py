@@ -26,9 +26,7 @@ def sh_degree_of(coefficients: int) -> int:
     """Degree 0..3 of `coefficients` = (degree + 1)^2; anything else raises ValueError."""
     degree = math.isqrt(coefficients) - 1
     if degree not in (0, 1, 2, 3) or (degree + 1) ** 2 != coefficients:
-        raise ValueError(
-            f"Gaussians: sh must have 1, 4, 9 or 16 coefficients (degree 0..3), got {coefficients}"
-        )
+        raise ValueError(f"Gaussians: sh must have 1, 4, 9 or 16 coefficients (degree 0..3), got {coefficients}")
     return degree
 
 
@@ -122,6 +120,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
+        """0..3."""
         return sh_degree_of(self.sh.shape[1])
 
     @property
@@ -184,9 +183,7 @@ def _tensor(name: str, x) -> torch.Tensor:
 def _check_shape(name: str, x, shape: tuple, n: int):
     if tuple(x.shape) != shape:
         want = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
-        raise ValueError(
-            f"Gaussians: {name} must have shape {want} with N = {n} from means, got {tuple(x.shape)}"
-        )
+        raise ValueError(f"Gaussians: {name} must have shape {want} with N = {n} from means, got {tuple(x.shape)}")
 
 
 def _check_range(name: str, x: torch.Tensor, low: float, high: float, hint: str):

@@ -158,11 +158,12 @@ class _Scene:
             o = o.expand(d.shape).reshape(-1, 3)
             d = torch.nn.functional.normalize(d.reshape(-1, 3), dim=1)
             pose = torch.eye(4, dtype=torch.float64)
-            pose[:3, 3] = -(o[0].detach() if len(o) else torch.zeros(3)) 
+            pose[:3, 3] = -(o[0].detach() if len(o) else torch.zeros(3))
             self._set_rays(o - origin, d)
         else:
             self.shape = (camera.height, camera.width)
-            pose = torch.as_tensor(camera.w2c, dtype=torch.float64)
+            pose = camera.w2c if isinstance(camera.w2c, torch.Tensor) else torch.tensor(camera.w2c)
+            pose = pose.to(torch.float64)
             if settings.traversal == "bvh" or settings.sh_direction == "ray":
                 local = torch.from_numpy(_local_directions(camera))
                 d = local @ pose[:3, :3]
@@ -270,7 +271,11 @@ class _Scene:
 
     def _tangents(self, tangents):
         """K dicts of tangents of the inputs, and whether there was a leading axis."""
-        shapes = {name: tuple(x.shape) for name, x in self.inputs.items() if name not in ("w2c", "ray_origins", "ray_directions")}
+        shapes = {
+            name: tuple(x.shape)
+            for name, x in self.inputs.items()
+            if name not in ("w2c", "ray_origins", "ray_directions")
+        }
         shapes |= {"rotations": (self.count, 3), "camera": (6,)}
         lengths, given = set(), {}
         for name, x in tangents.items():
@@ -288,7 +293,9 @@ class _Scene:
                 )
             given[name] = x
         if len(lengths) != 1:
-            raise ValueError(f"render_jvp: all tangents must have the same leading axis, got {sorted(map(str, lengths))}")
+            raise ValueError(
+                f"render_jvp: all tangents must have the same leading axis, got {sorted(map(str, lengths))}"
+            )
         columns = [
             self._column({name: x[k] for name, x in given.items()}) for k in range(len(next(iter(given.values()))))
         ]
@@ -306,7 +313,9 @@ class _Scene:
             twist[:3, :3], twist[:3, 3] = _cross_matrix(omega), v
             w2c = torch.as_tensor(self.camera.w2c, dtype=torch.float64).detach()
             change = -w2c @ twist  # c2w <- exp(xi) c2w is w2c <- w2c exp(-xi)
-            origin = torch.linalg.solve(w2c[:3, :3], (self.inputs["w2c"].cpu().detach().reshape(3, 4)[:, 3] - w2c[:3, 3]))
+            origin = torch.linalg.solve(
+                w2c[:3, :3], (self.inputs["w2c"].cpu().detach().reshape(3, 4)[:, 3] - w2c[:3, 3])
+            )
             shift = change[:3, 3] + change[:3, :3] @ origin
             column["w2c"] = torch.cat([change[:3, :3], shift[:, None]], 1).reshape(-1).to(self.home)
             if "ray_directions" in self.inputs:
@@ -324,15 +333,16 @@ class _Scene:
         buffers, lanes = [], []
         arguments = None
         for column in columns:
-            for name, x in inputs.items():
-                dr.disable_grad(x)
-                dr.enable_grad(x)
+            # A fresh graph each time: the old tangents are gone.
+            dr.disable_grad(inputs)
+            dr.enable_grad(inputs)
             _, arguments = self.prepare(inputs)
             _, record, sh, features, lane, _ = arguments
             for name, x in inputs.items():
                 if name in column:
                     dr.set_grad(x, _tensor(t, column[name].to(self.inputs[name].dtype)))
-            dr.forward_to(record, sh, features, lane)
+            # A ray's direction is a lane and on the way to its SH basis: interior tangents are kept.
+            dr.forward_to(record, sh, features, lane, flags=dr.ADFlag.ClearEdges)
             buffers.append({"record": _pack(t, [t.Float(dr.grad(x)) for x in record])})
             if sh is not None:
                 buffers[-1]["sh"] = dr.grad(sh)
@@ -378,14 +388,18 @@ def _differentiable(scene: _Scene) -> dict:
         results = _Bridge.apply(scene, names, *values)
         return dict(zip(scene.result_names, results, strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
-        return dr.wrap(source="torch", target="drjit")(scene.trace)(**scene.inputs) 
+        return dr.wrap(source="torch", target="drjit")(scene.trace)(**scene.inputs)
     images = scene.trace(**{name: _tensor(scene.t, x) for name, x in scene.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
 
 
 def _forward_ad(values) -> bool:
     """Whether a tensor is a dual number or belongs to a `torch.func` transform."""
-    return any(torch._C._functorch.is_functorch_wrapped_tensor(x) or torch.autograd.forward_ad.unpack_dual(x).tangent is not None for x in values)
+    return any(
+        torch._C._functorch.is_functorch_wrapped_tensor(x)
+        or torch.autograd.forward_ad.unpack_dual(x).tangent is not None
+        for x in values
+    )
 
 
 class _Bridge(torch.autograd.Function):

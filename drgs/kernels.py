@@ -109,7 +109,7 @@ class Model:
         return rho2, key, u
 
     def hit(self, record, ray, active):
-        """Opacity, depth t* (for `ewa`, the Gaussian's depth) and validity of a hit; derivatives flow to the first two."""
+        """Opacity, t* (for `ewa` the Gaussian's depth) and validity of a hit; the first two carry derivatives."""
         rho2, key, u = self._world(record, ray) if self.world else self._screen(record, ray)
         strength = record[layout.W_ALPHA if self.world else layout.ALPHA]
         extent2 = dr.detach(record[layout.W_EXT2 if self.world else layout.EXT2])
@@ -120,7 +120,6 @@ class Model:
             # 1 - exp(-tau) rounds a small tau away; its series does not.
             series = tau * dr.fma(tau, dr.fma(tau, dr.fma(tau, -1 / 24, 1 / 6), -0.5), 1)
             a = dr.select(tau < 0.03, series, 1 - dr.exp(-tau))
-            key = dr.maximum(key, 0)
         elif self.s.response == "peak":
             ok &= dr.detach(key) > 0
         if self.s.alpha_min > 0:
@@ -149,6 +148,7 @@ class Source:
 
     @property
     def outputs(self) -> int:
+        """Channels that the pass composites."""
         return (3 if self.color else 0) + self.channels
 
     def layout(self, ray: Ray) -> dict:
@@ -164,7 +164,7 @@ class Source:
         """What a hit of Gaussian `index` reads, name -> list of floats."""
         buffers, loaded = buffers or self.buffers, {}
         for name, (stride, offset, count) in self.layout(ray).items():
-            if stride == RECORD and name == "record":
+            if name == "record":
                 packet = dr.gather(t.ArrayXf, buffers[name], index, active, shape=(RECORD, dr.width(index)))
                 loaded[name] = list(packet)
             else:
@@ -196,6 +196,7 @@ class Primal:
         self.m, self.source, self.want, self.visibility = model, source, want, visibility
 
     def init(self, alive, place) -> dict:
+        """State of a ray; `place` is the order's "nowhere"."""
         t = self.m.t
         Sum = t.Float64 if "replay" in self.want else t.Float
         state = {
@@ -293,7 +294,9 @@ class Adjoint:
         D = t.Float64
         going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
         with dr.resume_grad():
-            fixed = {name: [dr.detach(x) for x in xs] for name, xs in self.source.load(t, index, rays[0], going).items()}
+            fixed = {
+                name: [dr.detach(x) for x in xs] for name, xs in self.source.load(t, index, rays[0], going).items()
+            }
             dr.enable_grad(fixed)
             total, hits, lanes = t.Float(0), t.Bool(False), []
             for ray, st, g, final, place in zip(rays, states, self.cotangents, self.finals, places, strict=True):
@@ -349,6 +352,7 @@ class Tangent:
         self.tangents, self.lanes = tangents, lanes
 
     def init(self, alive, place) -> dict:
+        """State of a ray: the primal's, and `d` with a tangent of it for each column."""
         t, state = self.m.t, self.primal.init(alive, place)
         names = ["T", "alpha", *(["depth"] if "depth" in state else [])]
         state["d"] = [
@@ -386,7 +390,8 @@ class Tangent:
                 values = self.source.values(m, moved, along)
                 results = [a, depth, *values]
                 dr.enqueue(dr.ADMode.Forward, moved, along.lane)
-                dr.traverse(dr.ADMode.Forward)
+                # Depth may lie on the way to the opacity: interior tangents are kept.
+                dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
                 da, ddepth, *dvalues = [dr.grad(x) for x in results]
             dw = dr.select(ok, dr.fma(old["T"], a0, T * da), 0)
             fresh = dict(old)

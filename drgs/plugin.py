@@ -98,6 +98,7 @@ class DrgsIntegrator(RBIntegrator):
         return mi.Color3f(*[dr.gather(t.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
 
     def to_string(self):
+        """For Mitsuba's printout of a scene."""
         return f"DrgsIntegrator[{self.settings}]"
 
 

@@ -115,7 +115,7 @@ class _Activated:
     """Activated parameters of every Gaussian in float64, and their camera-frame geometry."""
 
     def __init__(self, t, p, w2c, settings: RenderSettings, count: int):
-        Float, Float64, UInt32 = t.Float, t.Float64, t.UInt32
+        Float64, UInt32 = t.Float64, t.UInt32
         self.t, self.count = t, count
         self.i = i = dr.arange(UInt32, count)
         # Each Gaussian gathers its own entries once, so the adjoint needs no atomics.
@@ -155,10 +155,10 @@ class _Activated:
         # w2c maps the re-centered world of p["means"]; rows of the rotation and the translation.
         v = [[dr.gather(Float64, w2c, UInt32(4 * r + c)) for c in range(4)] for r in range(3)]
         self.view = v
-        self.center = [v[r][0] * self.mean[0] + v[r][1] * self.mean[1] + v[r][2] * self.mean[2] + v[r][3] for r in range(3)]
-        self.from_local = [
-            [sum(v[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)
+        self.center = [
+            v[r][0] * self.mean[0] + v[r][1] * self.mean[1] + v[r][2] * self.mean[2] + v[r][3] for r in range(3)
         ]
+        self.from_local = [[sum(v[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
 
     def distance(self):
         return dr.sqrt(_dot(self.center, self.center))

@@ -159,9 +159,7 @@ class RenderSettings:
         known = {f.name for f in dataclasses.fields(self)}
         unknown = sorted(set(fields) - known)
         if unknown:
-            raise ValueError(
-                f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}"
-            )
+            raise ValueError(f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}")
         return dataclasses.replace(self, **fields)
 
 

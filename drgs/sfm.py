@@ -9,10 +9,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
+from drgs.progress import Bar
 
-__all__ = ["SfmSummary", "run_sfm"]
+if TYPE_CHECKING:
+    from drgs.cli import Sfm
+
+__all__ = ["SfmSummary", "run_command", "run_sfm"]
 
 _CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -233,3 +238,28 @@ def _install(partial: Path, out_dir: Path, image_dir: Path) -> None:
     for file in partial.glob("database.db*"):
         os.replace(file, out_dir / file.name)
     os.replace(partial / "sparse", out_dir / "sparse")
+
+
+def run_command(args: Sfm) -> None:
+    """`drgs sfm IMAGES -o OUT`."""
+    with Bar("features", 1, not args.quiet) as bar:
+        summary = run_sfm(
+            args.images,
+            args.output,
+            lambda stage, done, total: bar.update(done, total, stage),
+            camera_model=args.camera_model,
+            matching=args.matcher,
+            seed=args.seed,
+        )
+    if args.quiet:
+        return
+    stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
+    print(
+        f"{summary.registered} of {summary.total} photos have a pose, {summary.points} points, "
+        f"mean reprojection error {summary.reprojection_error:.2f} px ({stages})"
+    )
+    if summary.missing:
+        print(f"without a pose: {', '.join(summary.missing)}")
+    if summary.models > 1:
+        print(f"the photos fell apart into {summary.models} models, the largest was kept")
+    print(f"next: drgs fit {args.output} -o RUN")

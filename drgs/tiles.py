@@ -71,7 +71,7 @@ def build(t, projected, settings, width: int, height: int, record=None) -> Lists
     total64 = dr.sum(t.UInt64(amount))[0]
     if total64 >= 2**32:
         raise ValueError(
-            f"render: the tile lists must have fewer than 2^32 entries, got {total64}; lower the extent or the image size"
+            f"render: the tile lists must have fewer than 2^32 entries, got {total64}; lower extent or image size"
         )
     pairs = int(total64)
     start, end = dr.zeros(t.UInt32, columns * rows), dr.zeros(t.UInt32, columns * rows)

@@ -9,7 +9,9 @@ import contextlib
 import dataclasses
 import logging
 import math
+import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -170,8 +172,12 @@ class _Loop:
     def run(self, bar: _Progress) -> None:
         trainer, config = self.trainer, self.trainer.config
         preview_every = max(1, config.max_steps // _PREVIEWS)
-        try:
+        with _interrupt_between_steps() as is_interrupted:
             while trainer.step_index < config.max_steps:
+                if is_interrupted():
+                    self.run_folder.log("interrupted", step=trainer.step_index)
+                    self.save()
+                    raise KeyboardInterrupt
                 began = time.perf_counter()
                 row = trainer.step()
                 self.seconds += time.perf_counter() - began
@@ -182,11 +188,7 @@ class _Loop:
                     self._preview(bar)
                 if done % config.save_every == 0 and done < config.max_steps:
                     self.save()
-        except KeyboardInterrupt:
-            self.run_folder.log("interrupted", step=trainer.step_index)
             self.save()
-            raise
-        self.save()
 
     def save(self) -> None:
         """The PLY, then the checkpoint."""
@@ -275,6 +277,29 @@ class _Progress:
             held_out = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
             text = f"step {done} of {self._total}: {count} Gaussians{held_out}, {seconds:.0f} s"
             print(text, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _interrupt_between_steps():
+    """Yields a function that says whether Ctrl-C was pressed; pressed again, it interrupts at once.
+
+    In the middle of a step the Gaussians may be half-way through density control: not a state to save.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False  # signals reach the main thread only
+        return
+    pressed = []
+
+    def on_interrupt(*_):
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(True)
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

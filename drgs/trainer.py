@@ -151,7 +151,7 @@ class Trainer:
         config, model, done = self.config, self.model, self.step_index
         events = self._prepare(done)
         frame = self.frames[self._next_view()]
-        out = drgs.render(model.gaussians(), frame.camera, config.settings)
+        out = drgs.render(model.gaussians(), frame.camera, config.settings, outputs=())
         loss = self._loss(frame, out)
         model.optimizer.zero_grad(set_to_none=True)
         loss.backward()

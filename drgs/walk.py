@@ -77,9 +77,7 @@ class Part:
         inside = [self.t.Bool(True)] * len(rays)
         stream_of = lambda _: self.stream_of(lanes)  # noqa: E731
         flat = [pick(f) for f in self.flat]
-        part = Part(
-            self.t, self.model, self.records, rays, flat, inside, stream_of, True, self.center_key, select=True
-        )
+        part = Part(self.t, self.model, self.records, rays, flat, inside, stream_of, True, self.center_key, select=True)
         dr.eval(rays, flat)
         return part
 
@@ -112,6 +110,8 @@ class Part:
         t, ray = self.t, self.rays[0]
         record = list(dr.gather(t.ArrayXf, self.records, index, active, shape=(RECORD, dr.width(index))))
         _, key, ok = self.model.hit(record, ray, active)
+        # `integral` has hits whose t* lies behind the origin.
+        key = dr.maximum(key, 0)
         if self.center_key is not None:
             key = dr.gather(t.Float, self.center_key, index, ok)
         return key, ok
@@ -123,16 +123,26 @@ class Part:
         start = stream.begin()
         keys, index = [F(EMPTY) for _ in range(BUFFER)], [U(0) for _ in range(BUFFER)]
 
+        def exchange(enter, candidate, keys, index, last, state):
+            """Put a hit into the buffer and composite the one that leaves it."""
+            (key, at), keys, index = _push(enter, candidate, keys, index)
+            out = key != EMPTY
+            (state,) = kernel.shade(at, self.rays, [state], [[key, at]], out)
+            return keys, index, [dr.select(out, key, last[0]), dr.select(out, at, last[1])], state
+
         def body(s, go, keys, index, last, failed, state):
             candidate, valid, bound, s = stream.next(s, t.Bool(True))
             key, ok = self._probe(candidate, valid)
             if check:
                 failed = dr.select(ok & _less(key, candidate, *last), 1, failed)
             enter = dr.select(ok & (state["alive"] != 0), key, EMPTY)
-            (key, at), keys, index = _push(enter, candidate, keys, index)
-            out = key != EMPTY
-            (state,) = kernel.shade(at, self.rays, [state], [[key, at]], out)
-            last = [dr.select(out, key, last[0]), dr.select(out, at, last[1])]
+            # Most candidates miss most packets of lanes: the branch skips the rest for these.
+            keys, index, last, state = dr.if_stmt(
+                (enter, candidate, keys, index, last, state),
+                enter != EMPTY,
+                exchange,
+                lambda _, __, *unchanged: unchanged,
+            )
             going = state["alive"] != 0
             if check:
                 going |= bound <= last[0]
@@ -149,7 +159,9 @@ class Part:
         t = self.t
 
         def body(j, keys, index, state):
-            (state,) = kernel.shade(index[0], self.rays, [state], [[keys[0], index[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST))
+            (state,) = kernel.shade(
+                index[0], self.rays, [state], [[keys[0], index[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST)
+            )
             keys = [*keys[1:], t.Float(_LAST)]
             index = [*index[1:], t.UInt32(0)]
             return j + 1, keys, index, state
@@ -181,7 +193,9 @@ class Part:
                 return s, keys, index
 
             empty = [F(_LAST) for _ in range(BUFFER)], [U(0xFFFFFFFF) for _ in range(BUFFER)]
-            _, keys, index = dr.while_loop((type(start)(start) if isinstance(start, U) else start, *empty), lambda s, *_: stream.more(s), body)
+            _, keys, index = dr.while_loop(
+                (type(start)(start) if isinstance(start, U) else start, *empty), lambda s, *_: stream.more(s), body
+            )
             return keys, index
 
         def body(go, last, state):
@@ -231,7 +245,9 @@ def tile_part(t, model, records, lists: Lists, settings, width: int, height: int
     pixels = [(x + a, y + b) for a, b in blocks]
     inside = [(px < width) & (py < height) for px, py in pixels]
     flat = [py * width + px for px, py in pixels]
-    rays = [ray_of(t.Float(px) + 0.5, t.Float(py) + 0.5, f, i) for (px, py), f, i in zip(pixels, flat, inside, strict=True)]
+    rays = [
+        ray_of(t.Float(px) + 0.5, t.Float(py) + 0.5, f, i) for (px, py), f, i in zip(pixels, flat, inside, strict=True)
+    ]
     some = inside[0]
     for other in inside[1:]:
         some |= other

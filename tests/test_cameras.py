@@ -1,4 +1,6 @@
-"""Cameras: conventions by projected points, lenses by re-projection and against OpenCV, files, bad input."""
+"""Cameras: conventions by projected points, lenses by re-projection and against OpenCV, files, bad
+input.
+"""
 
 from __future__ import annotations
 
@@ -27,17 +29,13 @@ FISHEYE = (-0.02, 0.005, 1e-3, -2e-4)
 
 
 def make(**changes) -> Camera:
+    """A camera with an off-center principal point; fields may be changed."""
     fields = {"K": intrinsics(100, 105, 60.5, 40.25), "w2c": POSE, "width": 128, "height": 80}
     return Camera(**{**fields, **changes})
 
 
-def at_pixel(c2w: np.ndarray, local: tuple) -> np.ndarray:
-    """Pixel of the point at a camera-frame position, given in the camera's own axes."""
-    camera = make(w2c=np.linalg.inv(c2w))
-    return camera.project((c2w @ [*local, 1.0])[None, :3])[0][0]
-
-
 def test_projects_by_opencv_axes_with_centers_at_half():
+    """x right, y down, z forward; behind the camera there is no pixel."""
     camera = make(w2c=np.eye(4))
     pixels, z = camera.project(np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [0, 0, -1]]))
     np.testing.assert_allclose(pixels[:3], [[60.5, 40.25], [110.5, 40.25], [60.5, 92.75]])
@@ -46,6 +44,7 @@ def test_projects_by_opencv_axes_with_centers_at_half():
 
 
 def test_opengl_frame_by_projected_point():
+    """A point right of and above a camera that looks along -z."""
     # A Blender camera at the origin looks along -z with +y up.
     c2w = c2w_from_opengl(np.eye(4))
     camera = make(w2c=np.linalg.inv(c2w))
@@ -56,6 +55,7 @@ def test_opengl_frame_by_projected_point():
 
 
 def test_llff_frame_by_projected_point():
+    """A point right of and below a camera given as (down, right, backward)."""
     # Columns down, right, backward: a camera at (1, 2, 3) whose axes are the world's OpenCV axes.
     pose = np.array([[0.0, 1, 0, 1], [1, 0, 0, 2], [0, 0, -1, 3]])
     camera = make(w2c=np.linalg.inv(c2w_from_llff(pose)))
@@ -65,6 +65,7 @@ def test_llff_frame_by_projected_point():
 
 
 def test_mitsuba_frame_looks_along_z_with_x_left():
+    """Mitsuba keeps our forward axis and turns x around."""
     to_world = c2w_to_mitsuba(make().c2w)
     np.testing.assert_allclose(to_world[:3, 2], make().c2w[:3, 2])
     np.testing.assert_allclose(to_world[:3, 0], -make().c2w[:3, 0])
@@ -72,6 +73,7 @@ def test_mitsuba_frame_looks_along_z_with_x_left():
 
 
 def test_mitsuba_sensor_traces_our_pixel_rays():
+    """Mitsuba's own rays at pixel centers equal ours, principal point off center."""
     mi = pytest.importorskip("mitsuba")
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
@@ -87,10 +89,11 @@ def test_mitsuba_sensor_traces_our_pixel_rays():
 
 
 def test_mitsuba_sensor_refuses_what_it_cannot_do():
+    """Lenses and oblong pixels are refused, each with its way out."""
     pytest.importorskip("mitsuba")
     with pytest.raises(ValueError, match="undistorted camera, got model opencv"):
         make(model="opencv", distortion=OPENCV).to_mitsuba()
-    with pytest.raises(ValueError, match="square pixels, got fx 100 and fy 105"):
+    with pytest.raises(ValueError, match="square pixels, got fx 100, fy 105"):
         make().to_mitsuba()
 
 
@@ -98,6 +101,7 @@ def test_mitsuba_sensor_refuses_what_it_cannot_do():
     ("model", "distortion"), [("pinhole", ()), ("opencv", OPENCV), ("opencv_fisheye", FISHEYE)]
 )
 def test_pixel_directions_project_back_to_their_pixels(model, distortion):
+    """Undistortion is converged: every pixel returns to itself."""
     camera = make(model=model, distortion=distortion)
     directions = camera.pixel_directions()
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0)
@@ -109,6 +113,7 @@ def test_pixel_directions_project_back_to_their_pixels(model, distortion):
 
 @pytest.mark.parametrize(("model", "distortion"), [("opencv", OPENCV), ("opencv_fisheye", FISHEYE)])
 def test_lenses_agree_with_opencv(model, distortion, rng):
+    """Our two lens models are OpenCV's."""
     cv2 = pytest.importorskip("cv2")
     camera = make(w2c=np.eye(4), model=model, distortion=distortion)
     points = np.concatenate([rng.uniform(-0.5, 0.5, (50, 2)), np.ones((50, 1))], axis=1)
@@ -124,6 +129,7 @@ def test_lenses_agree_with_opencv(model, distortion, rng):
 
 
 def test_fisheye_sees_beyond_180_degrees():
+    """Rays of an equidistant fisheye may point backward."""
     camera = make(
         K=intrinsics(25, 25, 64, 40), w2c=np.eye(4), model="opencv_fisheye", distortion=(0,) * 4
     )
@@ -133,11 +139,13 @@ def test_fisheye_sees_beyond_180_degrees():
 
 
 def test_warns_where_a_lens_has_no_inverse():
+    """A lens polynomial that folds is reported with the number of pixels."""
     with pytest.warns(UserWarning, match=r"lens cannot be inverted at \d+ of 10240 pixels"):
         make(model="opencv", distortion=(-2.0, 0.0, 0.0, 0.0)).pixel_directions()
 
 
 def test_resized_scales_k_exactly_and_undistorted_drops_the_lens():
+    """Pixels scale with the image, and a plain pinhole of the same K remains."""
     camera = make(model="opencv", distortion=OPENCV)
     small = camera.resized(64, 20)
     np.testing.assert_allclose(small.K, [[50, 0, 30.25], [0, 26.25, 10.0625], [0, 0, 1]])
@@ -149,6 +157,7 @@ def test_resized_scales_k_exactly_and_undistorted_drops_the_lens():
 
 
 def test_keeps_a_torch_pose_with_its_gradient():
+    """The very tensor is kept, through a resize too."""
     torch = pytest.importorskip("torch")
     pose = torch.tensor(POSE, requires_grad=True)
     camera = make(w2c=pose)
@@ -158,6 +167,7 @@ def test_keeps_a_torch_pose_with_its_gradient():
 
 
 def test_field_of_view_and_look_at():
+    """Focal length from an angle, up is up, right is right."""
     K = intrinsics_from_fov(90.0, 200, 100)
     np.testing.assert_allclose(K, [[100, 0, 100], [0, 100, 50], [0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(intrinsics_from_fov(90.0, 200, 100, axis="y")[0, 0], 50.0)
@@ -175,6 +185,7 @@ def test_field_of_view_and_look_at():
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 2, 3)])
 def test_orbit_looks_at_its_center_from_its_radius(up):
+    """Distance, elevation and target hold for any up direction."""
     cameras = orbit((1, 2, 3), 4.0, 7, elevation=30.0, up=up, width=64, height=48)
     assert len(cameras) == 7
     for camera in cameras:
@@ -187,6 +198,7 @@ def test_orbit_looks_at_its_center_from_its_radius(up):
 
 
 def test_cameras_json_round_trip_and_optional_center(tmp_path):
+    """INRIA's layout, with and without cx, cy."""
     path = tmp_path / "cameras.json"
     save_cameras_json(path, [make(name="a"), make(w2c=np.eye(4), name="b")])
     back = load_cameras_json(path)
@@ -202,6 +214,7 @@ def test_cameras_json_round_trip_and_optional_center(tmp_path):
 
 
 def test_cameras_json_bad_input(tmp_path):
+    """Each broken file names the file and the camera."""
     path = tmp_path / "cameras.json"
     with pytest.raises(FileNotFoundError, match="must be a cameras.json file"):
         load_cameras_json(path)
@@ -254,6 +267,7 @@ FLIPPED = np.diag([1.0, 1.0, -1.0, 1.0])
     ],
 )
 def test_refuses_bad_cameras_in_one_line(changes, message):
+    """Every field has its own message, which names the camera."""
     with pytest.raises(ValueError, match=message) as error:
         make(name="c7", **changes)
     assert "\n" not in str(error.value)

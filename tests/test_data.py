@@ -18,6 +18,7 @@ BARREL = (-0.2, 0.05, 1e-3, -2e-3)
 
 
 def poses(count: int) -> list[np.ndarray]:
+    """w2c of cameras on an arc that look at the origin."""
     angles = np.linspace(0, 1.5, count)
     return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0)) for a in angles]
 
@@ -31,6 +32,7 @@ def gradient(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
 
 
 def write_image(path, image) -> None:
+    """Write RGB, RGBA or one channel."""
     path.parent.mkdir(parents=True, exist_ok=True)
     order = [2, 1, 0, 3][: image.shape[2]] if image.ndim == 3 else ...
     assert cv2.imwrite(str(path), image[..., order] if image.ndim == 3 else image)
@@ -62,6 +64,7 @@ def write_colmap(folder, text: bool = False, count: int = 4, model: str = "PINHO
 
 
 def write_transforms(folder, count: int = 3, extra: dict | None = None, **top) -> dict:
+    """A transforms.json data set; ``extra`` goes to every frame, None drops a key."""
     frames = []
     for index, pose in enumerate(poses(count)):
         write_image(folder / "images" / f"{index}.png", gradient())
@@ -76,10 +79,12 @@ def write_transforms(folder, count: int = 3, extra: dict | None = None, **top) -
 
 
 def save(folder, data, name: str = "transforms.json") -> None:
+    """Write JSON."""
     (folder / name).write_text(json.dumps(data))
 
 
 def write_llff(folder, count: int = 3) -> np.ndarray:
+    """An LLFF data set; returns its rows."""
     rows = []
     for index, pose in enumerate(poses(count)):
         c2w = np.linalg.inv(pose)
@@ -98,6 +103,7 @@ def write_llff(folder, count: int = 3) -> np.ndarray:
 
 @pytest.mark.parametrize("text", [False, True])
 def test_colmap_binary_and_text(tmp_path, text):
+    """Poses, intrinsics, points and colors come through, by both kinds of file."""
     write_colmap(tmp_path, text)
     # A folder may hold more photos than the model lists.
     write_image(tmp_path / "images" / "unlisted.png", gradient())
@@ -115,6 +121,7 @@ def test_colmap_binary_and_text(tmp_path, text):
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
 def test_colmap_places(tmp_path, place):
+    """A model is found where COLMAP and Nerfstudio put it, or named itself."""
     target = write_colmap(tmp_path)
     moved = tmp_path / "moved"
     target.rename(moved)
@@ -147,6 +154,7 @@ def test_colmap_places(tmp_path, place):
     ],
 )
 def test_colmap_lenses_project_as_pycolmap_does(tmp_path, model, params, lens, distortion):
+    """Our camera projects where COLMAP's does, for every model."""
     pycolmap = pytest.importorskip("pycolmap")
     write_colmap(tmp_path, model=model, params=params)
     camera = load(tmp_path).views[0].camera
@@ -158,6 +166,7 @@ def test_colmap_lenses_project_as_pycolmap_does(tmp_path, model, params, lens, d
 
 
 def test_transforms_with_masks_and_depth(tmp_path):
+    """OpenGL poses, masks and millimeter depths."""
     write_transforms(tmp_path, extra={"mask_path": "m.png", "depth_file_path": "d.png"})
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 12:] = 255
@@ -175,6 +184,7 @@ def test_transforms_with_masks_and_depth(tmp_path):
 
 
 def test_transforms_depth_units(tmp_path):
+    """npy depths are in scene units unless the file says otherwise."""
     data = write_transforms(tmp_path, extra={"depth_file_path": "d.npy"})
     np.save(tmp_path / "d.npy", np.full((HEIGHT, WIDTH), 2.5, np.float32))
     np.testing.assert_allclose(load(tmp_path).views[0].depth(), 2.5)
@@ -183,6 +193,7 @@ def test_transforms_depth_units(tmp_path):
 
 
 def test_transforms_blender_split_without_suffix(tmp_path):
+    """Blender's files: three splits, no suffix, an angle for a focal length."""
     angle = 2 * np.arctan(0.5 * WIDTH / 20)
     for split in ("train", "test", "val"):
         write_image(tmp_path / split / "r_0.png", gradient())
@@ -199,6 +210,7 @@ def test_transforms_blender_split_without_suffix(tmp_path):
 
 
 def test_transforms_lenses(tmp_path):
+    """Coefficients go by the camera model that is named."""
     data = write_transforms(tmp_path, k1=0.1, k2=0.02, p1=1e-3, p2=2e-3)
     camera = load(tmp_path).views[0].camera
     assert (camera.model, camera.distortion) == ("opencv", (0.1, 0.02, 1e-3, 2e-3, 0.0))
@@ -210,6 +222,7 @@ def test_transforms_lenses(tmp_path):
 
 
 def test_transforms_scale_k_to_smaller_images(tmp_path):
+    """Images of half the size halve K."""
     write_transforms(tmp_path, w=2 * WIDTH, h=2 * HEIGHT)
     camera = load(tmp_path).views[0].camera
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
@@ -217,6 +230,7 @@ def test_transforms_scale_k_to_smaller_images(tmp_path):
 
 
 def test_transforms_mixed_sizes_with_their_own_intrinsics(tmp_path):
+    """Sizes may differ when every frame has its own intrinsics."""
     own = {"fl_x": 20, "w": WIDTH, "h": HEIGHT, "cx": 12, "cy": 8}
     data = write_transforms(tmp_path, extra=own)
     write_image(tmp_path / "images" / "1.png", gradient(30, 10))
@@ -226,10 +240,12 @@ def test_transforms_mixed_sizes_with_their_own_intrinsics(tmp_path):
 
 
 def test_transforms_points(tmp_path):
+    """The point cloud that the file names is read with its colors."""
     write_transforms(tmp_path, ply_file_path="points.ply")
     header = (
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
-        "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+        "end_header\n"
     )
     (tmp_path / "points.ply").write_text(header + "0 1 2 255 0 51\n3 4 5 0 0 0\n")
     dataset = load(tmp_path)
@@ -239,6 +255,7 @@ def test_transforms_points(tmp_path):
 
 
 def test_llff(tmp_path):
+    """Axes and the height, width, focal column."""
     write_llff(tmp_path)
     dataset = load(tmp_path)
     assert (dataset.format, len(dataset.views)) == ("llff", 3)
@@ -252,6 +269,7 @@ def test_llff(tmp_path):
 
 
 def test_split_is_every_eighth_by_name():
+    """The rule and its words, and what it refuses."""
     views = [View(Camera(K, np.eye(4), WIDTH, HEIGHT), name=f"{i:02d}") for i in range(17)]
     dataset = Dataset("x", "test", views[::-1])
     train, test = dataset.split()
@@ -266,6 +284,7 @@ def test_split_is_every_eighth_by_name():
 
 
 def test_load_reads_no_pixels(tmp_path):
+    """A damaged picture hurts only when it is asked for."""
     write_transforms(tmp_path)
     image = tmp_path / "images" / "1.png"
     image.write_bytes(image.read_bytes()[:40])  # the header survives, the pixels do not
@@ -276,6 +295,7 @@ def test_load_reads_no_pixels(tmp_path):
 
 
 def test_image_composites_alpha_and_reads_16_bits(tmp_path):
+    """Alpha goes on the background; 16 bits have the range of 8."""
     write_transforms(tmp_path)
     image = np.dstack([gradient(), np.full((HEIGHT, WIDTH), 51, np.uint8)])
     write_image(tmp_path / "images" / "0.png", image)
@@ -287,6 +307,7 @@ def test_image_composites_alpha_and_reads_16_bits(tmp_path):
 
 
 def test_image_resizes_by_area(tmp_path):
+    """Half size is the mean of 2x2 pixels."""
     write_transforms(tmp_path)
     expected = gradient().reshape(8, 2, 12, 2, 3).mean(axis=(1, 3)) / 255
     np.testing.assert_allclose(load(tmp_path).views[0].image(12, 8), expected, atol=1e-6)
@@ -296,7 +317,9 @@ def test_image_resizes_by_area(tmp_path):
     ("model", "distortion"), [("opencv", BARREL), ("opencv_fisheye", (0.05, 0.01, 0.0, 0.0))]
 )
 def test_undistorted_image_shows_the_right_rays(tmp_path, model, distortion):
-    """A photo whose colors are its ray directions, undistorted, must show a pinhole's directions."""
+    """A photo whose colors are its ray directions, undistorted, must show a pinhole's
+    directions.
+    """
     width, height = 120, 80
     camera = Camera(intrinsics(100, 105, 58.5, 41.25), np.eye(4), width, height, model, distortion)
     to_color = lambda camera: camera.pixel_directions() * [0.8, 0.8, 0] + 0.5  # noqa: E731
@@ -313,6 +336,7 @@ def test_undistorted_image_shows_the_right_rays(tmp_path, model, distortion):
 
 
 def test_undistorted_masks_and_depths_stay_unmixed_and_unseen_pixels_are_masked(tmp_path):
+    """No value appears that was not stored, and nothing is made up outside the photo."""
     camera = Camera(K, np.eye(4), WIDTH, HEIGHT, "opencv", (0.5, 0.0, 0.0, 0.0))
     depth = np.where(np.arange(WIDTH) < 12, 1000, 3000)[None].repeat(HEIGHT, 0)
     write_image(tmp_path / "d.png", depth.astype(np.uint16))
@@ -328,6 +352,7 @@ def test_undistorted_masks_and_depths_stay_unmixed_and_unseen_pixels_are_masked(
 
 
 def test_scene_extent():
+    """3DGS's rule, and what a single camera gets."""
     cameras = [Camera(K, pose, WIDTH, HEIGHT) for pose in poses(5)]
     centers = np.array([camera.center for camera in cameras])
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
@@ -339,6 +364,7 @@ def test_scene_extent():
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".bmp"])
 def test_image_size_agrees_with_decoding(tmp_path, suffix):
+    """Header and decoder agree."""
     from drgs.data.checks import image_size
 
     write_image(tmp_path / f"a{suffix}", gradient(37, 21))
@@ -346,6 +372,7 @@ def test_image_size_agrees_with_decoding(tmp_path, suffix):
 
 
 def test_barrel_lens_that_folds_back_is_masked():
+    """Past the fold a photo shows something else: masked, without a warning."""
     camera = Camera(intrinsics(20, 20, 12, 8), np.eye(4), WIDTH, HEIGHT, "opencv", (-1.0, 0, 0, 0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -23,10 +23,12 @@ from drgs.data import load
 
 
 def one_line(error) -> None:
+    """An error must be one line."""
     assert "\n" not in str(error.value)
 
 
 def test_says_where_it_looked(tmp_path):
+    """Nothing there, photos without poses, a wrong file."""
     with pytest.raises(FileNotFoundError, match="nowhere: must be a data set"):
         load(tmp_path / "nowhere")
     with pytest.raises(
@@ -44,6 +46,7 @@ def test_says_where_it_looked(tmp_path):
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
 def test_colmap_lying_counts_allocate_nothing(tmp_path, name):
+    """A claimed 10^12 records is refused by the size of the file."""
     path = write_colmap(tmp_path) / f"{name}.bin"
     path.write_bytes(struct.pack("<Q", 10**12) + path.read_bytes()[8:])
     with pytest.raises(ValueError, match=f"{name}.bin: must hold the 1000000000000") as error:
@@ -53,6 +56,7 @@ def test_colmap_lying_counts_allocate_nothing(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
 def test_colmap_truncated_binaries(tmp_path, name):
+    """Cut anywhere, a file is refused."""
     path = write_colmap(tmp_path) / f"{name}.bin"
     whole = path.read_bytes()
     for length in sorted({4, len(whole) // 2, len(whole) - 1}):
@@ -63,6 +67,7 @@ def test_colmap_truncated_binaries(tmp_path, name):
 
 
 def test_colmap_lying_lengths_inside_records(tmp_path):
+    """Track and observation counts are checked as well."""
     target = write_colmap(tmp_path)
     points = target / "points3D.bin"
     data = bytearray(points.read_bytes())
@@ -80,6 +85,7 @@ def test_colmap_lying_lengths_inside_records(tmp_path):
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames"])
 def test_colmap_truncated_text(tmp_path, name):
+    """A last word missing is refused."""
     path = write_colmap(tmp_path, text=True) / f"{name}.txt"
     text = path.read_text().rstrip()
     path.write_text(text[: text.rindex(" ")])
@@ -90,6 +96,7 @@ def test_colmap_truncated_text(tmp_path, name):
 
 @pytest.mark.parametrize("text", [False, True])
 def test_colmap_refuses_other_lenses_by_name(tmp_path, text):
+    """FOV is not among our models."""
     write_colmap(tmp_path, text, model="FOV", params=[20, 20, 12, 8, 0.5])
     with pytest.raises(ValueError, match="must be one of SIMPLE_PINHOLE.*, got FOV") as error:
         load(tmp_path)
@@ -97,6 +104,7 @@ def test_colmap_refuses_other_lenses_by_name(tmp_path, text):
 
 
 def test_colmap_bad_poses_and_missing_files(tmp_path):
+    """NaN poses and absent images are named by index and name."""
     target = write_colmap(tmp_path)
     frames = target / "frames.bin"
     whole = frames.read_bytes()
@@ -121,6 +129,7 @@ def test_colmap_bad_poses_and_missing_files(tmp_path):
 
 
 def test_colmap_image_of_another_shape(tmp_path):
+    """An image that cannot belong to its camera is refused."""
     write_colmap(tmp_path)
     write_image(tmp_path / "images" / "im3.png", gradient(30, 10))
     with pytest.raises(ValueError, match=r"image 3 .*\(24x16\), got 30x10"):
@@ -144,6 +153,7 @@ def test_colmap_image_of_another_shape(tmp_path):
     ],
 )
 def test_transforms_bad_fields(tmp_path, change, message):
+    """Every field of the file has its message."""
     write_transforms(tmp_path, **change)
     with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
         load(tmp_path)
@@ -151,6 +161,7 @@ def test_transforms_bad_fields(tmp_path, change, message):
 
 
 def test_transforms_bad_frames(tmp_path):
+    """The first bad frame is named."""
     good = write_transforms(tmp_path)
 
     def attempt(message, kind=ValueError, **frame):
@@ -182,6 +193,7 @@ def test_transforms_bad_frames(tmp_path):
 
 
 def test_transforms_rounded_poses_are_repaired(tmp_path):
+    """Three digits are enough for a rotation."""
     data = write_transforms(tmp_path)
     for frame in data["frames"]:
         frame["transform_matrix"] = np.round(frame["transform_matrix"], 3).tolist()
@@ -190,6 +202,7 @@ def test_transforms_rounded_poses_are_repaired(tmp_path):
 
 
 def test_transforms_mixed_sizes_need_their_own_intrinsics(tmp_path):
+    """Shared intrinsics cannot hold for two sizes."""
     data = write_transforms(tmp_path)
     write_image(tmp_path / "images" / "2.png", gradient(WIDTH // 2, HEIGHT // 2))
     with pytest.raises(ValueError, match="one size unless every frame.*12x8 at frame 2") as error:
@@ -199,6 +212,7 @@ def test_transforms_mixed_sizes_need_their_own_intrinsics(tmp_path):
 
 
 def test_points_ply_that_lies(tmp_path):
+    """Claimed counts, NaN and other files are refused."""
     write_transforms(tmp_path, ply_file_path="points.ply")
     header = (
         "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\n"
@@ -218,6 +232,7 @@ def test_points_ply_that_lies(tmp_path):
 
 
 def test_llff_bad_input(tmp_path):
+    """Lying headers, pickles, other shapes, NaN rows."""
     rows = write_llff(tmp_path)
     path = tmp_path / "poses_bounds.npy"
 
@@ -246,6 +261,7 @@ def test_llff_bad_input(tmp_path):
 
 
 def test_view_files_that_do_not_fit(tmp_path):
+    """Masks, depths and images of other sizes are refused when read."""
     write_transforms(tmp_path, extra={"mask_path": "m.png", "depth_file_path": "d.png"})
     write_image(tmp_path / "m.png", np.zeros((10, 30), np.uint8))
     write_image(tmp_path / "d.png", gradient())

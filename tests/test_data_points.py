@@ -30,7 +30,9 @@ def texture(rng) -> np.ndarray:
 def render_plane(
     camera: Camera, image: np.ndarray, half: float = 2.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The textured square |x|, |y| <= half in the plane z = 0: image and z-depth (0 where missed)."""
+    """The textured square |x|, |y| <= half in the plane z = 0: image and z-depth (0 where
+    missed).
+    """
     directions = camera.pixel_directions()
     t = -camera.center[2] / directions[..., 2]
     points = camera.center + t[..., None] * directions
@@ -42,6 +44,7 @@ def render_plane(
 
 
 def plane_views(folder, rng, count: int = 5, depth: bool = False, mask=None) -> list[View]:
+    """Views of a textured square, with depth maps and masks if wanted."""
     image, views = texture(rng), []
     for index in range(count):
         angle = -0.3 + 0.6 * index / max(count - 1, 1)
@@ -64,6 +67,7 @@ def plane_views(folder, rng, count: int = 5, depth: bool = False, mask=None) -> 
 
 
 def test_given_points_come_first_and_are_thinned_by_seed(tmp_path, rng):
+    """The data set knows best; the seed decides what is left out."""
     points, colors = rng.normal(size=(100, 3)), rng.uniform(size=(100, 3)).astype(np.float32)
     views = plane_views(tmp_path, rng, count=1)
     dataset = Dataset(tmp_path, "test", views, points, colors, "cloud, 100 points")
@@ -77,6 +81,7 @@ def test_given_points_come_first_and_are_thinned_by_seed(tmp_path, rng):
 
 
 def test_depth_maps_give_the_surface_with_its_colors(tmp_path, rng):
+    """Points lie on the surface and have the color they project to."""
     views = plane_views(tmp_path, rng, count=3, depth=True)
     points, colors, source = initial_points(views, max_points=3000)
     assert source == f"back-projected from 3 depth maps, {len(points)} points"
@@ -91,6 +96,7 @@ def test_depth_maps_give_the_surface_with_its_colors(tmp_path, rng):
 
 
 def test_depth_respects_masks(tmp_path, rng):
+    """Nothing comes from outside a mask."""
     left = np.zeros((HEIGHT, WIDTH), bool)
     left[:, :100] = True
     views = plane_views(tmp_path, rng, count=1, depth=True, mask=left)
@@ -99,6 +105,7 @@ def test_depth_respects_masks(tmp_path, rng):
 
 
 def test_triangulates_with_the_given_poses(tmp_path, rng):
+    """Points lie on the plane, in the given poses' frame."""
     pytest.importorskip("pycolmap")
     stages = []
     views = plane_views(tmp_path, rng)
@@ -114,6 +121,7 @@ def test_triangulates_with_the_given_poses(tmp_path, rng):
 
 
 def test_triangulation_stays_inside_the_masks(tmp_path, rng):
+    """Features outside the masks are dropped."""
     pytest.importorskip("pycolmap")
 
     def left_half(camera, z):
@@ -127,6 +135,7 @@ def test_triangulation_stays_inside_the_masks(tmp_path, rng):
 
 
 def test_random_points_lie_in_the_common_view(tmp_path, rng):
+    """Without texture: random, seen by several cameras, near the center."""
     views = plane_views(tmp_path, rng)
     for view in views:  # nothing to match
         assert cv2.imwrite(str(view.image_path), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
@@ -143,6 +152,7 @@ def test_random_points_lie_in_the_common_view(tmp_path, rng):
 
 
 def test_points_of_a_view_list_read_only_these_views(tmp_path, rng):
+    """An active run must not touch the files of other views."""
     views = plane_views(tmp_path, rng, count=3, depth=True)
     views[2].image_path.unlink()
     views[2].depth_path.unlink()
@@ -154,6 +164,7 @@ def test_points_of_a_view_list_read_only_these_views(tmp_path, rng):
 
 
 def test_pairs():
+    """Neighbors in time and in space."""
     assert sequential_pairs(list("abcd"), 1) == [
         ("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d")
     ]  # fmt: skip
@@ -165,6 +176,7 @@ def test_pairs():
 
 
 def test_real_office_depth_agrees_between_views(data_dir):
+    """One view's depth predicts another's."""
     if not (data_dir / "office").is_dir():
         pytest.skip(f"no office data set in {data_dir}")
     views = load(data_dir / "office").views
@@ -183,6 +195,7 @@ def test_real_office_depth_agrees_between_views(data_dir):
 
 
 def test_real_banana_and_head_load(data_dir):
+    """Real COLMAP and transforms data sets load."""
     for name, kind, count in (("banana", "colmap", 14), ("head", "transforms", 33)):
         if not (data_dir / name).is_dir():
             pytest.skip(f"no {name} data set in {data_dir}")

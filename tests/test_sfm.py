@@ -1,11 +1,14 @@
-"""Structure from motion: on a small rendered scene, on real photos when present, and its bad input."""
+"""Structure from motion: on a small rendered scene, on real photos when present, and its bad
+input.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_data_points import plane_views
+from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 
+from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
 from drgs.sfm import run_sfm
 
@@ -14,7 +17,9 @@ cv2 = pytest.importorskip("cv2")
 
 
 def aligned_error(found: np.ndarray, true: np.ndarray) -> float:
-    """Largest distance between two point lists after the best similarity, relative to the spread."""
+    """Largest distance between two point lists after the best similarity, relative to the
+    spread.
+    """
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -23,32 +28,39 @@ def aligned_error(found: np.ndarray, true: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def bumpy(tmp_path_factory):
-    """Photos of two textured planes, one before the other, as structure from motion needs depth."""
-    from test_data_points import HEIGHT, WIDTH, render_plane, texture
-
-    from drgs.cameras import Camera, intrinsics, look_at
-
-    folder = tmp_path_factory.mktemp("bumpy")
+def corner(tmp_path_factory):
+    """Photos of three textured walls that meet in a corner, and their cameras."""
+    folder = tmp_path_factory.mktemp("corner")
     rng = np.random.default_rng(5)
-    back, front = texture(rng), texture(rng)
+    K = intrinsics(384, 384, WIDTH / 2, HEIGHT / 2)
+    # Each wall is the square z = 0 of a frame of its own: its axes and center in the world.
+    walls = []
+    for axes, center in [
+        (([1, 0, 0], [0, 1, 0], [0, 0, 1]), (0, 0, -1.5)),
+        (([0, 0, 1], [1, 0, 0], [0, 1, 0]), (0, -1.5, 0)),
+        (([0, 1, 0], [0, 0, 1], [1, 0, 0]), (-1.5, 0, 0)),
+    ]:
+        world = np.eye(4)
+        world[:3, :3], world[:3, 3] = np.transpose(axes), center
+        walls.append((world, texture(rng)))
     cameras = []
     for index in range(7):
-        angle = -0.45 + 0.15 * index
-        eye = np.array([4 * np.sin(angle), 0.3 * (index % 3), 4 * np.cos(angle)])
-        K = intrinsics(384, 384, WIDTH / 2, HEIGHT / 2)
-        camera = Camera(K, look_at(eye, (0, 0, 0.3), (0, 1, 0)), WIDTH, HEIGHT)
-        color, _ = render_plane(camera, back, half=3.0)
-        raised = Camera(K, look_at(eye - [0, 0, 0.8], (0, 0, -0.5), (0, 1, 0)), WIDTH, HEIGHT)
-        near, depth = render_plane(raised, front, half=0.6)
-        color = np.where(depth[..., None] > 0, near, color)
-        assert cv2.imwrite(str(folder / f"{index}.png"), np.round(color * 255).astype(np.uint8))
+        angle = 0.3 + 0.15 * index
+        eye = (4 * np.sin(angle), 1.5 + 0.3 * (index % 3), 4 * np.cos(angle))
+        camera = Camera(K, look_at(eye, (-0.8, -0.8, -0.8), (0, 1, 0)), WIDTH, HEIGHT)
+        photo = np.zeros((HEIGHT, WIDTH, 3))
+        for world, image in walls:
+            local = Camera(K, camera.w2c @ world, WIDTH, HEIGHT)
+            color, depth = render_plane(local, image, half=1.5)
+            photo = np.where(depth[..., None] > 0, color, photo)
+        assert cv2.imwrite(str(folder / f"{index}.png"), np.round(photo * 255).astype(np.uint8))
         cameras.append(camera)
     return folder, cameras
 
 
-def test_recovers_poses_and_loads(bumpy, tmp_path):
-    folder, cameras = bumpy
+def test_recovers_poses_and_loads(corner, tmp_path):
+    """All photos found, centers right up to a similarity, result replaceable."""
+    folder, cameras = corner
     stages = []
     out = tmp_path / "out"
     summary = run_sfm(folder, out, progress=lambda *step: stages.append(step))
@@ -72,6 +84,7 @@ def test_recovers_poses_and_loads(bumpy, tmp_path):
 
 
 def test_photos_that_do_not_connect(tmp_path, rng):
+    """Nothing is left behind."""
     photos = tmp_path / "photos"
     photos.mkdir()
     for index in range(3):
@@ -85,6 +98,7 @@ def test_photos_that_do_not_connect(tmp_path, rng):
 
 
 def test_bad_input(tmp_path, rng):
+    """Each bad argument has its line."""
     with pytest.raises(FileNotFoundError, match="must be a folder of photos"):
         run_sfm(tmp_path / "gone", tmp_path / "out")
     photos = tmp_path / "photos"
@@ -112,6 +126,7 @@ def test_bad_input(tmp_path, rng):
 
 @pytest.mark.slow
 def test_real_banana(data_dir, tmp_path):
+    """At least 14 of the 16 poses."""
     photos = data_dir / "banana" / "images"
     if not photos.is_dir():
         pytest.skip(f"no banana data set in {data_dir}")

@@ -58,7 +58,10 @@ def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 
     reconstruction = _read(model)
     folder = _image_folder(path, model)
     views = []
-    registered = sorted(reconstruction.reg_image_ids())
+    # By name: COLMAP numbers images in the order in which its threads finish them.
+    registered = sorted(
+        reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name
+    )
     if not registered:
         raise ValueError(
             f"{model}: must hold at least one registered image, got none; run `drgs sfm` again"

@@ -1,0 +1,318 @@
+"""`drgs render`: pictures and videos of a Gaussian PLY or a finished run, from any cameras.
+
+Which cameras, which settings, which files; the drawing is `drgs.render`, the files are pictures.py.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+import drgs
+from drgs import pictures, runtime
+from drgs.cameras import load_cameras_json, save_cameras_json
+from drgs.files import SCHEMA, Run, load_ply, write_json
+from drgs.orbits import UP, capture_orbit, scene_orbit
+from drgs.progress import Bar
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.cli import Render
+    from drgs.data import Dataset
+    from drgs.ellipsoids import Gaussians
+    from drgs.settings import RenderSettings
+
+__all__ = ["render_views", "run"]
+
+_FORMATS = ("png", "exr", "webm")
+_MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
+
+
+def run(args: Render) -> None:
+    """`drgs render SCENE`."""
+    settings = args.settings()
+    formats = _formats(args.format)
+    _check_numbers(args)
+    gaussians, folder = _load_scene(args.scene)
+    if folder is not None and not any(text.startswith("background=") for text in args.overrides):
+        # A run was fitted over its background; over another one its edges show a halo.
+        settings = settings.replace(background=_run_background(folder))
+    cameras, source = _cameras(args, gaussians, folder)
+    cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
+    if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
+        cameras = [camera.undistorted() for camera in cameras]
+        _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
+    _make_folder(args.output)
+    with Bar("render", len(cameras), not args.quiet) as bar:
+        report = render_views(
+            gaussians,
+            cameras,
+            settings,
+            args.output,
+            formats=formats,
+            depth=args.depth,
+            fps=args.fps,
+            video="turntable.webm" if args.cameras == "orbit" else "video.webm",
+            advance=bar.advance,
+        )
+    report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
+    if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
+        save_cameras_json(args.output / "cameras.json", cameras)
+    else:
+        _say(args, "no cameras.json: its layout has no lens and no skew; render.json holds the cameras")
+    write_json(args.output / "render.json", {"schema": SCHEMA, "command": "render"} | report)
+    _say(args, _summary(report, args.output))
+
+
+def render_views(
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    settings: RenderSettings,
+    out_dir: Path,
+    *,
+    formats: tuple[str, ...] = ("png",),
+    depth: bool = False,
+    fps: float = 24.0,
+    video: str = "video.webm",
+    advance: Callable[[], None] | None = None,
+) -> dict:
+    """Render cameras to files, each of which appears once it is complete.
+
+    Args:
+        gaussians, cameras, settings: As for `drgs.render`, a list of cameras.
+        out_dir: Folder of the files; made if absent.
+        formats: Of png (8 bits, clamped, no transfer function), exr (float32; R G B, A, and Z, the
+            distance along the ray) and webm (one video).
+        depth: A color-mapped `NAME.depth.png` for each view, too.
+        fps: Of the video.
+        video: Its file name.
+        advance: Called after each view.
+    Returns:
+        JSON-serializable: settings, backend, seconds (first, median of the others, total), rays and
+        redone (rays whose exact order took more than one pass; None where the order is not exact),
+        and views (camera, files, seconds, rays, redone).
+    """
+    outputs = ("depth",) if depth or "exr" in formats else ()
+    views = []
+    movie = pictures.Video(out_dir / video, fps) if "webm" in formats else None
+    with movie or contextlib.nullcontext():
+        for camera, name in zip(cameras, _file_names(cameras), strict=True):
+            began = time.perf_counter()
+            with torch.no_grad():
+                out = drgs.render(gaussians, camera, settings, outputs)
+            rgb, alpha = out.rgb.cpu().numpy(), out.alpha.cpu().numpy()
+            seconds = time.perf_counter() - began
+            files = []
+            if "png" in formats:
+                pictures.write_png(out_dir / f"{name}.png", rgb)
+                files.append(f"{name}.png")
+            if outputs:
+                distance = out.depth.cpu().numpy()
+            if "exr" in formats:
+                pictures.write_exr(out_dir / f"{name}.exr", rgb, A=alpha, Z=distance)
+                files.append(f"{name}.exr")
+            if depth:
+                pictures.write_png(out_dir / f"{name}.depth.png", pictures.depth_picture(distance, alpha))
+                files.append(f"{name}.depth.png")
+            if movie is not None:
+                movie.write(rgb)
+            made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
+            views.append({"camera": _described(camera), "files": files, "seconds": seconds, **made})
+            if advance:
+                advance()
+    times = [view["seconds"] for view in views]
+    total = {key: _total(view[key] for view in views) for key in ("rays", "redone")}
+    return {
+        "settings": dataclasses.asdict(settings),
+        "backend": runtime.backend().variant,
+        "threads": runtime.backend().threads,
+        "seconds": {"first": times[0], "median": statistics.median(times[1:] or times), "total": sum(times)},
+        **total,
+        "video": video if movie is not None else None,
+        "views": views,
+    }
+
+
+# ------------------------------------------------------------------------------------------ inputs
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(part.strip().lower() for part in text.split(",") if part.strip()))
+    unknown = [name for name in names if name not in _FORMATS]
+    if unknown or not names:
+        got = unknown[0] if unknown else text
+        raise ValueError(f"render: --format must be a list of {', '.join(_FORMATS)}, got {got!r}")
+    return names
+
+
+def _check_numbers(args: Render) -> None:
+    for option, value, high in (
+        ("--width", args.width, _MAX_SIDE),
+        ("--height", args.height, _MAX_SIDE),
+        ("--frames", args.frames, 100_000),
+        ("--limit", args.limit, 10**9),
+    ):
+        if value is not None and not 1 <= value <= high:
+            raise ValueError(f"render: {option} must be in [1, {high}], got {value}")
+    if not 0 < args.fps <= 240:
+        raise ValueError(f"render: --fps must be in (0, 240], got {args.fps}")
+    if not 1 <= args.fov <= 170:
+        raise ValueError(f"render: --fov must be in [1, 170] degrees, got {args.fov}")
+    if args.elevation is not None and not -89 <= args.elevation <= 89:
+        raise ValueError(f"render: --elevation must be in [-89, 89] degrees, got {args.elevation}")
+
+
+def _load_scene(path: Path) -> tuple[Gaussians, Run | None]:
+    """The Gaussians, and the run that they belong to if `path` is a run folder."""
+    if not path.is_dir():
+        return load_ply(path), None
+    folder = Run(path)
+    folder.config()  # says that it is no run folder, or of another version
+    if not folder.point_cloud.is_file():
+        raise FileNotFoundError(
+            f"{path}: must hold point_cloud.ply, found none; the fit has not reached its first checkpoint"
+        )
+    return load_ply(folder.point_cloud), folder
+
+
+def _run_background(folder: Run) -> tuple[float, ...]:
+    try:
+        return tuple(folder.config()["fit"]["settings"]["background"])
+    except (KeyError, TypeError):
+        raise ValueError(f"{folder.path}/config.json: must record the fit's settings, does not; fit again") from None
+
+
+def _cameras(args: Render, gaussians: Gaussians, folder: Run | None) -> tuple[list[Camera], str]:
+    """The cameras before resizing, and where they come from in words."""
+    if args.cameras == "orbit":
+        if args.split != "all":
+            raise ValueError(f"render: --split {args.split} must have --cameras DATA, an orbit has no split")
+        size = args.width or 640, args.height or round((args.width or 640) * 0.75)
+        lens = {"width": size[0], "height": size[1], "fov": args.fov, "elevation": args.elevation}
+        captured = _captured(folder) if folder is not None and args.up == "auto" else []
+        cameras = capture_orbit(captured, args.frames, **lens) if captured else []
+        if cameras:
+            return cameras, "orbit like the photographs"
+        up = "minus-y" if args.up == "auto" else args.up
+        if args.up == "auto":
+            _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
+        return scene_orbit(gaussians, args.frames, up=UP[up], **lens), f"orbit, up {up}"
+    path = Path(args.cameras)
+    if _is_camera_list(path):
+        if args.split != "all":
+            raise ValueError(f"{path}: --split {args.split} must have a data set, a cameras.json has no split")
+        return load_cameras_json(path), str(path)
+    dataset, test_every = _dataset(path)
+    train, test = dataset.split(test_every)
+    views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
+    if not views:
+        rule = dataset.split_rule(test_every)
+        raise ValueError(f"{path}: split {args.split} must hold a view, holds none ({rule}); use --split all")
+    return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{path} ({args.split})"
+
+
+def _is_camera_list(path: Path) -> bool:
+    """Whether a JSON file is a list, as INRIA's cameras.json is, and not a transforms.json."""
+    if path.suffix != ".json" or not path.is_file():
+        return path.name == "cameras.json"
+    with path.open("rb") as file:
+        return file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
+
+
+def _dataset(path: Path) -> tuple[Dataset, int | None]:
+    """A data set, or that of a run; and the run's rule of the split."""
+    from drgs.data import load
+
+    if (path / "config.json").is_file() and (path / "log.jsonl").is_file():
+        config = Run(path).config()
+        return load(config["data"]), config["fit"]["test_every"]
+    return load(path), None
+
+
+def _captured(folder: Run) -> list[Camera]:
+    """Cameras of the photographs that a run was fitted to; none if they are no longer there."""
+    try:
+        return [view.camera for view in _dataset(folder.path)[0].views]
+    except (ValueError, OSError, KeyError):
+        return []
+
+
+def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
+    """The camera at the size asked for; one side alone keeps the shape."""
+    if width is None and height is None:
+        return camera
+    if width is None:
+        width = max(1, round(camera.width * height / camera.height))
+    if height is None:
+        height = max(1, round(camera.height * width / camera.width))
+    return camera.resized(width, height)
+
+
+# ----------------------------------------------------------------------------------------- outputs
+
+
+def _make_folder(path: Path) -> None:
+    """The output folder, found out to be writable before anything is computed."""
+    probe = path / ".drgs-probe"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"{path}: -o must be a folder that can be written, got: {reason}; choose another") from None
+
+
+def _file_names(cameras: list[Camera]) -> list[str]:
+    """One file name a camera: views' names may hold folders, be empty or repeat."""
+    names: list[str] = []
+    for index, camera in enumerate(cameras):
+        clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name).strip(".")[:100]
+        name = clean or f"view_{index:04d}"
+        names.append(name if name not in names else f"{name}_{index:04d}")
+    return names
+
+
+def _described(camera: Camera) -> dict:
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "c2w": camera.c2w.tolist(),
+        "model": camera.model,
+        "distortion": list(camera.distortion),
+    }
+
+
+def _number(value) -> int | None:
+    return None if value is None else int(value)
+
+
+def _total(values) -> int | None:
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None
+
+
+def _summary(report: dict, folder: Path) -> str:
+    views, seconds = report["views"], report["seconds"]
+    text = (
+        f"{len(views)} views of {report['gaussians']} Gaussians in {seconds['total']:.1f} s "
+        f"(first {seconds['first']:.2f} s, then {seconds['median']:.3f} s a view): {folder}"
+    )
+    if report["redone"] is not None:
+        share = report["redone"] / max(report["rays"], 1)
+        text += f"\nexact order: {report['redone']} of {report['rays']} rays ({share:.2%}) took more than one pass"
+    return text
+
+
+def _say(args: Render, text: str) -> None:
+    if not args.quiet:
+        print(text, flush=True)
