@@ -6,7 +6,8 @@ evaluated from our own records. What is done about its known faults (Mitsuba 3.9
 - the intersection divides by |d| instead of |d|^2: rays are traced with directions scaled to the size of the proxies;
 - its discriminant is rounded to about 6e-8 (distance / radius)^2: proxies are not smaller than 1e-3 of their distance;
 - rays that start inside a proxy see nothing of it: origins are moved back behind everything they could be inside of;
-- the restart behind a hit loses what enters within the step: the step is 1e-6 of the scene, doubled on a repeated hit;
+- the restart behind a hit loses what enters within the step: the step is about one unit in
+  the last place, doubled on a repeated hit;
 - of coincident proxies only one is found: Gaussians with the same center, rotation and scale share one primitive,
   whose members the stream delivers one by one.
 """
@@ -21,7 +22,8 @@ from drgs.walk import EMPTY, Part
 
 __all__ = ["Proxies", "proxy_scene"]
 
-_STEP = 1e-6  # of the scene's size
+_STEP = 1e-8  # of the scene's size
+_GRAZE = 1e-7  # of (distance / radius)^2: what rounding takes from the discriminant, with a margin
 _THIN = 1e-3  # smallest proxy radius, relative to the distance it is traced over
 
 
@@ -70,7 +72,10 @@ def proxy_scene(t, means, quats, radii, alive, origins) -> Proxies | None:
     # Only primitives that an origin can be inside of matter.
     around = widest[distance - widest <= 2 * spread]
     back = 2.0 * float(around.max()) if len(around) else 0.0
-    radii = np.maximum(radii * (1 + 1e-4), _THIN * (distance + back)[:, None])
+    reach = (distance + back)[:, None]
+    # Grazing rays are lost to rounding unless the proxy is larger than the Gaussian by as much.
+    grown = 1 + 1e-4 + _GRAZE * (reach / np.maximum(radii.min(1, keepdims=True), _THIN * reach)) ** 2
+    radii = np.maximum(radii * grown, _THIN * reach)
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
     xyzw = (quats / norm)[:, [1, 2, 3, 0]]
     data = np.concatenate([means, radii, xyzw], 1).astype(np.float32)
@@ -139,7 +144,7 @@ class _Stream:
         member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
         step = dr.select(again, 2 * step, dr.select(fresh, p.step, step))
         # Far along the ray the step is less than one unit in the last place.
-        forward = dr.maximum(step, 2.4e-7 * abs(entry))
+        forward = dr.maximum(step, 1.2e-7 * abs(entry))
         at = dr.select(found, entry + forward, at)
         last = dr.select(fresh, primitive, last)
         some = dr.select(trace & ~found, 0, some)

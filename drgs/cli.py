@@ -14,6 +14,7 @@ import dataclasses
 import importlib
 import io
 import logging
+import os
 import re
 import sys
 import typing
@@ -214,6 +215,8 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit code. Bad usage and --help leave through SystemExit, as argparse does.
     """
+    # Before torch starts them: OpenMP threads that spin between operations take cores from Dr.Jit's.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     argv = sys.argv[1:] if argv is None else list(argv)
     args = _parse_arguments(argv)
     name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)

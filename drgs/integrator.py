@@ -264,9 +264,25 @@ class _Scene:
             made["visibility"] = extra["visibility"].torch().to(self.device)
         return Output(**made, certificate=dict(self.view.certificate))
 
+    def nothing(self) -> dict:
+        """Flat images of no Gaussians: the background, with a derivative of 0."""
+        t, pixels = self.t, int(np.prod(self.shape))
+        self.view = View(t, self.settings, pixels, None, 0, self.width, self.want, None, None, False)
+        sizes = {"median": pixels, "count": pixels, "visibility": 0}
+        self.view.extra.update({name: dr.zeros(t.Float, sizes[name]) for name in self.want & set(sizes)})
+        zero = 0 * sum(x.sum().to(torch.float32) for x in self.inputs.values())
+        flat = {"alpha": pixels, "features": pixels * self.width} | ({"depth": pixels} if "depth" in self.want else {})
+        images = {name: zero.expand(size) for name, size in flat.items()}
+        return {"rgb": zero + torch.tensor(self.settings.background, device=self.home).repeat(pixels), **images}
+
     def jvp(self, tangents: dict) -> Output:
         """`render_jvp`."""
         columns, batched = self._tangents(tangents)
+        if self.count == 0:
+            still = self.output(self.nothing())
+            images = {name: getattr(still, name) for name in ("rgb", "alpha", "depth", "features")}
+            lead = (len(columns),) if batched else ()
+            return Output(**{n: x.new_zeros(*lead, *x.shape) for n, x in images.items() if x is not None})
         return _jvp_output(self, self._push_forward(columns), batched)
 
     def _tangents(self, tangents):
@@ -383,6 +399,8 @@ def _jvp_output(scene: _Scene, pushed, batched: bool) -> Output:
 def _differentiable(scene: _Scene) -> dict:
     """Run `scene.trace` on its torch inputs, through whichever bridge their derivative needs."""
     values = scene.inputs.values()
+    if scene.count == 0:
+        return scene.nothing()
     if _forward_ad(values):
         names = list(scene.inputs)
         results = _Bridge.apply(scene, names, *values)
@@ -407,8 +425,7 @@ class _Bridge(torch.autograd.Function):
 
     @staticmethod
     def forward(scene, names, *values):
-        plain = [_plain(x) for x in values]
-        images = scene.trace(**{n: _tensor(scene.t, x) for n, x in zip(names, plain, strict=True)})
+        images = scene.trace(**{n: _plain(scene.t, x) for n, x in zip(names, values, strict=True)})
         scene.result_names = list(images)
         return tuple(x.torch().clone() for x in images.values())
 
@@ -421,40 +438,37 @@ class _Bridge(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *cotangents):
         scene, t = ctx.scene, ctx.scene.t
-        inputs = {n: _tensor(t, _plain(x)) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
+        inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
         images = scene.trace(**inputs)
-        total = t.Float(0)
         for name, g in zip(scene.result_names, cotangents, strict=True):
-            dr.set_grad(images[name], t.Float(_plain(g)))
+            dr.set_grad(images[name], _plain(t, g).array)
         dr.enqueue(dr.ADMode.Backward, images)
         dr.traverse(dr.ADMode.Backward)
-        del total
         return None, None, *(dr.grad(x).torch().clone() for x in inputs.values())
 
     @staticmethod
     def jvp(ctx, _scene, _names, *tangents):
         scene, t = ctx.scene, ctx.scene.t
-        inputs = {n: _tensor(t, _plain(x)) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
+        inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
         images = scene.trace(**inputs)
         for x, v in zip(inputs.values(), tangents, strict=True):
             if v is not None:
-                dr.set_grad(x, _tensor(t, _plain(v)))
+                dr.set_grad(x, _plain(t, v))
         dr.enqueue(dr.ADMode.Forward, inputs)
         dr.traverse(dr.ADMode.Forward)
         return tuple(dr.grad(images[name]).torch().clone() for name in scene.result_names)
 
 
-def _plain(x):
+def _plain(t, x):
     """The values below any `torch.func` wrapper."""
     F = torch._C._functorch
-    while F.is_functorch_wrapped_tensor(x):
-        x = F.get_unwrapped(x)
-    x = x.detach()
-    while F.is_functorch_wrapped_tensor(x):  # detach() wraps again
-        x = F.get_unwrapped(x)
-    return x.contiguous()
+    # Otherwise every operation wraps its result again.
+    with torch._C._DisableFuncTorch():
+        while F.is_functorch_wrapped_tensor(x):
+            x = F.get_unwrapped(x)
+        return _tensor(t, x)
 
 
 def _tensor(t, x):

@@ -423,7 +423,7 @@ def project_world(t, p, w2c, settings: RenderSettings, coefficients: int):
     if settings.near > 0:
         alive &= z > settings.near
     key = z if settings.depth_key == "z" else distance
-    # The proxies of `bvh` may stop where alpha_min cuts.
-    extent = _listed_extent(g, settings)
+    # The proxies of `bvh` may stop where alpha_min cuts, unless it is their entry points that order the hits.
+    extent = dr.detach(g.extent) if settings.order == "entry" else _listed_extent(g, settings)
     ellipsoids = [*g.mean, *g.quat, *[dr.detach(s) * extent for s in g.scale]]
     return Projected(record, Float(key), None, None, alive & (extent > 0), [dr.detach(x) for x in ellipsoids])

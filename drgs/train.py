@@ -77,10 +77,10 @@ def fit(
         KeyboardInterrupt: Passed on after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
+    drgs.runtime.backend()  # sets torch's threads too, at first use
     if config.deterministic:
         import drjit as dr
 
-        drgs.runtime.backend()
         # Atomic additions of several threads come in any order, and float additions do not commute with that.
         dr.set_thread_count(1)
     train, test = dataset.split(config.test_every)
@@ -306,8 +306,9 @@ def _interrupt_between_steps():
 def _fewer_torch_threads():
     """Half of torch's threads while fitting.
 
-    Between its operations OpenMP's threads spin and take cores from Dr.Jit's: with all of them, a step on two cores
-    takes 0.10 s instead of 0.07 s (banana, 130,000 pixels), and much more once another process runs.
+    Between its operations OpenMP's threads spin and take cores from Dr.Jit's, and each operation waits for the last of
+    them: with all of them, a step on two cores takes 0.10 s instead of 0.07 s (banana, 130,000 pixels), and five times
+    as long once other processes run.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(max(1, threads // 2))

@@ -54,7 +54,8 @@ class FitConfig:
         refine_start, refine_stop, refine_every: Fractions between which, and how often, density is controlled.
         min_opacity: Below it a Gaussian is moved elsewhere.
         grow_until: Fraction at which the budget is reached, at a constant rate of growth.
-        noise: Strength of the exploration noise.
+        noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it cost
+            0.4 dB of held-out PSNR (28.0 against 28.4).
         jitter: Displacement of copies in their own standard deviations.
     """
 
@@ -86,7 +87,7 @@ class FitConfig:
     refine_every: float = 1 / 30
     min_opacity: float = 0.005
     grow_until: float = 0.5
-    noise: float = 5e5
+    noise: float = 0.0
     jitter: float = 0.1
 
     def __post_init__(self):

@@ -17,6 +17,7 @@ import pytest
 # Before torch or Dr.Jit is imported, and inherited by the processes that tests start.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"):
     os.environ.setdefault(_name, "2")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # OpenMP threads that spin take cores from Dr.Jit's
 os.environ.setdefault("DRGS_VARIANT", "llvm_ad_rgb")
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -63,7 +63,7 @@ def gaussians(rng, n=20, K=4, D=0, scale=0.15, spread=1.0, anisotropy=0.5, opaci
 def around_camera(g: Gaussians, cam: Camera) -> Gaussians:
     """Move the first Gaussians: in front of, around, beside and behind the camera, in its plane, into its center."""
     c2w = cam.c2w
-    places = ([0.05, 0.02, 0.4], [0.1, 0.0, 0.1], [0.3, 0.2, -0.25], [0, 0, -1.5], [1.5, 0.3, 0.2])
+    places = ([0.05, 0.02, 0.4], [0.1, 0.0, 0.1], [0.3, 0.2, -0.25], [0, 0, -1.5], [1.5, 0.3, 0.3])
     with torch.no_grad():
         for i, place in enumerate(places[: len(g)]):
             g.means[i] = torch.tensor(c2w[:3, :3] @ place + c2w[:3, 3], dtype=torch.float32)
@@ -106,15 +106,17 @@ class Oracle:
 
     Attributes:
         out: `reference.Output`.
-        good: (H, W) pixels that do not hang on a near tie.
+        good: (H, W) pixels that do not hang on a near tie, and are not in `skip`.
         u, back: Cotangents of the images, 0 where not `good`, and the gradient they give, by group.
         v, push: Tangents of the groups and the tangent images they give.
     """
 
-    def __init__(self, g, cam, settings, rng, tolerance=1e-5):
+    def __init__(self, g, cam, settings, rng, tolerance=1e-5, names=FIELDS, skip=None):
         self.out = reference.render(g, cam, settings, tolerance=tolerance)
         self.good = ~self.out.ambiguous
-        images = {name: x for name in FIELDS if (x := getattr(self.out, name)) is not None}
+        if skip is not None:
+            self.good &= ~skip
+        images = {name: x for name in names if (x := getattr(self.out, name)) is not None}
         self.u = {}
         for name, x in images.items():
             mask = self.good.reshape(*self.good.shape, *[1] * (x.ndim - self.good.ndim))

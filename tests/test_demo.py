@@ -1,0 +1,85 @@
+"""`drgs demo --quick`: every stage runs, and the numbers it prints are sane."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from drgs import cli, demo
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """The folder, the report and the text of one tiny demo."""
+    said = []
+    out = tmp_path_factory.mktemp("demo") / "out"
+    report = demo.make_demo(out, demo.Plan.quick(), said.append)
+    return out, report, said
+
+
+def test_files(result):
+    """Pictures, video, run folder and JSON are there, and nothing half-written."""
+    out, report, _ = result
+    names = {path.name for path in out.iterdir()}
+    assert names == {"still_life", "run", "comparison.png", "turntable.webm", "demo.json"}
+    assert json.loads((out / "demo.json").read_text())["presets"] == report["presets"]
+    assert (out / "run" / "point_cloud.ply").is_file()
+
+
+def test_picture_and_video(result):
+    """The sheet has six columns; the video has the planned frames."""
+    import cv2
+
+    out, _, _ = result
+    plan = demo.Plan.quick()
+    sheet = cv2.imread(str(out / "comparison.png"))
+    assert sheet.shape == (2 * (plan.height + 20), 6 * plan.width, 3)
+    video, count = cv2.VideoCapture(str(out / "turntable.webm")), 0
+    while video.read()[0]:
+        count += 1
+    assert count == plan.frames
+
+
+def test_numbers(result):
+    """`exact` is the oracle's image; the other presets are near it, each at its own distance."""
+    _, report, _ = result
+    rows = {row["preset"]: row for row in report["presets"]}
+    assert set(rows) == {"exact", "fast", "inria", "gsplat", "mitsuba"}
+    assert report["oracle"]["max_error"] < 1e-5
+    assert rows["exact"]["psnr_to_exact"] is None
+    assert all(25 < row["psnr_to_exact"] < 99 for name, row in rows.items() if name != "exact")
+    assert rows["fast"]["psnr_to_exact"] > rows["inria"]["psnr_to_exact"]
+    assert all(row["seconds"] > 0 for row in rows.values())
+    assert report["peer"]["psnr_between"] > 20
+    assert report["fit"]["mean"]["psnr"] > 10
+
+
+def test_text(result):
+    """What is said names the held-out views, the oracle and the files, without superlatives."""
+    out, report, said = result
+    text = "\n".join(str(line) for line in said)
+    assert [line[0] for line in said if isinstance(line, str)][:6] == list("123456")
+    assert "never saw" in text
+    assert f"{report['oracle']['max_error']:.1e}" in text
+    assert str(out / "demo.json") in text
+
+
+def test_again(result, monkeypatch, capsys):
+    """A second demo in the same folder keeps the still life and replaces the run."""
+    out, _, _ = result
+    stamp = (out / "still_life" / "params.json").stat().st_mtime_ns
+    before = (out / "run" / "config.json").stat().st_mtime_ns
+    assert cli.main(["demo", "--quick", "--quiet", "-o", str(out)]) == 0
+    assert (out / "still_life" / "params.json").stat().st_mtime_ns == stamp
+    assert (out / "run" / "config.json").stat().st_mtime_ns > before
+    assert capsys.readouterr().out == ""
+
+
+def test_bad_output(tmp_path, capsys):
+    """A folder that holds something else is refused in one line, before anything is computed."""
+    (tmp_path / "still_life").mkdir()
+    (tmp_path / "still_life" / "mine.txt").touch()
+    assert cli.main(["demo", "--quick", "-o", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [path.name for path in tmp_path.rglob("*")] == ["still_life", "mine.txt"]

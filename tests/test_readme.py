@@ -1,0 +1,126 @@
+"""The README is run: its commands on a tiny scene, its Python in order, its links and names looked up."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drgs
+from drgs import cli
+from drgs.cameras import c2w_to_opengl, orbit
+from drgs.files import save_ply
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+# What makes a command of the README small. Later options win over earlier ones.
+_SMALLER = {
+    "fit": ["--max-steps", "6", "--max-gaussians", "200"],
+    "render": ["--frames", "2", "--width", "24"],
+    "demo": ["--quick"],
+}
+# Structure from motion needs real texture and the demo takes half a minute: tests/test_sfm.py, tests/test_demo.py.
+_ELSEWHERE = ("sfm", "demo")
+
+
+def _blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.M | re.S)
+
+
+def _commands() -> list[list[str]]:
+    lines = "\n".join(_blocks("bash")).splitlines()
+    return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("drgs ")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with `scene`, nine posed pictures of a few Gaussians, and `point_cloud.ply`."""
+    import cv2
+
+    rng, folder = np.random.default_rng(3), tmp_path_factory.mktemp("readme")
+    n = 40
+    g = drgs.Gaussians.from_arrays(
+        (rng.normal(size=(n, 3)) * 0.5).astype(np.float32),
+        rng.normal(size=(n, 4)),
+        rng.uniform(0.05, 0.2, (n, 3)),
+        rng.uniform(0.5, 0.95, n),
+        rng.normal(size=(n, 4, 3)) * 0.5,
+    )
+    save_ply(g, folder / "point_cloud.ply")
+    (folder / "scene").mkdir()
+    frames = []
+    for i, camera in enumerate(orbit((0, 0, 0), 3.0, 9, width=32, height=24, up=(0, -1, 0))):
+        out = drgs.render(g, camera)
+        image = (out.rgb.numpy().clip(0, 1) * 255).round().astype(np.uint8)
+        z = out.median_depth if out.median_depth is not None else out.depth
+        cv2.imwrite(str(folder / f"scene/{i}.png"), image[..., ::-1])
+        cv2.imwrite(str(folder / f"scene/{i}.depth.png"), (z.numpy() * 1000).round().astype(np.uint16))
+        frames.append(
+            {
+                "file_path": f"{i}.png",
+                "depth_file_path": f"{i}.depth.png",
+                "transform_matrix": c2w_to_opengl(camera.c2w).tolist(),
+            }
+        )
+    K = camera.K
+    lens = {"w": 32, "h": 24, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    transforms = {"camera_model": "OPENCV", **lens, "depth_unit_scale_factor": 1e-3, "frames": frames}
+    (folder / "scene/transforms.json").write_text(json.dumps(transforms))
+    return folder
+
+
+def test_first_lines_are_the_two_commands():
+    """A stranger reads two commands first, and the Makefile has both."""
+    lines = README.splitlines()
+    assert [line.split()[:2] for line in lines[1:3]] == [["make", "demo"], ["make", "test"]]
+    makefile = (ROOT / "Makefile").read_text()
+    assert all(re.search(rf"^{name}:", makefile, flags=re.M) for name in ("demo", "test", "smoke"))
+
+
+def test_every_command_is_shown():
+    """The list of commands is complete."""
+    assert {command[0] for command in _commands()} == set(cli._RUN)
+
+
+def test_commands_run(folder, monkeypatch, capsys):
+    """The commands run in the order of the README, each on what the ones before have left."""
+    monkeypatch.chdir(folder)
+    for command in _commands():
+        if command[0] in _ELSEWHERE:
+            cli._parse_arguments(command)
+            continue
+        code = cli.main([*command, *_SMALLER.get(command[0], [])])
+        captured = capsys.readouterr()
+        assert code == 0, f"{command}: {captured.err}"
+        if "-o" in command:
+            assert any((folder / command[command.index("-o") + 1]).iterdir()), command
+
+
+def test_python_runs(folder, monkeypatch):
+    """The Python blocks run one after the other."""
+    monkeypatch.chdir(folder)
+    names: dict = {}
+    for block in _blocks("python"):
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["means"].grad.abs().max() > 0
+
+
+def test_presets_and_settings_exist():
+    """The table names every preset, and nothing else."""
+    from drgs.settings import PRESETS
+
+    table = README.split("## Presets")[1].split("## ")[0]
+    assert re.findall(r"^\| `(\w+)`", table, flags=re.M) == list(PRESETS)
+
+
+def test_links_lead_somewhere():
+    """Files that the README and the documentation link to are there."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
