@@ -313,9 +313,9 @@ def report(result: dict) -> str:
         lines += [
             f"`fast` forward composites {r['hits per second'] / 1e6:.0f} million hits a second, out of at most "
             f"{r['tests per second at most'] / 1e6:.0f} million tests of a Gaussian on a",
-            f"pixel; that is at most {100 * r['share of peak at most']:.0f} % of the {r['peak Gflop/s']:.0f} Gflop/s that "
-            "fused multiply-adds reach in a Dr.Jit kernel here, everything of a frame",
-            "in the clock.",
+            f"pixel; that is at most {100 * r['share of peak at most']:.0f} % of the {r['peak Gflop/s']:.0f} Gflop/s "
+            "that fused multiply-adds reach in a Dr.Jit kernel here,",
+            "everything of a frame in the clock.",
             "",
         ]
     if "hits" in result:

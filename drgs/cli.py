@@ -130,7 +130,7 @@ class Fit(_Settings):
     """Optimizer steps."""
     max_pixels: int = 130_000
     """Images are reduced to at most this many pixels."""
-    max_gaussians: int = 60_000
+    max_gaussians: int = 30_000
     """Budget of the density control."""
     init_points: Literal["auto", "views"] = "auto"
     """Initial points: the data set's if it has any, or only what the training views show."""

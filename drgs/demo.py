@@ -60,7 +60,7 @@ class Plan:
     height: int = 180
     spp: int = 30
     steps: int = 1500
-    gaussians: int = 16_000
+    gaussians: int = 24_000
     crop: tuple[int, int] = (48, 36)
     repeats: int = 5
     frames: int = 48

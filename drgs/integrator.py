@@ -162,8 +162,7 @@ class _Scene:
             self._set_rays(o - origin, d)
         else:
             self.shape = (camera.height, camera.width)
-            pose = camera.w2c if isinstance(camera.w2c, torch.Tensor) else torch.tensor(camera.w2c)
-            pose = pose.to(torch.float64)
+            pose = self._pose()
             if settings.traversal == "bvh" or settings.sh_direction == "ray":
                 local = torch.from_numpy(_local_directions(camera))
                 d = local @ pose[:3, :3]
@@ -173,6 +172,11 @@ class _Scene:
         shift = pose[:3, 3] + pose[:3, :3] @ origin
         self.inputs["w2c"] = self._move(torch.cat([pose[:3, :3], shift[:, None]], 1).reshape(-1))
         self.view = None
+
+    def _pose(self):
+        """w2c in float64; a copy of an array, which may be read-only."""
+        w2c = self.camera.w2c
+        return (w2c if isinstance(w2c, torch.Tensor) else torch.tensor(w2c)).to(torch.float64)
 
     def _set_rays(self, o, d):
         if self.settings.traversal == "bvh":
@@ -327,7 +331,7 @@ class _Scene:
             omega, v = given["camera"][:3], given["camera"][3:]
             twist = torch.zeros(4, 4, dtype=torch.float64)
             twist[:3, :3], twist[:3, 3] = _cross_matrix(omega), v
-            w2c = torch.as_tensor(self.camera.w2c, dtype=torch.float64).detach()
+            w2c = self._pose().detach()
             change = -w2c @ twist  # c2w <- exp(xi) c2w is w2c <- w2c exp(-xi)
             origin = torch.linalg.solve(
                 w2c[:3, :3], (self.inputs["w2c"].cpu().detach().reshape(3, 4)[:, 3] - w2c[:3, 3])

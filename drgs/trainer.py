@@ -62,7 +62,7 @@ class FitConfig:
     settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
     max_steps: int = 3000
     max_pixels: int = 130_000
-    max_gaussians: int = 60_000
+    max_gaussians: int = 30_000
     init_points: str = "auto"
     test_every: int = 8
     seed: int = 0

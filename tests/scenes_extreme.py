@@ -1,0 +1,244 @@
+"""The extremes that the renderer must stand, as named scenes; shared by the tests and benchmarks/numerics.py.
+
+A case builds (Gaussians, camera, settings); all leaves are float32 unless the case is about float64 means.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scenes_random import camera, gaussians
+
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.settings import RenderSettings
+
+SIZE = (9, 7)
+EXACT = RenderSettings.preset("exact")
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One line of the table.
+
+    Attributes:
+        name: As printed.
+        build: rng -> (Gaussians, Camera).
+        fields: Settings that differ from `exact`.
+        image, gradient: Bounds, where they are not 1e-5 and 1e-4.
+        bvh: Bound of image and gradients on `bvh`, or None where it is not run.
+        remark: What a reader should know.
+    """
+
+    name: str
+    build: Callable
+    fields: dict = dataclasses.field(default_factory=dict)
+    image: float = 1e-5
+    gradient: float = 1e-4
+    bvh: float | None = None
+    remark: str = ""
+
+    @property
+    def settings(self) -> RenderSettings:
+        return EXACT.replace(**self.fields)
+
+
+def _base(rng, size=SIZE, n=12, K=4, D=0, **options):
+    return gaussians(rng, n, K, D, **options), camera(rng, size)
+
+
+def _change(change, **options):
+    """A case's builder: a random scene, changed in place by `change(g, cam)`."""
+
+    def build(rng):
+        g, cam = _base(rng, **options)
+        with torch.no_grad():
+            change(g, cam)
+        return g, cam
+
+    return build
+
+
+def _at_camera(offset, scale=0.3):
+    """The first Gaussian, round, at `offset` (camera axes) from the camera center."""
+
+    def change(g, cam):
+        c2w = cam.c2w
+        g.means[0] = torch.tensor(c2w[:3, :3] @ np.asarray(offset, float) + c2w[:3, 3])
+        g.log_scales[0] = math.log(scale) + torch.tensor([0.0, 0.2, -0.2])
+        g.logit_opacities[0] = 0.5
+
+    return _change(change)
+
+
+def _scaled(factor):
+    """Everything, the camera's distance included, in other units."""
+
+    def build(rng):
+        g, cam = _base(rng)
+        with torch.no_grad():
+            g.means.mul_(factor)
+            g.log_scales.add_(math.log(factor))
+            pose = cam.w2c.clone()
+            pose[:3, 3] *= factor
+        return g, dataclasses.replace(cam, w2c=pose.requires_grad_())
+
+    return build
+
+
+def _scales(g, cam):
+    g.log_scales[:4] = math.log(1e-7)
+    g.log_scales[4:6] = math.log(1e4)
+
+
+def _huge(g, cam):
+    g.log_scales[:3] = math.log(1e4)
+    g.logit_opacities[:3] = -2.0
+
+
+def _needles(g, cam):
+    g.log_scales[:, 0], g.log_scales[:, 1:] = 0.0, math.log(1e-6)
+
+
+def _sheets(g, cam):
+    g.log_scales[:, :2], g.log_scales[:, 2] = math.log(0.5), math.log(0.5e-6)
+
+
+def _opacities(g, cam):
+    g.logit_opacities[:4] = math.log(1e-8)
+    g.logit_opacities[4:8] = 16.1
+    g.logit_opacities[8:10] = -100.0
+    g.logit_opacities[10:] = 100.0
+
+
+def _coincident(g, cam):
+    for x in (g.means, g.quats, g.log_scales):
+        x[:] = x[:1]
+    g.means[:] = 0
+    g.log_scales[:] = math.log(0.4)
+    g.logit_opacities[:] = -5.0 + torch.rand(len(g), generator=torch.Generator().manual_seed(0))
+
+
+def _equal_depths(rng):
+    """A plane of equal camera z, mirrored pairs at equal distance."""
+    g, cam = gaussians(rng, 12, 4), camera(rng, SIZE, turn=0.0)
+    with torch.no_grad():
+        g.means[:, 2] = 0.5
+        g.means[:, 0] = 0.1 + 0 * g.means[:, 0]
+        g.means[:, 1] = torch.linspace(-0.8, 0.8, 12)
+        g.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    return g, cam
+
+
+def _offset(rng, where):
+    """A world 1e6 from zero whose detail is 1e-2: float64 means, or float32 means relative to `origin`."""
+    g, cam = _base(rng)
+    shift = np.array([1e6, -7e5, 3e5])
+    with torch.no_grad():
+        g.means.mul_(0.1)
+        g.log_scales.fill_(math.log(1e-2)).add_(0.3 * torch.tensor(rng.normal(size=(len(g), 3))))
+        pose = cam.w2c.clone()
+        pose[:3, 3] *= 0.1
+        pose[:3, 3] -= pose[:3, :3] @ torch.tensor(shift)
+        means = g.means.double() + (torch.tensor(shift) if where == "means" else 0)
+    means = (means if where == "means" else means.float()).requires_grad_()
+    origin = np.zeros(3) if where == "means" else shift
+    return g.replace(means=means, origin=origin), dataclasses.replace(cam, w2c=pose.requires_grad_())
+
+
+def _focal(focal):
+    def build(rng):
+        g = gaussians(rng, 12, 4)
+        cam = camera(rng, SIZE, focal=focal, turn=0.0)
+        if focal > 100:
+            # The image spans 1e-4 of the distance.
+            with torch.no_grad():
+                g.means.mul_(2e-4)
+                g.means.sub_(torch.tensor([0.1, -0.1, 0.0]))
+                g.log_scales.fill_(math.log(5e-5))
+        return g, cam
+
+    return build
+
+
+def _covering(g, cam):
+    g.means[0] = torch.tensor(cam.c2w[:3, :3] @ [0, 0, 1.0] + cam.c2w[:3, 3])
+    g.log_scales[0] = math.log(100.0)
+
+
+def _layers(rng):
+    """1,000 opaque layers: T underflows within a few of them."""
+    g, cam = gaussians(rng, 1000, 1), camera(rng, SIZE)
+    with torch.no_grad():
+        g.log_scales[:] = math.log(0.5)
+        g.logit_opacities[:] = 6.0
+    return g, cam
+
+
+def _quaternions(g, cam):
+    g.quats[:4] *= 1e-20
+    g.quats[4:8] *= 1e15
+    g.quats[8:] *= -1
+
+
+def _negative(g, cam):
+    g.sh[:, 0] = -4.0
+    g.sh[::2, 0, 1] = 1.0
+
+
+def _one(rng):
+    return _base(rng, n=1)
+
+
+def _none(rng):
+    return _base(rng, n=0)
+
+
+_BEHIND = {"remark": "`integral`: the tail in front of the camera counts"}
+CASES = (
+    Case("scale 1e-7 to 1e4 in one scene", _change(_scales), image=1e-5),
+    Case("world in units of 1e-7", _scaled(1e-7)),
+    Case("world in units of 1e4", _scaled(1e4)),
+    Case("scale 1e4 around the camera", _change(_huge)),
+    Case("anisotropy 1e6:1, needles", _change(_needles)),
+    Case("anisotropy 1e6:1, sheets", _change(_sheets)),
+    Case("opacity 1e-8 to 1 - 1e-7, logits of 100", _change(_opacities)),
+    Case("opacity 1e-8 to 1 - 1e-7, `integral`", _change(_opacities), {"response": "integral"}),
+    Case("2,000 coincident Gaussians", _change(_coincident, n=2000, K=1)),
+    Case("equal depths, `center`", _equal_depths, {"order": "center", "depth_key": "z"}),
+    Case("equal depths", _equal_depths),
+    Case("camera inside a Gaussian", _at_camera([0.05, 0.02, 0.1])),
+    Case("camera inside, `integral`", _at_camera([0.05, 0.02, 0.1]), {"response": "integral"}),
+    Case("camera on the surface (1 sigma)", _at_camera([0, 0, 0.3])),
+    Case("camera just in front of a mean", _at_camera([0, 0, -1e-3])),
+    Case("camera just in front, `integral`", _at_camera([0, 0, -1e-3]), {"response": "integral"}, **_BEHIND),
+    Case("camera just behind a mean", _at_camera([0, 0, 1e-3])),
+    Case("camera at a mean", _at_camera([0, 0, 0]), {"response": "integral"}),
+    Case("mean in the camera plane", _at_camera([0.2, 0.1, 0])),
+    Case("mean in the camera plane, `integral`", _at_camera([0.2, 0.1, 0]), {"response": "integral"}),
+    Case("mean on the camera's x axis", _at_camera([0.2, 0, 0]), {"response": "integral"}),
+    Case("mean just off the camera plane", _at_camera([0.2, 0.1, 1e-6]), {"response": "integral"}),
+    Case("crossing the near plane", _at_camera([0, 0, 0.21]), {"near": 0.2}),
+    Case("covering the screen, sigma 100", _change(_covering)),
+    Case("`ewa` close to the camera plane", _at_camera([0.001, 0, 0.01], 0.1), {"response": "ewa", "order": "center"}),
+    Case("world offset 1e6, detail 1e-2, float64 means", lambda rng: _offset(rng, "means")),
+    Case("world offset 1e6, detail 1e-2, `origin`", lambda rng: _offset(rng, "origin")),
+    Case("focal length 1 px", _focal(1.0)),
+    Case("focal length 1e5 px", _focal(1e5)),
+    Case("image 1x1", lambda rng: _base(rng, (1, 1))),
+    Case("image 1x4096", lambda rng: _base(rng, (4096, 1))),
+    Case("image 4096x1", lambda rng: _base(rng, (1, 4096))),
+    Case("0 Gaussians", _none),
+    Case("1 Gaussian", _one),
+    Case("quaternions near 0, huge and negated", _change(_quaternions)),
+    Case("negative colors", _change(_negative)),
+    Case("1,000 opaque layers", _layers),
+    Case("1,000 opaque layers, `center`", _layers, {"order": "center"}),
+    Case("1,000 opaque layers, `integral`", _layers, {"response": "integral"}),
+    Case("D = 1", lambda rng: _base(rng, D=1)),
+    Case("D = 512", lambda rng: _base(rng, D=512)),
+)
