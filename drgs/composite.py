@@ -110,7 +110,7 @@ class Composite(dr.CustomOp):
         parts, done = self._parts(kernel.source), []
         for part in list(parts):
             # Visibility is scattered on the way, so rays that turn out wrong must be known beforehand.
-            check = part.ordered and not part.select and first
+            check = part.ordered and first
             if check and kernel.visibility is not None:
                 probe = Primal(self.model, self._source(), frozenset())
                 dr.eval(part.run(probe, check=True), part.failed)
@@ -135,7 +135,7 @@ class Composite(dr.CustomOp):
         dr.eval(part.inside)
         self.view.certificate["rays"] = self.view.pixels
         self.view.certificate["redone"] = dr.width(lanes)
-        return [part.take(lanes)] if dr.width(lanes) else []
+        return part.listed(lanes)
 
     def _write(self, out, source, part, states):
         """Scatter the states of a part into the images."""

@@ -6,8 +6,7 @@ for 64 pixels. In every other case a lane has one ray and a sorted buffer of K h
 
 Exact order with a finite buffer: hits enter as they come, and the nearest leaves when a new one needs its place. A ray
 goes wrong only if a hit arrives in front of one that has left; this is checked on every hit (the certificate), and such
-rays are redone by repeated selection: each pass over the stream takes the K nearest hits beyond the last one
-composited, so any depth is exact. A ray may stop at its transmittance limit only where nothing that is still to come
+rays are redone from a sorted list of all their hits, so any depth is exact. A ray may stop at its transmittance limit only where nothing that is still to come
 can lie in front: streams bound the keys to come from below.
 """
 
@@ -25,6 +24,7 @@ BUFFER = 16
 EMPTY = -1.0  # order key of "no hit"; keys of hits are >= 0
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
 _LAST = 3.3e38  # a key behind all others
+_MAX_HITS = 1 << 28  # of one sorted list; longer ones are split by rays
 
 
 class TileStream:
@@ -61,33 +61,72 @@ class Part:
         failed: After a primal pass in exact order: lanes whose buffer was too short.
     """
 
-    def __init__(self, t, model, records, rays, flat, inside, stream_of, ordered: bool, center_key=None, select=False):
+    def __init__(self, t, model, records, rays, flat, inside, stream_of, ordered: bool, center_key=None):
         self.t, self.model, self.records = t, model, records
         self.rays, self.flat, self.inside = rays, flat, inside
-        self.stream_of, self.ordered, self.center_key, self.select = stream_of, ordered, center_key, select
-        self.finals, self.failed = None, None
+        self.stream_of, self.ordered, self.center_key = stream_of, ordered, center_key
+        self.failed = None
 
-    def take(self, lanes) -> Part:
-        """The same for a subset of lanes, to be done by repeated selection."""
+    def listed(self, lanes) -> list[Part]:
+        """Parts that walk a subset of lanes along sorted lists of all their hits."""
+        t = self.t
+        if dr.width(lanes) == 0:
+            return []
         pick = lambda x: dr.gather(type(x), x, lanes)  # noqa: E731
         rays = [
             Ray(*(None if v is None else pick(v) for v in (r.x, r.y, r.length)), [pick(v) for v in r.lane], r.basis)
             for r in self.rays
         ]
-        inside = [self.t.Bool(True)] * len(rays)
-        stream_of = lambda _: self.stream_of(lanes)  # noqa: E731
-        flat = [pick(f) for f in self.flat]
-        part = Part(self.t, self.model, self.records, rays, flat, inside, stream_of, True, self.center_key, select=True)
+        flat, stream = [pick(f) for f in self.flat], self.stream_of(lanes)
         dr.eval(rays, flat)
-        return part
+        with dr.suspend_grad():
+            count = self._each_hit(rays[0], stream, dr.width(lanes), lambda *hit: None)
+            dr.eval(count)
+            total = int(dr.sum(t.UInt64(count))[0])
+            if total > _MAX_HITS and dr.width(lanes) > 1:
+                half = dr.arange(t.UInt32, dr.width(lanes) // 2)
+                rest = dr.arange(t.UInt32, dr.width(lanes) - dr.width(half)) + dr.width(half)
+                return self.listed(dr.gather(t.UInt32, lanes, half)) + self.listed(dr.gather(t.UInt32, lanes, rest))
+            start = dr.cumsum(count) - count
+            keys, index = dr.zeros(t.UInt64, max(total, 1)), dr.zeros(t.UInt32, max(total, 1))
+            lane = t.UInt64(dr.arange(t.UInt32, dr.width(lanes))) << 32
+
+            def write(k, candidate, key, ok):
+                # Keys are >= 0, where floats order like their bits.
+                dr.scatter(keys, lane | t.UInt64(dr.reinterpret_array(t.UInt32, key)), start + k, ok)
+                dr.scatter(index, candidate, start + k, ok)
+
+            dr.eval(self._each_hit(rays[0], stream, dr.width(lanes), write), keys, index)
+            # Sorts are stable: by index first, so that equal keys of a ray keep that order.
+            by_index = t.UInt32(dr.argsort(index))
+            by_key = t.UInt32(dr.argsort(dr.gather(t.UInt64, keys, by_index)))
+            index = dr.gather(t.UInt32, index, dr.gather(t.UInt32, by_index, by_key))
+            dr.eval(index, start)
+        lists = Lists(index, start, start + count, None, 0, 0, total)
+        here = dr.arange(t.UInt32, dr.width(lanes))
+        stream_of = lambda _: TileStream(t, lists, here, t.Bool(True))  # noqa: E731
+        inside = [t.Bool(True)] * len(rays)
+        return [Part(t, self.model, self.records, rays, flat, inside, stream_of, False)]
+
+    def _each_hit(self, ray, stream, lanes: int, visit):
+        """Number of hits of every lane; `visit(number so far, Gaussian, key, is hit)` sees each candidate."""
+        t = self.t
+        start = stream.begin()
+        start = t.UInt32(start) if isinstance(start, t.UInt32) else start
+
+        def body(s, k):
+            candidate, valid, _, s = stream.next(s, t.Bool(True))
+            key, ok = self._probe(candidate, ray, valid)
+            visit(k, candidate, key, ok)
+            return s, k + dr.select(ok, t.UInt32(1), 0)
+
+        return dr.while_loop((start, dr.zeros(t.UInt32, lanes)), lambda s, k: stream.more(s), body)[1]
 
     def run(self, kernel, check: bool = False) -> list[dict]:
         """Walk all rays with a Primal, Adjoint or Tangent; `check` keeps the certificate in `failed`."""
         with dr.suspend_grad():
             if not self.ordered:
                 return self._in_order(kernel)
-            if self.select:
-                return self._selected(kernel)
             return self._sorted(kernel, check)
 
     def _in_order(self, kernel):
@@ -105,9 +144,9 @@ class Part:
         go = dr.select(stream.more(start), t.UInt32(1), 0)
         return dr.while_loop((start, go, states), lambda s, go, states: go != 0, body)[2]
 
-    def _probe(self, index, active):
+    def _probe(self, index, ray, active):
         """Order key of a candidate, and whether it is a hit."""
-        t, ray = self.t, self.rays[0]
+        t = self.t
         record = list(dr.gather(t.ArrayXf, self.records, index, active, shape=(RECORD, dr.width(index))))
         _, key, ok = self.model.hit(record, ray, active)
         # `integral` has hits whose t* lies behind the origin.
@@ -132,7 +171,7 @@ class Part:
 
         def body(s, go, keys, index, last, failed, state):
             candidate, valid, bound, s = stream.next(s, t.Bool(True))
-            key, ok = self._probe(candidate, valid)
+            key, ok = self._probe(candidate, self.rays[0], valid)
             if check:
                 failed = dr.select(ok & _less(key, candidate, *last), 1, failed)
             enter = dr.select(ok & (state["alive"] != 0), key, EMPTY)
@@ -170,42 +209,6 @@ class Part:
             return (j < BUFFER) & (state["alive"] != 0)
 
         return dr.while_loop((t.UInt32(0), keys, index, state), cond, body)[3]
-
-    def _selected(self, kernel):
-        t, stream = self.t, self.stream_of(None)
-        F, U = t.Float, t.UInt32
-        state = kernel.init(self.inside[0], [F(EMPTY), U(0)])
-        start = stream.begin()
-
-        def scan(last):
-            """The K nearest hits beyond `last`."""
-
-            def body(s, keys, index):
-                candidate, valid, _, s = stream.next(s, t.Bool(True))
-                key, ok = self._probe(candidate, valid)
-                ok &= _less(last[0], last[1], key, candidate)
-                key = dr.select(ok, key, _LAST)
-                keys, index = list(keys), list(index)
-                for j in range(BUFFER):
-                    swap = _less(key, candidate, keys[j], index[j])
-                    key, keys[j] = dr.select(swap, keys[j], key), dr.select(swap, key, keys[j])
-                    candidate, index[j] = dr.select(swap, index[j], candidate), dr.select(swap, candidate, index[j])
-                return s, keys, index
-
-            empty = [F(_LAST) for _ in range(BUFFER)], [U(0xFFFFFFFF) for _ in range(BUFFER)]
-            _, keys, index = dr.while_loop(
-                (type(start)(start) if isinstance(start, U) else start, *empty), lambda s, *_: stream.more(s), body
-            )
-            return keys, index
-
-        def body(go, last, state):
-            keys, index = scan(last)
-            last = [F(keys[-1]), U(index[-1])]
-            state = self._drain(kernel, keys, index, state)
-            return dr.select((last[0] < _LAST) & (state["alive"] != 0), U(1), 0), last, state
-
-        loop = (dr.select(state["alive"] != 0, U(1), 0), [F(EMPTY), U(0)], state)
-        return [dr.while_loop(loop, lambda go, *_: go != 0, body)[2]]
 
 
 def _less(key_a, index_a, key_b, index_b):
