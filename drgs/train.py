@@ -156,7 +156,9 @@ def _start(dataset: Dataset, train: list, frames: list[Frame], config: FitConfig
         dataset if given else train, seed=config.seed, max_points=config.max_gaussians
     )
     extent = scene_extent([frame.camera for frame in frames], points)
-    model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), config.initial_opacity)
+    dense = not (given and dataset.points is not None) and any(view.depth_path is not None for view in train)
+    opacity, scale = (config.dense_opacity, config.dense_scale) if dense else (config.initial_opacity, 1.0)
+    model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), opacity, scale)
     _log.info("%d initial points: %s", len(points), source)
     return Trainer(config, frames, model, extent), source
 
