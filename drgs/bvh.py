@@ -8,8 +8,8 @@ evaluated from our own records. What is done about its known faults (Mitsuba 3.9
 - rays that start inside a proxy see nothing of it: origins are moved back behind everything they could be inside of;
 - the restart behind a hit loses what enters within the step: the step is about one unit in
   the last place, doubled on a repeated hit;
-- of coincident proxies only one is found: Gaussians with the same center, rotation and scale share one primitive,
-  whose members the stream delivers one by one.
+- of coincident proxies only one is found, of nested ones not all: Gaussians with the same center, rotation and shape
+  share one primitive, the largest, whose members the stream delivers one by one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 
 from drgs import runtime
+from drgs.tiles import _argsort
 from drgs.walk import EMPTY, Part
 
 __all__ = ["Proxies", "proxy_scene"]
@@ -43,24 +44,30 @@ class Proxies:
         self.back, self.scale, self.step = back, scale, step
 
 
-def proxy_scene(t, means, quats, radii, alive, origins) -> Proxies | None:
+def proxy_scene(t, means, quats, radii, alive, origins, nested: bool = True) -> Proxies | None:
     """Build the proxies, or None when nothing can be hit.
 
     Args:
         means, quats, radii: (N, 3), (N, 4) wxyz, (N, 3) half axes in world units, NumPy.
         alive: (N,) bool.
         origins: (P, 3) ray origins: decide how far everything can be.
+        nested: Ellipsoids that only differ in size share a proxy; otherwise only equal ones do.
     """
     mi = runtime.mitsuba()
     index = np.flatnonzero(alive & np.isfinite(means).all(1) & np.isfinite(radii).all(1))
     if len(index) == 0 or len(origins) == 0:
         return None
     means, quats, radii = means[index], quats[index], radii[index]
-    rows = np.ascontiguousarray(np.concatenate([means, quats, radii], 1), np.float64)
+    longest = radii.max(1)
+    # Rounded: the radii differ by the extents, which are multiplied in.
+    shape = np.round(radii / longest[:, None], 9) if nested else radii
+    rows = np.ascontiguousarray(np.concatenate([means, quats, shape], 1), np.float64)
     _, primitive, inverse = np.unique(rows.view(np.dtype((np.void, rows.itemsize * 10))).ravel(), True, True)
-    members = index[np.argsort(inverse, kind="stable")]
+    grouped = np.argsort(inverse, kind="stable")
+    members = index[grouped]
     first = np.concatenate([[0], np.cumsum(np.bincount(inverse, minlength=len(primitive)))])
-    means, quats, radii = means[primitive], quats[primitive], radii[primitive]
+    growth = np.maximum.reduceat(longest[grouped], first[:-1]) / longest[primitive]
+    means, quats, radii = means[primitive], quats[primitive], radii[primitive] * growth[:, None]
     low, high = (means - radii.max(1, keepdims=True)).min(0), (means + radii.max(1, keepdims=True)).max(0)
     far = np.maximum(high - origins.min(0), origins.max(0) - low)
     size = float(np.linalg.norm(np.maximum(far, high - low)))
@@ -170,6 +177,11 @@ def parts_of(view, model, buffer, ray_of, share):
         return _Stream(t, view.proxies, r, s.order == "ray", t.Bool(True))
 
     center = view.projected.key if s.order == "center" else None
+    if center is not None and s.depth_key == "z":
+        # Behind the camera plane z is negative, which no order key may be: the rank orders as well.
+        center = dr.zeros(t.Float, dr.width(view.projected.key))
+        rank = dr.arange(t.UInt32, dr.width(center))
+        dr.scatter(center, t.Float(rank), _argsort(t, view.projected.key, rank))
     return [Part(t, model, buffer, [ray], [i], [inside], stream_of, s.order != "entry", center)]
 
 
@@ -179,4 +191,5 @@ def _build(view, ray):
     ellipsoids = np.stack([x.numpy() for x in view.projected.ellipsoids], 1)
     origins = np.stack([v.numpy() for v in ray.lane[-6:-3]], 1).astype(np.float64)
     alive = view.projected.alive.numpy() & np.ones(len(ellipsoids), bool)
-    return proxy_scene(view.t, ellipsoids[:, :3], ellipsoids[:, 3:7], ellipsoids[:, 7:], alive, origins)
+    nested = view.settings.order != "entry"
+    return proxy_scene(view.t, ellipsoids[:, :3], ellipsoids[:, 3:7], ellipsoids[:, 7:], alive, origins, nested)

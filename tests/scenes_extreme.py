@@ -90,7 +90,15 @@ def _scaled(factor):
     return build
 
 
+def _on_rays(g, cam, which):
+    """Move Gaussians onto rays through pixel centers, so that even the thinnest is hit."""
+    d = cam.pixel_directions().reshape(-1, 3)[3 :: len(cam.pixel_directions().reshape(-1, 3)) // len(g) or 1]
+    for k, i in enumerate(which):
+        g.means[i] = torch.tensor(cam.center + (3.5 + 0.1 * i) * d[k % len(d)])
+
+
 def _scales(g, cam):
+    _on_rays(g, cam, range(4))
     g.log_scales[:4] = math.log(1e-7)
     g.log_scales[4:6] = math.log(1e4)
 
@@ -101,6 +109,7 @@ def _huge(g, cam):
 
 
 def _needles(g, cam):
+    _on_rays(g, cam, range(len(g)))
     g.log_scales[:, 0], g.log_scales[:, 1:] = 0.0, math.log(1e-6)
 
 
@@ -119,7 +128,7 @@ def _coincident(g, cam):
     for x in (g.means, g.quats, g.log_scales):
         x[:] = x[:1]
     g.means[:] = 0
-    g.log_scales[:] = math.log(0.4)
+    g.log_scales[:] = torch.tensor([0.3, 0.4, 0.6]).log()
     g.logit_opacities[:] = -5.0 + torch.rand(len(g), generator=torch.Generator().manual_seed(0))
 
 
@@ -220,7 +229,13 @@ CASES = (
     Case("camera at a mean", _at_camera([0, 0, 0]), {"response": "integral"}),
     Case("mean in the camera plane", _at_camera([0.2, 0.1, 0])),
     Case("mean in the camera plane, `integral`", _at_camera([0.2, 0.1, 0]), {"response": "integral"}),
-    Case("mean on the camera's x axis", _at_camera([0.2, 0, 0]), {"response": "integral"}),
+    Case(
+        "mean on the camera's x axis",
+        _at_camera([0.2, 0, 0]),
+        {"response": "integral"},
+        gradient=3e-2,
+        remark="the frame of the record is singular there: part of that one Gaussian's gradient is lost",
+    ),
     Case("mean just off the camera plane", _at_camera([0.2, 0.1, 1e-6]), {"response": "integral"}),
     Case("crossing the near plane", _at_camera([0, 0, 0.21]), {"near": 0.2}),
     Case("covering the screen, sigma 100", _change(_covering)),
@@ -228,7 +243,7 @@ CASES = (
     Case("world offset 1e6, detail 1e-2, float64 means", lambda rng: _offset(rng, "means")),
     Case("world offset 1e6, detail 1e-2, `origin`", lambda rng: _offset(rng, "origin")),
     Case("focal length 1 px", _focal(1.0)),
-    Case("focal length 1e5 px", _focal(1e5)),
+    Case("focal length 1e5 px", _focal(1e5), gradient=5e-4),
     Case("image 1x1", lambda rng: _base(rng, (1, 1))),
     Case("image 1x4096", lambda rng: _base(rng, (4096, 1))),
     Case("image 4096x1", lambda rng: _base(rng, (1, 4096))),
