@@ -58,7 +58,7 @@ class Model:
         L = layout
         if self.world:
             return [*range(L.W_MEAN, L.W_ALPHA + 1), *range(L.W_RGB, L.W_RGB + 3)]
-        used = [*range(L.R11, L.R33 + 1), L.ALPHA, *range(L.RGB, L.RGB + 3)]
+        used = [*range(L.R11, L.R23 + 1), L.ALPHA, *range(L.RGB, L.RGB + 3)]
         if self.s.response == "ewa":
             return used + ([L.H1] if depth else [])
         used += range(L.E2, L.E6 + 1)
@@ -71,15 +71,14 @@ class Model:
         L = layout
         dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
         c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
-        c2 = dr.fma(r[L.R22], dy, r[L.R23])
+        c2 = dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, r[L.R23]))
         if self.s.response == "ewa":
             return dr.fma(c1, c1, c2 * c2), r[L.H1], None
-        c3 = r[L.R33]
         d1 = dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1))
         d2 = dr.fma(r[L.E4], dx, r[L.E5] * dy)
         d3 = r[L.E6] * dy
         inverse = dr.rcp(dr.fma(d1, d1, dr.fma(d2, d2, d3 * d3)))
-        rho2 = dr.fma(c1, c1, dr.fma(c2, c2, c3 * c3)) * inverse
+        rho2 = dr.fma(c1, c1, c2 * c2) * inverse
         along = dr.fma(r[L.H1], d1, dr.fma(r[L.H2], d2, r[L.H3] * d3))
         u = r[L.NORM] * along * dr.sqrt(inverse) if self.s.response == "integral" else None
         return rho2, along * inverse * ray.length, u

@@ -7,9 +7,9 @@ d_z = 1, around an anchor pixel (x_a, y_a); c is the mean in camera coordinates,
 
 Nothing cancels in screen space: o' x d' is linear in the pixel, C_a + A dx + B dy, with
 (W c) x (W d) = cof(W) (c x d), so that rho^2 = |C_a + A dx + B dy|^2 / |d'|^2 is formed without subtracting large
-numbers however far the Gaussian is. Rotating both triples (A, B, C_a) and (d'_a, d'_x, d'_y) into triangular form
-leaves 6 + 5 numbers; the anchor is the pixel center nearest to the projected mean, where C_a is small. A mean on or
-behind the camera plane has no projection: there any anchor will do, because such a Gaussian reaches the picture only
+numbers however far the Gaussian is. A, B and C_a are perpendicular to W c: a frame of that plane leaves 6 numbers of
+them, triangular form 5 of (d'_a, d'_x, d'_y). The anchor is the pixel center nearest to the projected mean, where C_a
+is small. A mean on or behind the camera plane has no projection: there any anchor will do, because such a Gaussian reaches the picture only
 if it is within a few standard deviations of the camera, where nothing is large.
 """
 
@@ -23,7 +23,7 @@ __all__ = ["RECORD", "Projected", "project_screen", "project_world", "sh_basis",
 
 # Layout of a screen record (floats). ALPHA holds the opacity, or softplus(logit) for the integral response.
 RECORD = 24
-AX, AY, R11, R12, R13, R22, R23, R33, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)
+AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)
 # A world record: mean (3), W by rows (9), opacity, extent^2, rgb (3); padded to the same stride.
 W_MEAN, W_ROWS, W_ALPHA, W_EXT2, W_RGB = 0, 3, 12, 13, 14
 
@@ -246,8 +246,9 @@ def _peak(g: _Activated, ax, ay, dx, dy, pinhole):
     A = _scaled(local(_cross(g.center, dx), cofactor), unit)
     B = _scaled(local(_cross(g.center, dy), cofactor), unit)
     C = _scaled(local(_cross(g.center, da), cofactor), unit)
-    u, v, w = _frame(A, B, C)
-    r = [_dot(u, A), _dot(u, B), _dot(u, C), _dot(v, B), _dot(v, C), _dot(w, C)]
+    # All three are perpendicular to W c: two components each say everything.
+    u, v = _frame(local(g.center, inverse))
+    r = [_dot(u, A), _dot(u, B), _dot(u, C), _dot(v, A), _dot(v, B), _dot(v, C)]
     # The same for (d'_a, d'_x, d'_y), divided by |d'_a|.
     f1 = _scaled(d, unit)
     Dx, Dy = _scaled(local(dx, inverse), unit), _scaled(local(dy, inverse), unit)
@@ -260,37 +261,21 @@ def _peak(g: _Activated, ax, ay, dx, dy, pinhole):
     return [*r, e2, e3, e4, _dot(f2, Dy), _dot(f3, Dy), _dot(f1, h), _dot(f2, h), _dot(f3, h), norm]
 
 
-def _frame(A, B, C):
-    """Orthonormal u, v, w with u along A and v in the plane of A and B.
-
-    A vanishes for a mean on the x axis of the camera, and A and B are parallel for any mean on the camera plane:
-    there the next vector takes over, and an arbitrary one where there is none (the mean at the camera center).
-    """
-    size = dr.detach(_dot(A, A) + _dot(B, B) + _dot(C, C))
-    tiny = 1e-24 * size + 1e-200
-    first = dr.detach(_dot(A, A)) > tiny
-    u = _unit(first, A, _perpendicular(B))
-    rest, last = _less(B, u, _dot(u, B)), _less(C, u, _dot(u, C))
-    second = dr.detach(_dot(rest, rest)) > tiny
-    third = dr.detach(_dot(last, last)) > tiny
-    spare = [dr.select(third, dr.detach(x), y) for x, y in zip(last, _perpendicular(u), strict=True)]
-    v = _unit(second, rest, spare)
-    return u, v, _cross(u, v)
-
-
-def _unit(usable, a, otherwise):
-    """a / |a| where `usable`, else the detached `otherwise`, normalized."""
-    a = [dr.select(usable, x, dr.detach(y)) for x, y in zip(a, otherwise, strict=True)]
-    return _scaled(a, dr.rsqrt(_dot(a, a)))
-
-
-def _perpendicular(a):
-    """Some nonzero vector perpendicular to a, also for a = 0."""
-    x, y, z = (dr.detach(v) for v in a)
-    wide = abs(x) > abs(y)
-    p = [dr.select(wide, -z, 0), dr.select(wide, 0, z), dr.select(wide, x, -y)]
-    size = _dot(p, p)
-    return [dr.select(size > 0, v * dr.rsqrt(dr.select(size > 0, size, 1)), float(k == 0)) for k, v in enumerate(p)]
+def _frame(n):
+    """Orthonormal u, v perpendicular to n, smooth in n; around the z axis where n is 0 (the mean at the camera)."""
+    squared = _dot(n, n)
+    usable = dr.detach(squared) > 0
+    scale = dr.select(usable, dr.rsqrt(dr.select(usable, squared, 1)), 0)
+    x, y, z = _scaled(n, scale)
+    z = dr.select(usable, z, 1)
+    # The axis that n is least along gives u its direction.
+    ax, ay, az = (abs(dr.detach(v)) for v in (x, y, z))
+    first, second = (ax <= ay) & (ax <= az), ay <= az
+    e = [dr.select(first, 1.0, 0.0), dr.select(~first & second, 1.0, 0.0), dr.select(~first & ~second, 1.0, 0.0)]
+    n = [x, y, z]
+    u = _less(e, n, _dot(e, n))
+    u = _scaled(u, dr.rsqrt(_dot(u, u)))
+    return u, _cross(n, u)
 
 
 def _listed_extent(g: _Activated, settings):
@@ -378,7 +363,7 @@ def _ewa(g: _Activated, pinhole, ax, ay, settings, width: int, height: int):
     px = fx * c[0] * iz + skew * c[1] * iz + cx
     py = fy * c[1] * iz + cy
     ox, oy = ax - px, ay - py
-    shape = [r11, r12, r11 * ox + r12 * oy, r22, r22 * oy, Float64(0), *[Float64(0)] * 5]
+    shape = [r11, r12, r11 * ox + r12 * oy, Float64(0), r22, r22 * oy, *[Float64(0)] * 5]
     px, py, cxx, cyy, det = (dr.detach(v) for v in (px, py, cxx, cyy, det))
     if settings.culling == "inria":
         mid = 0.5 * (cxx + cyy)
