@@ -14,6 +14,8 @@ evaluated from our own records. What is done about its known faults (Mitsuba 3.9
 
 from __future__ import annotations
 
+import warnings
+
 import drjit as dr
 import numpy as np
 
@@ -25,6 +27,7 @@ __all__ = ["Proxies", "proxy_scene"]
 
 _STEP = 1e-8  # of the scene's size
 _GRAZE = 1e-7  # of (distance / radius)^2: what rounding takes from the discriminant, with a margin
+_FAR = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
 _THIN = 1e-3  # smallest proxy radius, relative to the distance it is traced over
 
 
@@ -191,5 +194,21 @@ def _build(view, ray):
     ellipsoids = np.stack([x.numpy() for x in view.projected.ellipsoids], 1)
     origins = np.stack([v.numpy() for v in ray.lane[-6:-3]], 1).astype(np.float64)
     alive = view.projected.alive.numpy() & np.ones(len(ellipsoids), bool)
+    _warn_of_rounding(ellipsoids[alive], origins)
     nested = view.settings.order != "entry"
     return proxy_scene(view.t, ellipsoids[:, :3], ellipsoids[:, 3:7], ellipsoids[:, 7:], alive, origins, nested)
+
+
+def _warn_of_rounding(ellipsoids, origins):
+    """Tell of Gaussians too thin, in two of their axes, for hits in float32 world space."""
+    if len(ellipsoids) == 0 or len(origins) == 0:
+        return
+    distance = np.linalg.norm(ellipsoids[:, :3] - 0.5 * (origins.min(0) + origins.max(0)), axis=1)
+    ratio = distance / np.maximum(np.median(ellipsoids[:, 7:], axis=1), 1e-300)
+    share = float((ratio > _FAR).mean())
+    if share > 0.01:
+        warnings.warn(
+            f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR:g} of their distance in two axes, got "
+            f"{share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use traversal='tiles'",
+            stacklevel=2,
+        )

@@ -148,6 +148,11 @@ class _Scene:
         gaussians.validate("render")
         self.device = gaussians.means.device
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
+        if settings.traversal == "bvh" and gaussians.means.dtype == torch.float64 and len(gaussians):
+            # World records are float32, so a world far from 0 is moved there.
+            middle = gaussians.means.detach().mean(0)
+            origin = np.asarray(gaussians.origin, np.float64) + [float(x) for x in middle]
+            gaussians = gaussians.replace(means=gaussians.means - middle, origin=origin)
         self.inputs = {name: self._move(x) for name, x in gaussians.parameters().items()}
         self.count, self.coefficients = len(gaussians), gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]

@@ -25,7 +25,7 @@ __all__ = ["METRICS", "VARIANTS", "Lpips", "evaluate", "flip", "print_table", "p
 
 VARIANTS = {
     "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
-    "ssim": "11x11 Gaussian window, sigma 1.5, no padding (torchmetrics); both images black outside the mask",
+    "ssim": "11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",

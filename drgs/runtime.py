@@ -45,7 +45,6 @@ _PACKAGES = (
     "rich",
     "plyfile",
     "safetensors",
-    "torchmetrics",
     "flip-evaluator",
 )
 

@@ -29,17 +29,16 @@ class Case:
         name: As printed.
         build: rng -> (Gaussians, Camera).
         fields: Settings that differ from `exact`.
-        image, gradient: Bounds, where they are not 1e-5 and 1e-4.
-        bvh: Bound of image and gradients on `bvh`, or None where it is not run.
+        bvh: Whether `bvh` keeps the bounds as well; `warns` where it cannot and says so, `skip` where it is not run.
+        depth: Whether the bounds hold for the derivative of depth too.
         remark: What a reader should know.
     """
 
     name: str
     build: Callable
     fields: dict = dataclasses.field(default_factory=dict)
-    image: float = 1e-5
-    gradient: float = 1e-4
-    bvh: float | None = None
+    bvh: str = "holds"
+    depth: bool = True
     remark: str = ""
 
     @property
@@ -166,9 +165,8 @@ def _focal(focal):
         if focal > 100:
             # The image spans 1e-4 of the distance.
             with torch.no_grad():
-                g.means.mul_(2e-4)
-                g.means.sub_(torch.tensor([0.1, -0.1, 0.0]))
-                g.log_scales.fill_(math.log(5e-5))
+                g.means[:, :2].mul_(1e-4).sub_(torch.tensor([0.1, -0.1]))
+                g.log_scales.fill_(math.log(5e-5)).add_(0.3 * torch.tensor(rng.normal(size=(12, 3))))
         return g, cam
 
     return build
@@ -183,7 +181,7 @@ def _layers(rng):
     """1,000 opaque layers: T underflows within a few of them."""
     g, cam = gaussians(rng, 1000, 1), camera(rng, SIZE)
     with torch.no_grad():
-        g.log_scales[:] = math.log(0.5)
+        g.log_scales[:] = torch.tensor([0.4, 0.5, 0.7]).log()
         g.logit_opacities[:] = 6.0
     return g, cam
 
@@ -207,13 +205,14 @@ def _none(rng):
     return _base(rng, n=0)
 
 
+_THIN = "depth derivatives: 6e-8 x distance / scale"
 _BEHIND = {"remark": "`integral`: the tail in front of the camera counts"}
 CASES = (
-    Case("scale 1e-7 to 1e4 in one scene", _change(_scales), image=1e-5),
+    Case("scale 1e-7 to 1e4 in one scene", _change(_scales), bvh="warns", depth=False, remark=_THIN),
     Case("world in units of 1e-7", _scaled(1e-7)),
     Case("world in units of 1e4", _scaled(1e4)),
     Case("scale 1e4 around the camera", _change(_huge)),
-    Case("anisotropy 1e6:1, needles", _change(_needles)),
+    Case("anisotropy 1e6:1, needles", _change(_needles), bvh="warns", depth=False, remark=_THIN),
     Case("anisotropy 1e6:1, sheets", _change(_sheets)),
     Case("opacity 1e-8 to 1 - 1e-7, logits of 100", _change(_opacities)),
     Case("opacity 1e-8 to 1 - 1e-7, `integral`", _change(_opacities), {"response": "integral"}),
@@ -229,13 +228,7 @@ CASES = (
     Case("camera at a mean", _at_camera([0, 0, 0]), {"response": "integral"}),
     Case("mean in the camera plane", _at_camera([0.2, 0.1, 0])),
     Case("mean in the camera plane, `integral`", _at_camera([0.2, 0.1, 0]), {"response": "integral"}),
-    Case(
-        "mean on the camera's x axis",
-        _at_camera([0.2, 0, 0]),
-        {"response": "integral"},
-        gradient=3e-2,
-        remark="the frame of the record is singular there: part of that one Gaussian's gradient is lost",
-    ),
+    Case("mean on the camera's x axis", _at_camera([0.2, 0, 0]), {"response": "integral"}),
     Case("mean just off the camera plane", _at_camera([0.2, 0.1, 1e-6]), {"response": "integral"}),
     Case("crossing the near plane", _at_camera([0, 0, 0.21]), {"near": 0.2}),
     Case("covering the screen, sigma 100", _change(_covering)),
@@ -243,10 +236,10 @@ CASES = (
     Case("world offset 1e6, detail 1e-2, float64 means", lambda rng: _offset(rng, "means")),
     Case("world offset 1e6, detail 1e-2, `origin`", lambda rng: _offset(rng, "origin")),
     Case("focal length 1 px", _focal(1.0)),
-    Case("focal length 1e5 px", _focal(1e5), gradient=5e-4),
+    Case("focal length 1e5 px", _focal(1e5), bvh="warns", depth=False, remark=_THIN),
     Case("image 1x1", lambda rng: _base(rng, (1, 1))),
-    Case("image 1x4096", lambda rng: _base(rng, (4096, 1))),
-    Case("image 4096x1", lambda rng: _base(rng, (1, 4096))),
+    Case("image 4096x1", lambda rng: _base(rng, (4096, 1))),
+    Case("image 1x4096", lambda rng: _base(rng, (1, 4096))),
     Case("0 Gaussians", _none),
     Case("1 Gaussian", _one),
     Case("quaternions near 0, huge and negated", _change(_quaternions)),
@@ -255,5 +248,5 @@ CASES = (
     Case("1,000 opaque layers, `center`", _layers, {"order": "center"}),
     Case("1,000 opaque layers, `integral`", _layers, {"response": "integral"}),
     Case("D = 1", lambda rng: _base(rng, D=1)),
-    Case("D = 512", lambda rng: _base(rng, D=512)),
+    Case("D = 512", lambda rng: _base(rng, D=512), bvh="skip"),
 )

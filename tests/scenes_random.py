@@ -157,6 +157,7 @@ class Errors:
         image: Output name -> largest absolute error (depths: relative to the largest depth, or 1).
         gradient: Group -> relative L2 error of the adjoint.
         forward: Output name -> relative L2 error of the forward mode.
+        joint: relative L2 error of the forward mode over all outputs but depth.
         duality: |<Jv, u> - <v, J^T u>| / (|Jv| |u|).
         finite: Every output, gradient and tangent is finite, ambiguous pixels included.
         count: Largest difference of the number of hits of a pixel.
@@ -166,6 +167,7 @@ class Errors:
     image: dict
     gradient: dict
     forward: dict
+    joint: float
     duality: float
     finite: bool
     count: int
@@ -189,10 +191,13 @@ def compare(g, cam, settings, oracle: Oracle) -> Errors:
     jv = {name: getattr(pushed, name).double() for name in oracle.u}
     finite &= all(bool(torch.isfinite(x).all()) for x in (*ours.values(), *jv.values()))
     scale = (inner(jv, jv) * inner(oracle.u, oracle.u)) ** 0.5
+    colors = [name for name in jv if name != "depth"]
+    both = [torch.cat([x[name][good].reshape(-1) for name in colors] or [torch.zeros(0)]) for x in (jv, oracle.push)]
     return Errors(
         image=image,
         gradient={name: relative(x, oracle.back[name]) for name, x in ours.items()},
         forward={name: relative(x[good], oracle.push[name][good]) for name, x in jv.items()},
+        joint=relative(*both),
         duality=abs(inner(jv, oracle.u) - inner(oracle.v, ours)) / max(scale, 1e-12),
         finite=finite,
         count=int(_largest((out.count - ref.count)[good])),

@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 
+from drgs import runtime
 from drgs.cameras import (
     Camera,
     c2w_from_llff,
@@ -74,9 +75,7 @@ def test_mitsuba_frame_looks_along_z_with_x_left():
 
 def test_mitsuba_sensor_traces_our_pixel_rays():
     """Mitsuba's own rays at pixel centers equal ours, principal point off center."""
-    mi = pytest.importorskip("mitsuba")
-    if mi.variant() is None:
-        mi.set_variant("scalar_rgb")
+    mi = runtime.mitsuba()
     camera = make(K=intrinsics(100, 100, 60.5, 31.25))
     sensor = mi.load_dict(camera.to_mitsuba(near=1e-3))
     directions = camera.pixel_directions()

@@ -81,12 +81,14 @@ def test_given_points_come_first_and_are_thinned_by_seed(tmp_path, rng):
 
 
 def test_depth_maps_give_the_surface_with_its_colors(tmp_path, rng):
-    """Points lie on the surface and have the color they project to."""
+    """Points lie on the surface, where depth is known, and have the color they project to."""
     views = plane_views(tmp_path, rng, count=3, depth=True)
     points, colors, source = initial_points(views, max_points=3000)
     assert source == f"back-projected from 3 depth maps, {len(points)} points"
     assert 1500 < len(points) <= 3000
-    assert np.abs(points[:, 2]).max() < 2e-3
+    known = np.mean([(view.depth() > 0).mean() for view in views])
+    assert known < 1  # around the square there is no depth: the nearest one stands in
+    assert np.mean(np.abs(points[:, 2]) < 2e-3) > known - 0.02
     assert colors.dtype == np.float32
     # The colors are the picture's where the points project to.
     dense, dense_colors, _ = initial_points(views[:1], max_points=10**6)

@@ -1,0 +1,147 @@
+"""Tile lists: complete, ordered, no longer than the screen bounds allow."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import around_camera, camera, gaussians
+
+from drgs import reference, runtime
+from drgs.integrator import _Scene, _tensor, render
+from drgs.settings import RenderSettings
+
+runtime.backend()
+import drjit as dr  # noqa: E402
+
+from drgs.composite import _pack  # noqa: E402
+from drgs.tiles import TILE, build  # noqa: E402
+
+
+def _scene(g, cam, settings):
+    """The `Projected` and the `Lists` of a view."""
+    scene = _Scene(g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings, frozenset())
+    t = runtime.dr_types()
+    view, (_, record, *_) = scene.prepare({n: _tensor(t, x) for n, x in scene.inputs.items()})
+    lists = build(t, view.projected, settings, cam.width, cam.height, _pack(t, record))
+    dr.eval(lists.index, lists.start, lists.end)
+    return view.projected, lists
+
+
+def _listed(lists):
+    """Tile -> list of Gaussians, in order."""
+    start, end, index = (np.asarray(x.numpy()) for x in (lists.start, lists.end, lists.index))
+    return [index[a:b].tolist() for a, b in zip(start, end, strict=True)]
+
+
+@pytest.mark.parametrize("response", ["peak", "integral", "ewa"])
+@pytest.mark.parametrize("near", [False, True])
+def test_every_hit_is_listed(rng, response, near):
+    """Whatever the oracle finds at a pixel is in the list of its tile."""
+    order = "center" if response == "ewa" else "ray"
+    settings = RenderSettings(response=response, order=order)
+    for _ in range(6):
+        cam = camera(rng, (37, 21))
+        g = gaussians(rng, 25, 1, anisotropy=1.2)
+        g = (around_camera(g, cam) if near else g).detach()
+        listed = _listed(_scene(g, cam, settings)[1])
+        columns = -(-37 // TILE)
+        extent = (2 * torch.log((g.opacities.double() * 25 / 1e-5).clamp(min=1))).sqrt()
+        for i in range(len(g)):
+            one = reference.render(g.take([i]), cam, settings.replace(extent=max(float(extent[i]), 1e-3)))
+            hit = (one.count > 0) & (one.alpha > 1e-12)
+            for y, x in hit.nonzero().tolist():
+                assert i in listed[(y // TILE) * columns + x // TILE], (i, x, y)
+
+
+def test_bounds_are_tight(rng):
+    """In front of the camera, a Gaussian is listed in no tile that its silhouette's box does not touch."""
+    settings = RenderSettings(extent=3.0)
+    for _ in range(4):
+        cam, g = camera(rng, (64, 48)), gaussians(rng, 20, 1, anisotropy=0.8, scale=0.05)
+        projected, lists = _scene(g, cam, settings)
+        box = np.stack([b.numpy() for b in projected.bounds], 1)
+        # The silhouette by sampling the ellipsoid: its box, to the density of the samples.
+        d = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(20000, 3))), dim=1)
+        for i in range(len(g)):
+            w, x, y, z = (g.quats[i] / g.quats[i].norm()).double().tolist()
+            R = torch.tensor(
+                [
+                    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+                ],
+                dtype=torch.float64,
+            )
+            points = (3 * d * g.scales[i].double()) @ R.T + g.means[i].double()
+            pixels, _ = cam.project(points.detach().numpy())
+            want = np.concatenate([pixels.min(0), pixels.max(0)])
+            size = (pixels.max(0) - pixels.min(0)).max()
+            assert np.abs(box[i] - want).max() < 0.02 * size + 2e-3
+
+
+def test_order(rng):
+    """`center` lists are sorted by (depth, index); ranges cover all entries exactly once."""
+    cam, g = camera(rng, (40, 30)), gaussians(rng, 60, 1, scale=0.3)
+    with torch.no_grad():
+        g.means[30:40] = g.means[29]  # ties fall by index
+    projected, lists = _scene(g, cam, RenderSettings())
+    key, listed = projected.key.numpy(), _listed(lists)
+    assert sum(map(len, listed)) == lists.pairs
+    for entries in listed:
+        assert entries == sorted(entries, key=lambda i: (key[i], i))
+
+
+def test_nothing_ahead_of_the_bound(rng):
+    """`ray` order: no hit of an entry or a later one is nearer than the entry's bound."""
+    cam = camera(rng, (24, 16))
+    g = around_camera(gaussians(rng, 30, 1, scale=0.3), cam).detach()
+    settings = RenderSettings(order="ray", extent=3.0)
+    _, lists = _scene(g, cam, settings)
+    ahead, start = lists.ahead.numpy(), lists.start.numpy()
+    nearest = {}
+    for i in range(len(g)):
+        one = reference.render(g.take([i]), cam, settings)
+        for y, x in (one.count > 0).nonzero().tolist():
+            nearest[i, x, y] = float(one.depth[y, x])
+    columns = -(-24 // TILE)
+    for tile, entries in enumerate(_listed(lists)):
+        pixels = [(x, y) for x in range(24) for y in range(16) if (y // TILE) * columns + x // TILE == tile]
+        for k in range(len(entries)):
+            later = [nearest.get((i, x, y), math.inf) for i in entries[k:] for x, y in pixels]
+            assert ahead[start[tile] + k] <= min(later) * (1 + 1e-6)
+
+
+def test_nothing_listed(rng):
+    """All Gaussians behind the camera or off the screen: empty lists, a black image."""
+    cam, g = camera(rng, (9, 7)), gaussians(rng, 12, 1)
+    with torch.no_grad():
+        g.means.add_(torch.tensor(cam.c2w[:3, :3] @ [0, 0, -50.0] + cam.center))
+    for order in ("center", "ray"):
+        out = render(g, cam, RenderSettings(order=order), outputs="all")
+        assert out.certificate["pairs"] == 0
+        assert not out.rgb.any()
+        assert not out.visibility.any()
+        (found,) = torch.autograd.grad(out.rgb.sum(), g.means)
+        assert not found.any()
+
+
+def test_image_smaller_than_a_tile_and_larger(rng):
+    """Sizes around multiples of the tile give the same pixels as the larger image they are cut from."""
+    cam, g = camera(rng, (17, 17)), gaussians(rng, 20, 1, scale=0.3).detach()
+    settings = RenderSettings.preset("exact")
+    whole = render(g, cam, settings).rgb
+    for width, height in ((1, 1), (7, 9), (8, 8), (16, 1), (17, 15)):
+        part = dataclasses.replace(cam, width=width, height=height)
+        torch.testing.assert_close(render(g, part, settings).rgb, whole[:height, :width], rtol=0, atol=1e-6)
+
+
+def test_too_many_pairs():
+    """2^32 list entries are refused before anything of that size is allocated."""
+    rng = np.random.default_rng(0)
+    cam, g = camera(rng, (2**15, 2**15)), gaussians(rng, 300, 1, scale=1e3)
+    with pytest.raises(ValueError, match="fewer than 2\\^32 entries.*lower extent or image size"):
+        _scene(g, cam, RenderSettings())
