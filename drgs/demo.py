@@ -137,8 +137,8 @@ def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) 
     oracle = _check(g, frames[0], images["exact"][0], plan.crop)
     lap("oracle", start)
     say(
-        f"4. Float64 oracle, {oracle['width']}x{oracle['height']} pixels of view {oracle['view']}: `exact` is off by at "
-        f"most {oracle['max_error']:.1e} (claimed: 1e-5) where no two of {oracle['hits_a_ray']:.0f} hits a ray tie "
+        f"4. Float64 oracle, {oracle['width']}x{oracle['height']} pixels of view {oracle['view']}: `exact` is off by "
+        f"at most {oracle['max_error']:.1e} (claimed: 1e-5) where no two of {oracle['hits_a_ray']:.0f} hits a ray tie "
         f"({100 * oracle['ties']:.0f} % of the pixels do)"
     )
 
