@@ -1,6 +1,6 @@
 """Errors of the renderer against the float64 oracle at the extremes; writes the table of docs/numerics.md.
 
-    python benchmarks/numerics.py [--print]
+python benchmarks/numerics.py [--print]
 """
 
 from __future__ import annotations

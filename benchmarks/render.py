@@ -330,9 +330,9 @@ def report(result: dict) -> str:
             f"| `bvh` | {100 * x['bvh finds']:.2f} % | {x['bvh ns per true hit']:.0f} |",
             f"| `volprim_rf_basic` | {100 * x['volprim finds']:.2f} % | {x['volprim ns per true hit']:.0f} |",
             "",
-            f"{100 * x['rays equal on both traversals']:.2f} % of the rays get the same color (1e-4) from both `bvh` and "
-            "`tiles`. A lone Gaussian of this size is",
-            "missed by `volprim_rf_basic` on 40 % of its rays; in this crowd each hit restarts the ray nearby, and few are.",
+            f"{100 * x['rays equal on both traversals']:.2f} % of the rays get the same color (1e-4) from both `bvh`",
+            "and `tiles`. A lone Gaussian of this size is missed by `volprim_rf_basic` on 40 % of its rays; in this",
+            "crowd each hit restarts the ray nearby, and few are.",
             "",
         ]
     lines += [

@@ -3,7 +3,7 @@
 Mitsuba's `ellipsoids` shape is used as a proxy only: it says which Gaussian a ray may meet next, the response is always
 evaluated from our own records. What is done about its known faults (Mitsuba 3.9.1):
 
-- the intersection divides by |d| instead of |d|^2: rays are traced with directions scaled to the size of the proxies;
+- the intersection divides by |d| instead of |d|^2: rays are traced with directions as long as the thinnest proxy;
 - its discriminant is rounded to about 6e-8 (distance / radius)^2: proxies are not smaller than 1e-3 of their distance;
 - rays that start inside a proxy see nothing of it: origins are moved back behind everything they could be inside of;
 - the restart behind a hit loses what enters within the step: the step is about one unit in
@@ -97,7 +97,8 @@ def proxy_scene(t, means, quats, radii, alive, origins, nested: bool = True) -> 
         "extent": 1.0,
     }
     scene = mi.load_dict({"type": "scene", "gaussians": shape})
-    scale = dr.opaque(t.Float, float(np.median(radii.min(1))))
+    # Where the scaled direction is longer than a proxy is thick, thick hits are lost as well as grazing ones.
+    scale = dr.opaque(t.Float, float(radii.min()))
     step = dr.opaque(t.Float, _STEP * size)
     return Proxies(
         scene,

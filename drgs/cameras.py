@@ -92,10 +92,7 @@ class Camera:
         for axis in ("width", "height"):
             value = getattr(self, axis)
             if not (np.isfinite(value) and value >= 1 and int(value) == value):
-                raise ValueError(
-                    f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct "
-                    "it"
-                )
+                raise ValueError(f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct it")
             put(axis, int(value))
         put("distortion", _checked_distortion(where, self.model, self.distortion))
 
@@ -226,9 +223,7 @@ class Camera:
             radius = np.hypot(x, y)
             angle = np.arctan2(radius, z)
             # On the axis the ratio is 0/0; its limit multiplies x = y = 0 and does not matter.
-            factor = fisheye_polynomial(angle, self.distortion)[0] / np.where(
-                radius > 0, radius, 1.0
-            )
+            factor = fisheye_polynomial(angle, self.distortion)[0] / np.where(radius > 0, radius, 1.0)
             plane = np.stack([x * factor, y * factor], axis=-1)
         else:
             depth = np.where(z > 0, z, np.nan)
@@ -293,9 +288,7 @@ def intrinsics_from_fov(fov: float, width: int, height: int, axis: str = "x") ->
         axis: ``x`` or ``y``.
     """
     if not 0.0 < fov < 180.0:
-        raise ValueError(
-            f"intrinsics_from_fov: fov must lie between 0 and 180 degrees, got {fov}; correct it"
-        )
+        raise ValueError(f"intrinsics_from_fov: fov must lie between 0 and 180 degrees, got {fov}; correct it")
     if axis not in ("x", "y"):
         raise ValueError(f"intrinsics_from_fov: axis must be x or y, got {axis!r}; choose one")
     focal = 0.5 * (width if axis == "x" else height) / np.tan(np.radians(fov) / 2)
@@ -311,8 +304,7 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 0.0, 1.0)) -> np.ndarray:
     right = np.cross(forward, up)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
         raise ValueError(
-            f"look_at: eye, target and up must not lie on one line, got {eye}, {target}, {up}; "
-            "move one of them"
+            f"look_at: eye, target and up must not lie on one line, got {eye}, {target}, {up}; move one of them"
         )
     forward /= np.linalg.norm(forward)
     right /= np.linalg.norm(right)
@@ -346,9 +338,7 @@ def orbit(
             0).
     """
     if n < 1 or not radius > 0:
-        raise ValueError(
-            f"orbit: n must be >= 1 and radius > 0, got {n} and {radius}; correct them"
-        )
+        raise ValueError(f"orbit: n must be >= 1 and radius > 0, got {n} and {radius}; correct them")
     center = np.asarray(center, dtype=np.float64)
     axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     # Any direction orthogonal to up serves as azimuth 0; the world axis least aligned with up is
@@ -360,9 +350,7 @@ def orbit(
     cameras = []
     for index in range(n):
         turn = 2 * np.pi * index / n
-        outward = (
-            np.cos(rise) * (np.cos(turn) * first + np.sin(turn) * second) + np.sin(rise) * axis
-        )
+        outward = np.cos(rise) * (np.cos(turn) * first + np.sin(turn) * second) + np.sin(rise) * axis
         w2c = look_at(center + radius * outward, center, axis)
         cameras.append(Camera(K=K, w2c=w2c, width=width, height=height, name=f"orbit_{index:04d}"))
     return cameras
@@ -423,8 +411,7 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
         raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
     if not isinstance(entries, list) or not entries:
         raise ValueError(
-            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see "
-            "INRIA's layout"
+            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see INRIA's layout"
         )
     cameras = []
     for index, entry in enumerate(entries):
@@ -440,9 +427,7 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
             name = str(entry.get("img_name", entry.get("id", index)))
             cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name))
         except KeyError as error:
-            raise ValueError(
-                f"{path}: camera {index} must have the key {error}, found none; add it"
-            ) from None
+            raise ValueError(f"{path}: camera {index} must have the key {error}, found none; add it") from None
         except (TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{path}: camera {index}: {error}") from None
     return cameras
@@ -469,50 +454,33 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 def _checked_intrinsics(where: str, K: Any) -> np.ndarray:
     K = _read_only(_as_numpy(K))
     if K.shape != (3, 3):
-        raise ValueError(
-            f"{where}: K must have shape (3, 3), got {K.shape}; see drgs.cameras.intrinsics"
-        )
+        raise ValueError(f"{where}: K must have shape (3, 3), got {K.shape}; see drgs.cameras.intrinsics")
     if not np.isfinite(K).all():
-        raise ValueError(
-            f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct "
-            "it"
-        )
+        raise ValueError(f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct it")
     if not (K[0, 0] > 0 and K[1, 1] > 0):
-        raise ValueError(
-            f"{where}: focal lengths must be positive, got {K[0, 0]:g} and {K[1, 1]:g}; correct K"
-        )
+        raise ValueError(f"{where}: focal lengths must be positive, got {K[0, 0]:g} and {K[1, 1]:g}; correct K")
     if K[1, 0] != 0 or tuple(K[2]) != (0.0, 0.0, 1.0):
-        raise ValueError(
-            f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct "
-            "it"
-        )
+        raise ValueError(f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct it")
     return K
 
 
 def _checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
     w2c = _read_only(w2c)
     if w2c.shape != (4, 4):
-        raise ValueError(
-            f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1"
-        )
+        raise ValueError(f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1")
     if not np.isfinite(w2c).all():
         row, column = np.argwhere(~np.isfinite(w2c))[0]
         raise ValueError(
-            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop "
-            "this view"
+            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop this view"
         )
     if np.abs(w2c[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise ValueError(
-            f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it "
-            "transposed?"
-        )
+        raise ValueError(f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
     rotation = w2c[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         got = f"an error of {error:.2g}" if error > _ROTATION_TOLERANCE else "a reflection"
         raise ValueError(
-            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove "
-            "scale and flips"
+            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove scale and flips"
         )
     return w2c
 
@@ -523,9 +491,7 @@ def _checked_distortion(where: str, model: str, distortion: Any) -> tuple[float,
         raise ValueError(f"{where}: distortion must be finite, got {values}; correct it")
     lengths = {"pinhole": (0,), "opencv": _OPENCV_LENGTHS, "opencv_fisheye": (4,)}.get(model)
     if lengths is None:
-        raise ValueError(
-            f"{where}: model must be pinhole, opencv or opencv_fisheye, got {model!r}; choose one"
-        )
+        raise ValueError(f"{where}: model must be pinhole, opencv or opencv_fisheye, got {model!r}; choose one")
     if len(values) not in lengths:
         raise ValueError(
             f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion "

@@ -176,9 +176,9 @@ class Sfm(_Common):
     """A folder of photographs."""
     output: _Output
     """Folder for the data set."""
-    camera_model: Literal[
-        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
-    ] = "SIMPLE_RADIAL"
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
+        "SIMPLE_RADIAL"
+    )
     """COLMAP's name of the lens; photographs of one size share one camera."""
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match all pairs, or neighbors by name (video); auto decides by their number."""

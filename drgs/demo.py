@@ -68,9 +68,7 @@ class Plan:
     @classmethod
     def quick(cls) -> Plan:
         """Half a minute, to see that everything runs; its pictures are poor."""
-        return cls(
-            views=9, width=80, height=60, spp=4, steps=60, gaussians=1500, crop=(16, 12), repeats=2, frames=6
-        )
+        return cls(views=9, width=80, height=60, spp=4, steps=60, gaussians=1500, crop=(16, 12), repeats=2, frames=6)
 
 
 def run(args: Demo) -> None:
@@ -105,9 +103,7 @@ def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) 
     still_life = _still_life()
     size = {"views": plan.views, "width": plan.width, "height": plan.height, "spp": plan.spp}
     with Bar("path tracing", plan.views, progress) as bar:
-        data = still_life.generate(
-            out_dir / "still_life", **size, progress=lambda done, total: bar.update(done, total)
-        )
+        data = still_life.generate(out_dir / "still_life", **size, progress=lambda done, total: bar.update(done, total))
     took = lap("still life", start)
     say(f"1. Still life: {plan.views} views of {plan.width}x{plan.height}, path traced from meshes ({took:.0f} s)")
 
@@ -203,9 +199,7 @@ def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str,
                 "psnr_to_exact": None if same else statistics.mean(metrics.psnr(a, b) for a, b in pairs),
                 "max_difference": None if same else max(float((a - b).abs().max()) for a, b in pairs),
                 "seconds": statistics.median(times[name]),
-                "time_of_exact": statistics.median(
-                    t / e for t, e in zip(times[name], times["exact"], strict=True)
-                ),
+                "time_of_exact": statistics.median(t / e for t, e in zip(times[name], times["exact"], strict=True)),
             }
         )
     return images, rows
@@ -276,7 +270,7 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
         "volprim_rf_basic": statistics.median(b for _, b in times),
         "ratio": statistics.median(b / a for a, b in times),
         "psnr_between": float(-10 * np.log10(max(mse, 1e-10))),
-        "note": "its defaults: 3 sigma, at most 64 hits a ray, transmittance 0.01; srgb_primitives off; 1 sample a pixel",
+        "note": "its defaults: 3 sigma, 64 hits a ray, transmittance 0.01; srgb_primitives off; 1 sample a pixel",
     }
 
 

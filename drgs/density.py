@@ -39,9 +39,7 @@ class Model:
         self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
 
     @classmethod
-    def from_points(
-        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0
-    ) -> Model:
+    def from_points(cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0) -> Model:
         """One isotropic Gaussian a point, as wide as the points around it are far apart.
 
         Args:
@@ -69,6 +67,7 @@ class Model:
 
     @property
     def sh_degree(self) -> int:
+        """0..3."""
         return math.isqrt(1 + self.tensors["sh_rest"].shape[1]) - 1
 
     def gaussians(self) -> Gaussians:
@@ -186,9 +185,7 @@ def relocate(model: Model, min_opacity: float, jitter: float, generator: torch.G
     return len(dead)
 
 
-def add_gaussians(
-    model: Model, count: int, min_opacity: float, jitter: float, generator: torch.Generator
-) -> int:
+def add_gaussians(model: Model, count: int, min_opacity: float, jitter: float, generator: torch.Generator) -> int:
     """Add `count` copies of Gaussians drawn by opacity; arguments as in `relocate`. How many were added."""
     opacity = model.tensors["logit_opacities"].detach().sigmoid()
     if count <= 0 or not len(model):

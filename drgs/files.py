@@ -279,9 +279,7 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
         with safe_open(str(path), "pt") as file:
             header = json.loads((file.metadata() or {}).get("drgs", "{}"))
             if header.get("schema") != SCHEMA:
-                raise ValueError(
-                    f"{path}: checkpoint schema must be {SCHEMA}, got {header.get('schema')}; fit again"
-                )
+                raise ValueError(f"{path}: checkpoint schema must be {SCHEMA}, got {header.get('schema')}; fit again")
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
     except (SafetensorError, json.JSONDecodeError, struct.error) as error:
         text = " ".join(str(error).split())

@@ -40,9 +40,7 @@ def undistort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.nda
     return result.reshape(-1, 2)
 
 
-def fisheye_polynomial(
-    angle: np.ndarray, distortion: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+def fisheye_polynomial(angle: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Distorted angle and its derivative for an angle (radians) to the axis."""
     k1, k2, k3, k4 = distortion
     a2 = angle * angle
@@ -60,8 +58,6 @@ def fisheye_directions(plane: np.ndarray, distortion: tuple[float, ...]) -> np.n
     angle = radius.copy()
     for _ in range(30):
         value, slope = fisheye_polynomial(angle, distortion)
-        angle = np.clip(
-            angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi
-        )
+        angle = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi)
     factor = np.sin(angle) / np.where(radius > 0, radius, 1.0)
     return np.concatenate([plane * factor[:, None], np.cos(angle)[:, None]], axis=1)

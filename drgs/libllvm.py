@@ -145,8 +145,7 @@ def require_llvm(libraries: list[Library] | None = None) -> Library:
     versions = sorted({lib.version for lib in libraries})
     got = ", ".join(map(dotted, versions)) if versions else "none"
     raise FileNotFoundError(
-        f"drgs: no usable Dr.Jit backend: libLLVM >= {MINIMUM_LLVM} is needed, found {got}. "
-        f"{_INSTALL}"
+        f"drgs: no usable Dr.Jit backend: libLLVM >= {MINIMUM_LLVM} is needed, found {got}. {_INSTALL}"
     )
 
 
@@ -222,9 +221,7 @@ def _elf_soname(path: str) -> str | None:
             f.seek(offset)
             entries = dict(struct.iter_unpack("<QQ", f.read(min(length, _ELF_LIMIT) // 16 * 16)))
             address = entries[5]  # DT_STRTAB, a virtual address: find the segment that maps it
-            start = next(
-                s[2] + address - s[3] for s in segments if s[0] == 1 and 0 <= address - s[3] < s[5]
-            )
+            start = next(s[2] + address - s[3] for s in segments if s[0] == 1 and 0 <= address - s[3] < s[5])
             f.seek(start + entries[14])  # DT_SONAME
             return f.read(256).split(b"\0", 1)[0].decode()
     except (OSError, ValueError, OverflowError, KeyError, StopIteration, struct.error):

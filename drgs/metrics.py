@@ -21,7 +21,19 @@ if TYPE_CHECKING:
     from drgs.frames import Frame
     from drgs.settings import RenderSettings
 
-__all__ = ["METRICS", "VARIANTS", "Lpips", "evaluate", "flip", "print_table", "psnr", "run_eval", "save_png", "ssim", "write_metrics"]
+__all__ = [
+    "METRICS",
+    "VARIANTS",
+    "Lpips",
+    "evaluate",
+    "flip",
+    "print_table",
+    "psnr",
+    "run_eval",
+    "save_png",
+    "ssim",
+    "write_metrics",
+]
 
 VARIANTS = {
     "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
@@ -80,7 +92,9 @@ class Lpips:
     def __init__(self, weights: Path):
         weights = Path(weights)
         if not weights.is_file():
-            raise FileNotFoundError(f"{weights}: must be weights of AlexNet or VGG16, found none; check --lpips-weights")
+            raise FileNotFoundError(
+                f"{weights}: must be weights of AlexNet or VGG16, found none; check --lpips-weights"
+            )
         try:
             import lpips
         except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision built for another torch

@@ -9,8 +9,8 @@ Nothing cancels in screen space: o' x d' is linear in the pixel, C_a + A dx + B 
 (W c) x (W d) = cof(W) (c x d), so that rho^2 = |C_a + A dx + B dy|^2 / |d'|^2 is formed without subtracting large
 numbers however far the Gaussian is. A, B and C_a are perpendicular to W c: a frame of that plane leaves 6 numbers of
 them, triangular form 5 of (d'_a, d'_x, d'_y). The anchor is the pixel center nearest to the projected mean, where C_a
-is small. A mean on or behind the camera plane has no projection: there any anchor will do, because such a Gaussian reaches the picture only
-if it is within a few standard deviations of the camera, where nothing is large.
+is small. A mean on or behind the camera plane has no projection: there any anchor will do, because such a Gaussian
+reaches the picture only if it is within a few standard deviations of the camera, where nothing is large.
 """
 
 from __future__ import annotations

@@ -102,9 +102,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
     if wanted == "cuda_ad_rgb":
         usable, reason = cuda_status()
         if not usable:
-            raise ValueError(
-                f"drgs: variant cuda_ad_rgb must have a CUDA device, but {reason}; use llvm_ad_rgb."
-            )
+            raise ValueError(f"drgs: variant cuda_ad_rgb must have a CUDA device, but {reason}; use llvm_ad_rgb.")
         import drjit.cuda.ad as types
 
         version = None
@@ -319,9 +317,7 @@ def _cpu_model() -> str:
                 return line.split(":", 1)[1].strip()
     except OSError:  # not Linux
         pass
-    brand = (
-        _output("sysctl", "-n", "machdep.cpu.brand_string") if sys.platform == "darwin" else None
-    )
+    brand = _output("sysctl", "-n", "machdep.cpu.brand_string") if sys.platform == "darwin" else None
     return brand or platform.processor() or platform.machine()
 
 

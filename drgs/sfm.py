@@ -84,29 +84,17 @@ def run_sfm(
     """
     image_dir, out_dir = Path(image_dir), Path(out_dir)
     if not image_dir.is_dir():
-        raise FileNotFoundError(
-            f"{image_dir}: must be a folder of photos, found none; check the path"
-        )
+        raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]
     if len(names) < 2:
-        raise ValueError(
-            f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos"
-        )
+        raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
     spaced = next((name for name in names if any(c.isspace() for c in name)), None)
     if spaced:
-        raise ValueError(
-            f"{image_dir}: photo names must be without spaces for COLMAP, got {spaced!r}; rename it"
-        )
+        raise ValueError(f"{image_dir}: photo names must be without spaces for COLMAP, got {spaced!r}; rename it")
     if camera_model not in _CAMERA_MODELS:
-        raise ValueError(
-            f"run_sfm: camera_model must be one of {', '.join(_CAMERA_MODELS)}, got "
-            f"{camera_model!r}"
-        )
+        raise ValueError(f"run_sfm: camera_model must be one of {', '.join(_CAMERA_MODELS)}, got {camera_model!r}")
     if matching not in ("auto", "exhaustive", "sequential"):
-        raise ValueError(
-            f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose "
-            "one"
-        )
+        raise ValueError(f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one")
     if out_dir.exists() and not out_dir.is_dir():
         raise ValueError(f"{out_dir}: must be a folder, found a file; choose another output")
     # A folder with photos of its own here is the user's, not an earlier result.
@@ -117,17 +105,13 @@ def run_sfm(
         and own.resolve() != image_dir.resolve()
         and not (out_dir / "database.db").exists()
     ):
-        raise ValueError(
-            f"{out_dir}: must not hold other photos in images, found some; choose another output"
-        )
+        raise ValueError(f"{out_dir}: must not hold other photos in images, found some; choose another output")
 
     partial = out_dir.with_name(out_dir.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     (partial / "models").mkdir(parents=True)
     try:
-        summary = _reconstruct(
-            image_dir, names, partial, progress, camera_model, max_image_size, matching, seed
-        )
+        summary = _reconstruct(image_dir, names, partial, progress, camera_model, max_image_size, matching, seed)
         _install(partial, out_dir, image_dir)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -181,12 +165,8 @@ def _reconstruct(
             image_dir,
             partial / "models",
             options=options,
-            initial_image_pair_callback=lambda: report(
-                "mapping", min(2 * next(done), len(names)), len(names)
-            ),
-            next_image_callback=lambda: report(
-                "mapping", min(1 + next(done), len(names)), len(names)
-            ),
+            initial_image_pair_callback=lambda: report("mapping", min(2 * next(done), len(names)), len(names)),
+            next_image_callback=lambda: report("mapping", min(1 + next(done), len(names)), len(names)),
         )
         marks.append(time.perf_counter())
     if not models:
@@ -208,10 +188,7 @@ def _reconstruct(
         points=best.num_points3D(),
         reprojection_error=float(best.compute_mean_reprojection_error()),
         models=len(models),
-        seconds={
-            stage: marks[i + 1] - marks[i]
-            for i, stage in enumerate(("features", "matching", "mapping"))
-        },
+        seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
         missing=tuple(name for name in names if name not in found),
     )
 

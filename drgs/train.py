@@ -137,7 +137,9 @@ def run_fit(args: Fit) -> None:
     config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
     if not args.resume and (args.output / "config.json").exists():
         # Found out before minutes of reading images and triangulating points.
-        raise ValueError(f"{args.output}: must be a new run folder, holds a run already; add --resume or choose another")
+        raise ValueError(
+            f"{args.output}: must be a new run folder, holds a run already; add --resume or choose another"
+        )
     dataset = load(args.data, test_every=config.test_every, background=config.settings.background)
     result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet)
     metrics.print_table(result.metrics)

@@ -57,8 +57,8 @@ class FitConfig:
         refine_start, refine_stop, refine_every: Fractions between which, and how often, density is controlled.
         min_opacity: Below it a Gaussian is moved elsewhere.
         grow_until: Fraction at which the budget is reached, at a constant rate of growth.
-        noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it cost
-            0.4 dB of held-out PSNR (28.0 against 28.4).
+        noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it
+            cost 0.4 dB of held-out PSNR (28.0 against 28.4).
         jitter: Displacement of copies in their own standard deviations.
     """
 
@@ -218,7 +218,9 @@ class Trainer:
                     "repeat the options or choose another run folder"
                 )
         if header["views"] != [frame.name for frame in frames]:
-            raise ValueError(f"{where}: --resume must have the same training views, the data set has changed; fit again")
+            raise ValueError(
+                f"{where}: --resume must have the same training views, the data set has changed; fit again"
+            )
         trainer = cls(config, frames, Model.from_state(tensors), header["extent"])
         trainer.step_index, trainer.bad_steps = header["step"], header["bad_steps"]
         trainer._start_count = header["start_count"]

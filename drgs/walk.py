@@ -6,8 +6,8 @@ for 64 pixels. In every other case a lane has one ray and a sorted buffer of K h
 
 Exact order with a finite buffer: hits enter as they come, and the nearest leaves when a new one needs its place. A ray
 goes wrong only if a hit arrives in front of one that has left; this is checked on every hit (the certificate), and such
-rays are redone from a sorted list of all their hits, so any depth is exact. A ray may stop at its transmittance limit only where nothing that is still to come
-can lie in front: streams bound the keys to come from below.
+rays are redone from a sorted list of all their hits, so any depth is exact. A ray may stop at its transmittance limit
+only where nothing that is still to come can lie in front: streams bound the keys to come from below.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ class Part:
         rays: `share` rays a lane.
         flat: Per shared ray, the pixel (row-major index) it belongs to.
         inside: Per shared ray, whether there is such a pixel and this part decides it.
-        finals: State of the primal pass, per shared ray.
         failed: After a primal pass in exact order: lanes whose buffer was too short.
     """
 

@@ -64,9 +64,7 @@ def spline(points, count):
     i = np.minimum(s.astype(int), len(p) - 4)
     t = (s - i)[:, None]
     a, b, c, d = p[i], p[i + 1], p[i + 2], p[i + 3]
-    curve = 0.5 * (
-        2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3
-    )
+    curve = 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     at = np.linspace(0, length[-1], count)
     return np.stack([np.interp(at, length, column) for column in curve.T], 1)
@@ -274,9 +272,7 @@ def encode_srgb(linear):
 _DEPTH_UNIT = 1e-4  # meters a 16-bit step: reaches 6.5 m, finer than a pixel's footprint indoors
 
 
-def write_views(
-    folder, scene, K, poses, width, height, *, spp, max_depth, exposure, seed=0, progress=None
-):
+def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, exposure, seed=0, progress=None):
     """Path traces `scene` and writes Nerfstudio's layout: images/, depth/, transforms.json.
 
     Args:
@@ -299,9 +295,7 @@ def write_views(
         (folder / sub).mkdir()
     for i, c2w in enumerate(poses):
         aim(camera, c2w)
-        image = mi.render(
-            scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i
-        )
+        image = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i)
         image = encode_srgb(np.asarray(image) * exposure)
         depth = np.rint(z_depth(scene, K, c2w, width, height) / _DEPTH_UNIT)
         name = f"{i:03d}.png"
@@ -349,8 +343,7 @@ def publish(out_dir, parameters, fill, where):
     empty = not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir()))
     if "sha256" not in held and not empty:
         raise ValueError(
-            f"{where}: the output must be a new folder or one made here, got {out_dir}; "
-            "name another or remove it"
+            f"{where}: the output must be a new folder or one made here, got {out_dir}; name another or remove it"
         )
     out_dir = Path(os.path.abspath(out_dir))
     out_dir.parent.mkdir(parents=True, exist_ok=True)
@@ -361,9 +354,7 @@ def publish(out_dir, parameters, fill, where):
     partial.mkdir()
     try:
         fill(partial)
-        (partial / "params.json").write_text(
-            json.dumps({"sha256": digest, **parameters}, indent=1) + "\n"
-        )
+        (partial / "params.json").write_text(json.dumps({"sha256": digest, **parameters}, indent=1) + "\n")
         if held:
             shutil.rmtree(out_dir)
         partial.rename(out_dir)

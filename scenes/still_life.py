@@ -358,8 +358,7 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
     for name, value in values.items():
         if not isinstance(value, int) or not lowest[name] <= value <= 16384:
             raise ValueError(
-                f"{where}: {name} must be an integer from {lowest[name]} to 16384, got {value!r}; "
-                f"choose another {name}"
+                f"{where}: {name} must be an integer from {lowest[name]} to 16384, got {value!r}; choose another {name}"
             )
     parameters = {"scene": "still_life", "version": _VERSION, **values}
 

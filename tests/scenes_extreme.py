@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from scenes_random import camera, gaussians
 
-from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
 from drgs.settings import RenderSettings
 
 SIZE = (9, 7)

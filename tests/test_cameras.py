@@ -96,9 +96,7 @@ def test_mitsuba_sensor_refuses_what_it_cannot_do():
         make().to_mitsuba()
 
 
-@pytest.mark.parametrize(
-    ("model", "distortion"), [("pinhole", ()), ("opencv", OPENCV), ("opencv_fisheye", FISHEYE)]
-)
+@pytest.mark.parametrize(("model", "distortion"), [("pinhole", ()), ("opencv", OPENCV), ("opencv_fisheye", FISHEYE)])
 def test_pixel_directions_project_back_to_their_pixels(model, distortion):
     """Undistortion is converged: every pixel returns to itself."""
     camera = make(model=model, distortion=distortion)
@@ -129,9 +127,7 @@ def test_lenses_agree_with_opencv(model, distortion, rng):
 
 def test_fisheye_sees_beyond_180_degrees():
     """Rays of an equidistant fisheye may point backward."""
-    camera = make(
-        K=intrinsics(25, 25, 64, 40), w2c=np.eye(4), model="opencv_fisheye", distortion=(0,) * 4
-    )
+    camera = make(K=intrinsics(25, 25, 64, 40), w2c=np.eye(4), model="opencv_fisheye", distortion=(0,) * 4)
     directions = camera.pixel_directions()
     assert directions[40, 0, 2] < 0
     np.testing.assert_allclose(np.arccos(directions[40, 127, 2]), np.hypot(63.5, 0.5) / 25)
@@ -188,9 +184,7 @@ def test_orbit_looks_at_its_center_from_its_radius(up):
     cameras = orbit((1, 2, 3), 4.0, 7, elevation=30.0, up=up, width=64, height=48)
     assert len(cameras) == 7
     for camera in cameras:
-        np.testing.assert_allclose(
-            camera.project(np.array([[1.0, 2, 3]]))[0][0], [32, 24], atol=1e-9
-        )
+        np.testing.assert_allclose(camera.project(np.array([[1.0, 2, 3]]))[0][0], [32, 24], atol=1e-9)
         offset = camera.center - (1, 2, 3)
         np.testing.assert_allclose(np.linalg.norm(offset), 4.0)
         np.testing.assert_allclose(offset @ up / np.linalg.norm(up), 2.0)

@@ -47,9 +47,7 @@ def write_colmap(folder, text: bool = False, count: int = 4, model: str = "PINHO
     reconstruction.add_camera_with_trivial_rig(camera)
     points = np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2], [0.1, 0.1, 0.1]])
     for index, pose in enumerate(poses(count)):
-        image = pycolmap.Image(
-            name=f"im{index}.png", keypoints=np.zeros((5, 2)), camera_id=1, image_id=index + 1
-        )
+        image = pycolmap.Image(name=f"im{index}.png", keypoints=np.zeros((5, 2)), camera_id=1, image_id=index + 1)
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
         write_image(folder / "images" / f"im{index}.png", gradient())
     for index, point in enumerate(points):
@@ -88,9 +86,7 @@ def write_llff(folder, count: int = 3) -> np.ndarray:
     rows = []
     for index, pose in enumerate(poses(count)):
         c2w = np.linalg.inv(pose)
-        matrix = np.stack(
-            [c2w[:3, 1], c2w[:3, 0], -c2w[:3, 2], c2w[:3, 3], (HEIGHT, WIDTH, 20.0)], axis=1
-        )
+        matrix = np.stack([c2w[:3, 1], c2w[:3, 0], -c2w[:3, 2], c2w[:3, 3], (HEIGHT, WIDTH, 20.0)], axis=1)
         rows.append([*matrix.ravel(), 0.5, 9.0])
         write_image(folder / "images" / f"{index}.png", gradient())
     rows = np.array(rows)
@@ -313,9 +309,7 @@ def test_image_resizes_by_area(tmp_path):
     np.testing.assert_allclose(load(tmp_path).views[0].image(12, 8), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("model", "distortion"), [("opencv", BARREL), ("opencv_fisheye", (0.05, 0.01, 0.0, 0.0))]
-)
+@pytest.mark.parametrize(("model", "distortion"), [("opencv", BARREL), ("opencv_fisheye", (0.05, 0.01, 0.0, 0.0))])
 def test_undistorted_image_shows_the_right_rays(tmp_path, model, distortion):
     """A photo whose colors are its ray directions, undistorted, must show a pinhole's
     directions.

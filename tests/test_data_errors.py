@@ -31,9 +31,7 @@ def test_says_where_it_looked(tmp_path):
     """Nothing there, photos without poses, a wrong file."""
     with pytest.raises(FileNotFoundError, match="nowhere: must be a data set"):
         load(tmp_path / "nowhere")
-    with pytest.raises(
-        FileNotFoundError, match=r"looked for transforms.json.*sparse/0.*npy"
-    ) as error:
+    with pytest.raises(FileNotFoundError, match=r"looked for transforms.json.*sparse/0.*npy") as error:
         load(tmp_path)
     one_line(error)
     write_image(tmp_path / "images" / "a.png", gradient())

@@ -27,9 +27,7 @@ def texture(rng) -> np.ndarray:
     return np.clip((image - image.min()) / np.ptp(image), 0, 1)
 
 
-def render_plane(
-    camera: Camera, image: np.ndarray, half: float = 2.0
-) -> tuple[np.ndarray, np.ndarray]:
+def render_plane(camera: Camera, image: np.ndarray, half: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
     """The textured square |x|, |y| <= half in the plane z = 0: image and z-depth (0 where
     missed).
     """

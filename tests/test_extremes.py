@@ -45,7 +45,9 @@ def test_tiles(case):
         assert oracle.out.count.max() > 0
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.bvh != "skip" and "ewa" not in c.name], ids=lambda c: c.name.replace("`", ""))
+@pytest.mark.parametrize(
+    "case", [c for c in CASES if c.bvh != "skip" and "ewa" not in c.name], ids=lambda c: c.name.replace("`", "")
+)
 def test_bvh(case):
     """The same bounds on `bvh`; where float32 world space cannot hold them, finite values and a warning."""
     with warnings.catch_warnings(record=True) as caught:

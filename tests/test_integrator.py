@@ -337,7 +337,9 @@ def test_gradients_reach_the_arrays(rng):
     made = drgs.Gaussians.from_arrays(g.means, g.quats, linear["scales"], linear["opacities"], g.sh, g.features)
     drgs.render(made, cam, settings).rgb.square().sum().backward()
     got = {name: x.grad for name, x in {**linear, "means": g.means, "sh": g.sh}.items()}
-    drgs_raw = torch.autograd.grad(render(g, cam, settings).rgb.square().sum(), [g.log_scales, g.logit_opacities, g.means, g.sh])
+    drgs_raw = torch.autograd.grad(
+        render(g, cam, settings).rgb.square().sum(), [g.log_scales, g.logit_opacities, g.means, g.sh]
+    )
     a = linear["opacities"].detach()
     for name, want in zip(
         ("scales", "opacities", "means", "sh"),

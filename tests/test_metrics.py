@@ -78,6 +78,8 @@ def lpips_packages():
 
 
 class Rendered:
+    """Stands for an `Output`."""
+
     def __init__(self, rgb):
         self.rgb = rgb
 
@@ -165,5 +167,7 @@ def test_bad_weights_are_refused(tmp_path):
 
 
 class Malicious:
+    """Runs code when unpickled."""
+
     def __reduce__(self):
         return (print, ("unpickled",))

@@ -26,9 +26,7 @@ def _f64(values):
 
 
 def _settings(response="peak", order="center", **fields):
-    return RenderSettings(
-        response=response, order=order, traversal="tiles" if response == "ewa" else "bvh", **fields
-    )
+    return RenderSettings(response=response, order=order, traversal="tiles" if response == "ewa" else "bvh", **fields)
 
 
 def _camera(width=8, height=6, focal=8.0, w2c=None, center=None):
@@ -150,9 +148,7 @@ def test_two_gaussians_peak():
 @pytest.mark.parametrize("response", ["peak", "integral"])
 def test_center_hit_has_the_opacity(response):
     """A full pass through the center has a = alpha from every side, whatever the shape."""
-    g = _gaussians(
-        {"mean": (0, 0, 0), "scale": (1e-3, 0.1, 3), "quat": (0.3, -0.5, 1.1, 0.2), "opacity": 0.37}
-    )
+    g = _gaussians({"mean": (0, 0, 0), "scale": (1e-3, 0.1, 3), "quat": (0.3, -0.5, 1.1, 0.2), "opacity": 0.37})
     generator = torch.Generator().manual_seed(0)
     o = torch.nn.functional.normalize(torch.randn(9, 3, generator=generator).double(), dim=1) * 100
     out = render(g, None, _settings(response), rays=(o, -o))
@@ -623,9 +619,7 @@ def test_sh_basis_is_orthonormal():
     r = (1 - z * z).sqrt()[:, None]
     d = torch.stack([r * phi.cos(), r * phi.sin(), z[:, None].expand(8, 16)], -1)
     basis = reference.sh_basis(d, 16)
-    gram = torch.einsum(
-        "zp,zpi,zpj->ij", w[:, None].expand(8, 16) * (2 * math.pi / 16), basis, basis
-    )
+    gram = torch.einsum("zp,zpi,zpj->ij", w[:, None].expand(8, 16) * (2 * math.pi / 16), basis, basis)
     _close(gram, torch.eye(16), 1e-13)
 
 

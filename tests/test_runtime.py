@@ -36,9 +36,7 @@ def _python(code: str, **environ: str) -> subprocess.CompletedProcess:
     """Run code in a fresh interpreter; a value of "" removes the variable."""
     env = {**os.environ, **environ}
     env = {k: v for k, v in env.items() if v != ""}
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=env, timeout=120
-    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=env, timeout=120)
 
 
 @pytest.mark.parametrize(

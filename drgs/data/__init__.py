@@ -41,15 +41,11 @@ def load(
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(
-            f"{path}: must be a data set, found no such file or folder; check the path"
-        )
+        raise FileNotFoundError(f"{path}: must be a data set, found no such file or folder; check the path")
     if path.is_file():
         loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
         if loader is None:
-            raise ValueError(
-                f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these"
-            )
+            raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
     elif find_transforms(path):
         loader = load_transforms
     elif find_model(path):
@@ -78,6 +74,4 @@ def _nothing_found(path: Path) -> FileNotFoundError:
         "poses_bounds.npy",
         "images",
     ]
-    return FileNotFoundError(
-        f"{path}: must be a data set, found none (looked for {', '.join(looked)}); check the path"
-    )
+    return FileNotFoundError(f"{path}: must be a data set, found none (looked for {', '.join(looked)}); check the path")

@@ -19,11 +19,7 @@ _MAX_NPY_HEADER = 65536
 
 def list_images(folder: Path) -> list[Path]:
     """Image files directly in a folder, by name; hidden files are left out."""
-    return sorted(
-        p
-        for p in folder.iterdir()
-        if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
-    )
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
 def read_json(path: Path) -> Any:
@@ -61,9 +57,7 @@ def read_npy(path: Path) -> np.ndarray:
             start = file.tell()
     except (ValueError, EOFError, OSError) as error:
         text = " ".join(str(error).split())
-        raise ValueError(
-            f"{path}: must be a .npy file, got {text}; save it with numpy.save"
-        ) from None
+        raise ValueError(f"{path}: must be a .npy file, got {text}; save it with numpy.save") from None
     if dtype.hasobject or dtype.kind not in "fiub":
         raise ValueError(f"{path}: must hold plain numbers, got dtype {dtype}; save a float array")
     # Python integers: a claimed shape of 10^12 x 10^12 must not wrap around.
@@ -117,9 +111,7 @@ def read_image(path: Path) -> np.ndarray:
     except cv2.error:
         data = None
     if data is None:
-        raise ValueError(
-            f"{path}: must be an image, could not be decoded; copy or convert it again"
-        )
+        raise ValueError(f"{path}: must be an image, could not be decoded; copy or convert it again")
     if data.ndim == 3:
         order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(data.shape[2])
         if order is None:

@@ -59,27 +59,18 @@ def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 
     folder = _image_folder(path, model)
     views = []
     # By name: COLMAP numbers images in the order in which its threads finish them.
-    registered = sorted(
-        reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name
-    )
+    registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
-        raise ValueError(
-            f"{model}: must hold at least one registered image, got none; run `drgs sfm` again"
-        )
+        raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
         where = f"{model}: image {index} ({image.name})"
         if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
-            raise ValueError(
-                f"{where}: the name must stay inside {folder}, got {image.name!r}; rename it"
-            )
+            raise ValueError(f"{where}: the name must stay inside {folder}, got {image.name!r}; rename it")
         w2c = np.eye(4)
         w2c[:3] = image.cam_from_world().matrix()
         if not np.isfinite(w2c).all():
-            raise ValueError(
-                f"{where}: the pose must be finite, got NaN or Inf; remove this image from the "
-                "model"
-            )
+            raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model")
         camera = _camera(reconstruction.cameras[image.camera_id], w2c, image.name, where)
         views.append(
             View(
@@ -155,14 +146,11 @@ def _camera(camera: object, w2c: np.ndarray, name: str, where: str) -> Camera:
 def _points(reconstruction: object, model: Path) -> tuple[np.ndarray, np.ndarray]:
     entries = [reconstruction.points3D[key] for key in sorted(reconstruction.point3D_ids())]
     points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(
-        -1, 3
-    ) / np.float32(255)
+    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise ValueError(
-            f"{model}: points must be finite, got {points[bad[0]]} at index {bad[0]}; run `drgs "
-            "sfm` again"
+            f"{model}: points must be finite, got {points[bad[0]]} at index {bad[0]}; run `drgs sfm` again"
         )
     return points, colors
 
@@ -178,9 +166,7 @@ def _read(model: Path) -> object:
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name in _REQUIRED:
         if not (model / f"{name}{suffix}").is_file():
-            raise FileNotFoundError(
-                f"{model}: must hold {name}{suffix}, found none; copy the whole model"
-            )
+            raise FileNotFoundError(f"{model}: must hold {name}{suffix}, found none; copy the whole model")
     check = _check_binary if suffix == ".bin" else _check_text
     for name in (*_REQUIRED, "rigs", "frames"):
         if (model / f"{name}{suffix}").is_file():
@@ -300,12 +286,8 @@ def _check_text(path: Path, kind: str) -> None:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
-        raise ValueError(
-            f"{path}: must be a text file, got binary data; export the model again"
-        ) from None
-    lines = [
-        (number, line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")
-    ]
+        raise ValueError(f"{path}: must be a text file, got binary data; export the model again") from None
+    lines = [(number, line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
     if kind == "images":
         _check_image_lines(path, lines)
         return
@@ -366,7 +348,4 @@ def _numbers(path: Path, line: int, words: list[str], least: int, exact: bool = 
 
 
 def _bad_line(path: Path, line: int, needs: str, got: str) -> ValueError:
-    return ValueError(
-        f"{path}: line {line} must hold {needs}, got {got}; it is truncated or damaged, export it "
-        "again"
-    )
+    return ValueError(f"{path}: line {line} must hold {needs}, got {got}; it is truncated or damaged, export it again")

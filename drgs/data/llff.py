@@ -33,20 +33,15 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
         raise ValueError(f"{file}: must have shape (N, 17), got {rows.shape}; this is no LLFF file")
     folder = file.parent / "images"
     if not folder.is_dir():
-        raise FileNotFoundError(
-            f"{file}: the photos must lie in {folder}, found no such folder; move them there"
-        )
+        raise FileNotFoundError(f"{file}: the photos must lie in {folder}, found no such folder; move them there")
     images = list_images(folder)
     if len(images) != len(rows):
         raise ValueError(
-            f"{file}: must have one row an image, got {len(rows)} rows and {len(images)} images; "
-            "match them"
+            f"{file}: must have one row an image, got {len(rows)} rows and {len(images)} images; match them"
         )
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
-        raise ValueError(
-            f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image"
-        )
+        raise ValueError(f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image")
     views = []
     for index, (row, image) in enumerate(zip(rows.astype(np.float64), images, strict=True)):
         where = f"{file}: row {index} ({image.name})"

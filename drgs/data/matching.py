@@ -90,9 +90,7 @@ def extract(
         progress("features", len(names), len(names))
 
 
-def match(
-    database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progress: Progress | None = None
-) -> None:
+def match(database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progress: Progress | None = None) -> None:
     """Match image pairs and verify them geometrically; results go to the database.
 
     Args:
@@ -131,12 +129,7 @@ def sequential_pairs(names: list[str], window: int) -> list[tuple[str, str]]:
     gaps.
     """
     steps = set(range(1, window + 1)) | {2**k for k in range(16) if 2**k > window}
-    return [
-        (names[i], names[i + s])
-        for i in range(len(names))
-        for s in sorted(steps)
-        if i + s < len(names)
-    ]
+    return [(names[i], names[i + s]) for i in range(len(names)) for s in sorted(steps) if i + s < len(names)]
 
 
 def nearby_pairs(centers: np.ndarray, axes: np.ndarray, neighbors: int) -> list[tuple[int, int]]:

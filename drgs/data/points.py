@@ -41,10 +41,7 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
         points: (P,3) world points, used only in that case.
     """
     if not cameras:
-        raise ValueError(
-            "scene_extent: there must be at least one camera, got none; pass the training views' "
-            "cameras"
-        )
+        raise ValueError("scene_extent: there must be at least one camera, got none; pass the training views' cameras")
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(axis=0)
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
@@ -79,15 +76,9 @@ def initial_points(
     rng = np.random.default_rng(seed)
     views = data.views if isinstance(data, Dataset) else list(data)
     if not views:
-        raise ValueError(
-            "initial_points: there must be at least one view, got none; pass the training views"
-        )
+        raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
-        colors = (
-            data.colors
-            if data.colors is not None
-            else np.full(data.points.shape, 0.5, dtype=np.float32)
-        )
+        colors = data.colors if data.colors is not None else np.full(data.points.shape, 0.5, dtype=np.float32)
         keep = _subset(len(data.points), max_points, rng)
         note = "" if len(keep) == len(data.points) else f", {len(keep)} kept"
         return data.points[keep], colors[keep], f"{data.point_source}{note}"
@@ -117,9 +108,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ValueError: no PLY with x, y, z, shorter than it claims, or not finite.
     """
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path"
-        )
+        raise FileNotFoundError(f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path")
     import plyfile
 
     try:
@@ -134,14 +123,10 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             colors = raw.astype(np.float32) / np.float32(np.iinfo(raw.dtype).max if whole else 1)
     except (plyfile.PlyParseError, ValueError, KeyError, UnicodeDecodeError, EOFError) as error:
         text = " ".join(str(error).split())
-        raise ValueError(
-            f"{path}: must be a PLY point cloud with x, y, z, got {text}; export it again"
-        ) from None
+        raise ValueError(f"{path}: must be a PLY point cloud with x, y, z, got {text}; export it again") from None
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
-        raise ValueError(
-            f"{path}: points must be finite, got NaN or Inf at index {bad[0]}; export it again"
-        )
+        raise ValueError(f"{path}: points must be finite, got NaN or Inf at index {bad[0]}; export it again")
     return points, colors
 
 
@@ -166,9 +151,7 @@ def _check_ply_size(path: Path) -> None:
             least += count * (2 if text else _PLY_BYTES.get(kind, 1))
     held = path.stat().st_size - end - len(b"end_header\n")
     if least > held + text:  # text may lack the last line break
-        raise ValueError(
-            f"a header that claims at least {least} bytes of data where the file holds {held}"
-        )
+        raise ValueError(f"a header that claims at least {least} bytes of data where the file holds {held}")
 
 
 def _subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
@@ -179,9 +162,7 @@ def _subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
 # -------------------------------------------------- depth
 
 
-def _from_depth(
-    views: list[View], limit: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Back-projected pixels, an even share a view, at most ``limit``.
 
     Not thinned in space: what is close to many cameras gets many points, and that is where pixels are to be explained.
@@ -204,9 +185,7 @@ def _from_depth(
         # A random phase on a regular step through the valid pixels: even, without the grid's moire
         # between views.
         step = max(1.0, len(pixels) / share)
-        chosen = pixels[
-            np.arange(rng.uniform(0, min(step, len(pixels))), len(pixels), step).astype(np.int64)
-        ]
+        chosen = pixels[np.arange(rng.uniform(0, min(step, len(pixels))), len(pixels), step).astype(np.int64)]
         points.append(_back_project(view.camera, chosen, depth.reshape(-1)[chosen]))
         if view.image_path is None:
             colors.append(np.full((len(chosen), 3), 0.5, dtype=np.float32))
@@ -255,9 +234,7 @@ def _triangulated(
         for index, view in enumerate(views):
             camera = view.camera.undistorted()
             scale = min(1.0, _FEATURE_SIZE / max(camera.width, camera.height))
-            camera = camera.resized(
-                max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-            )
+            camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
             image, mask = (
                 view.image(camera.width, camera.height),
                 view.mask(camera.width, camera.height),
@@ -291,14 +268,10 @@ def _triangulated(
         match(database, pairs, seed=seed, progress=progress)
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = seed
-        result = pycolmap.triangulate_points(
-            reconstruction, database, base / "images", base / "model", options=options
-        )
+        result = pycolmap.triangulate_points(reconstruction, database, base / "images", base / "model", options=options)
         entries = [result.points3D[key] for key in sorted(result.point3D_ids())]
     points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(
-        -1, 3
-    ) / np.float32(255)
+    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     keep = np.isfinite(points).all(axis=1)
     return points[keep], colors[keep]
 
@@ -337,17 +310,13 @@ def _write_png(path: Path, data: np.ndarray) -> None:
     import cv2
 
     if not cv2.imwrite(str(path), data, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(
-            f"{path}: the temporary image must be writable, the write failed; free some disk space"
-        )
+        raise OSError(f"{path}: the temporary image must be writable, the write failed; free some disk space")
 
 
 # -------------------------------------------------- random
 
 
-def _random(
-    views: list[View], count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _random(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points along random pixels' rays, kept where at least half as many cameras look as look at
     the best point.
     """
@@ -359,9 +328,7 @@ def _random(
     for index, camera in enumerate(cameras):
         number = drawn // len(cameras) + (index < drawn % len(cameras))
         size = camera.width * camera.height
-        allowed = (
-            np.arange(size) if masks[index] is None else np.flatnonzero(masks[index] > _MASK_KEEP)
-        )
+        allowed = np.arange(size) if masks[index] is None else np.flatnonzero(masks[index] > _MASK_KEEP)
         if not len(allowed) or not number:
             continue
         pixels = rng.choice(allowed, number)

@@ -40,9 +40,7 @@ def find_transforms(path: Path) -> list[Path]:
     return [file for split in _SPLITS if (file := path / f"transforms_{split}.json").is_file()]
 
 
-def load_transforms(
-    path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> Dataset:
+def load_transforms(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 
     Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x;
@@ -62,8 +60,7 @@ def load_transforms(
     files = find_transforms(path)
     if not files:
         raise FileNotFoundError(
-            f"{path}: must hold transforms.json or transforms_train.json, found none; check the "
-            "path"
+            f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
         )
     views: list[View] = []
     points = colors = None
@@ -72,10 +69,7 @@ def load_transforms(
         data = read_json(file)
         frames = data.get("frames") if isinstance(data, dict) else None
         if not isinstance(frames, list) or not frames:
-            raise ValueError(
-                f"{file}: must be an object with a list `frames` of at least one frame; check the "
-                "file"
-            )
+            raise ValueError(f"{file}: must be an object with a list `frames` of at least one frame; check the file")
         named = _named_splits(data)
         sizes: dict[tuple[int, int], int] = {}
         for index, frame in enumerate(frames):
@@ -85,9 +79,7 @@ def load_transforms(
             view, own = _view(file.parent, where, data, frame, background)
             if not own:
                 sizes.setdefault((view.camera.width, view.camera.height), index)
-            view.split = named.get(
-                frame["file_path"], file.stem.removeprefix("transforms").lstrip("_")
-            )
+            view.split = named.get(frame["file_path"], file.stem.removeprefix("transforms").lstrip("_"))
             if view.split not in _SPLITS:
                 view.split = ""
             views.append(view)
@@ -113,8 +105,7 @@ def _view(
     image = _image_file(folder, frame["file_path"])
     if image is None:
         raise FileNotFoundError(
-            f"{where}: the image {folder / frame['file_path']} must exist, found none; restore it "
-            "or drop the frame"
+            f"{where}: the image {folder / frame['file_path']} must exist, found none; restore it or drop the frame"
         )
     own = any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
     merged = {**{key: value for key, value in data.items() if key != "frames"}, **frame}
@@ -149,30 +140,20 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path) -> Camera:
         fx = _focal(where, values, "camera_angle_x", width)
         fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
     else:
-        raise ValueError(
-            f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; "
-            "add one"
-        )
-    K = intrinsics(
-        fx, fy, _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
-    )
+        raise ValueError(f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; add one")
+    K = intrinsics(fx, fy, _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2))
     kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if kind not in _LENSES:
         raise ValueError(
-            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort "
-            "the images"
+            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort the images"
         )
-    k1, k2, k3, k4, p1, p2 = (
-        _number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
-    )
+    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model, distortion = _LENSES[kind], ()
     if model == "opencv_fisheye":
         distortion = (k1, k2, k3, k4)
     elif model == "opencv":
         if k4:
-            raise ValueError(
-                f"{where}: OPENCV takes k1, k2, k3, p1, p2, got k4 = {k4:g}; undistort the images"
-            )
+            raise ValueError(f"{where}: OPENCV takes k1, k2, k3, p1, p2, got k4 = {k4:g}; undistort the images")
         distortion = (k1, k2, p1, p2, k3)
         if not any(distortion):
             model, distortion = "pinhole", ()
@@ -189,21 +170,13 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
     except (TypeError, ValueError):
         c2w = np.empty(0)
     if c2w.shape not in ((4, 4), (3, 4)):
-        raise ValueError(
-            f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct "
-            "it"
-        )
+        raise ValueError(f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct it")
     if not np.isfinite(c2w).all():
-        raise ValueError(
-            f"{where}: transform_matrix must be finite, got NaN or Inf; drop this frame"
-        )
+        raise ValueError(f"{where}: transform_matrix must be finite, got NaN or Inf; drop this frame")
     pose = np.eye(4)
     pose[:3] = c2w[:3]
     pose = c2w_from_opengl(pose)
-    if (
-        np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < _ROUNDING
-        and np.linalg.det(pose[:3, :3]) > 0
-    ):
+    if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < _ROUNDING and np.linalg.det(pose[:3, :3]) > 0:
         u, _, vt = np.linalg.svd(pose[:3, :3])
         pose[:3, :3] = u @ vt
     # The transpose stands for the inverse: Camera then reports whatever is no rotation.
@@ -215,9 +188,7 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
 def _focal(where: str, values: dict, key: str, size: float) -> float:
     angle = _number(where, values, key)
     if not 0.0 < angle < math.pi:
-        raise ValueError(
-            f"{where}: {key} must lie between 0 and pi radians, got {angle:g}; correct it"
-        )
+        raise ValueError(f"{where}: {key} must lie between 0 and pi radians, got {angle:g}; correct it")
     return 0.5 * size / math.tan(0.5 * angle)
 
 
@@ -245,9 +216,7 @@ def _optional_file(folder: Path, where: str, frame: dict, key: str) -> Path | No
         return None
     path = folder / frame[key]
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{where}: {key} names {path}, found no such file; restore it or remove the key"
-        )
+        raise FileNotFoundError(f"{where}: {key} names {path}, found no such file; restore it or remove the key")
     return path
 
 

@@ -64,9 +64,7 @@ class View:
             data = np.repeat(data[..., None], 3, axis=2)
         if data.shape[2] == 4:
             alpha = data[..., 3:]
-            data = data[..., :3] * alpha + (1 - alpha) * np.asarray(
-                self.background, dtype=np.float32
-            )
+            data = data[..., :3] * alpha + (1 - alpha) * np.asarray(self.background, dtype=np.float32)
         if self.camera.is_distorted:
             columns, rows, _ = _lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -79,9 +77,7 @@ class View:
         Pixels of an undistorted image that the photo did not see are 0, also where there is no mask
         file.
         """
-        if self.mask_path is None and not (
-            self.camera.is_distorted and _lens_maps(self.camera)[2] is not None
-        ):
+        if self.mask_path is None and not (self.camera.is_distorted and _lens_maps(self.camera)[2] is not None):
             return None
         if self.mask_path is None:
             data = np.ones((self.camera.height, self.camera.width), dtype=np.float32)
@@ -106,18 +102,11 @@ class View:
 
         if self.depth_path is None:
             return None
-        raw = (
-            read_npy(self.depth_path)
-            if self.depth_path.suffix == ".npy"
-            else read_image(self.depth_path)
-        )
+        raw = read_npy(self.depth_path) if self.depth_path.suffix == ".npy" else read_image(self.depth_path)
         if raw.ndim == 3 and raw.shape[2] == 1:
             raw = raw[..., 0]
         if raw.ndim != 2:
-            raise ValueError(
-                f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; "
-                "convert it"
-            )
+            raise ValueError(f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; convert it")
         data = raw.astype(np.float32) * np.float32(self.depth_scale)
         data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
         data = self._nearest(data, self.depth_path)
@@ -153,9 +142,7 @@ class View:
             data = cv2.resize(data, size, interpolation=cv2.INTER_NEAREST_EXACT)
         if self.camera.is_distorted:
             columns, rows, _ = _lens_maps(self.camera)
-            data = cv2.remap(
-                data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-            )
+            data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return data
 
 
@@ -224,9 +211,7 @@ def fit_to_image(camera: Camera, path: Path, where: str) -> Camera:
         ValueError: not an image, or another shape.
     """
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{where}: the image {path} must exist, found none; restore it or drop the view"
-        )
+        raise FileNotFoundError(f"{where}: the image {path} must exist, found none; restore it or drop the view")
     width, height = image_size(path)
     if (width, height) == (camera.width, camera.height):
         return camera
@@ -247,9 +232,7 @@ def _unit_range(data: np.ndarray, path: Path) -> np.ndarray:
         return data.astype(np.float32) / np.float32(65535)
     if data.dtype.kind == "f":
         return np.clip(data.astype(np.float32), 0.0, 1.0)
-    raise ValueError(
-        f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it"
-    )
+    raise ValueError(f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it")
 
 
 def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -258,18 +241,14 @@ def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
     if data.shape[1::-1] == (width, height):
         return np.ascontiguousarray(data)
     shrinks = width <= data.shape[1] and height <= data.shape[0]
-    return cv2.resize(
-        data, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
+    return cv2.resize(data, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
 def _lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the
     photo did not see.
     """
-    return _cached_lens_maps(
-        camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion
-    )
+    return _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
 
 
 @functools.lru_cache(maxsize=8)
@@ -277,9 +256,7 @@ def _cached_lens_maps(
     K: bytes, width: int, height: int, model: str, distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     matrix = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
-    lens = Camera(
-        K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion
-    )
+    lens = Camera(K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion)
     rays = lens.undistorted().pixel_directions().reshape(-1, 3)
     pixels = lens.project(rays)[0].reshape(height, width, 2)
     x, y = pixels[..., 0], pixels[..., 1]
