@@ -156,9 +156,14 @@ class Composite(dr.CustomOp):
         return {name: dr.zeros(self.view.t.Float, dr.width(x)) for name, x in self.buffers.items()}
 
     def backward(self):
-        """Replay every traversal with the cotangents of its outputs."""
+        """Dr.Jit reverse mode."""
+        for name, x in self.adjoint(self.grad_out()).items():
+            self.set_grad_in(name, x)
+
+    def adjoint(self, g: dict) -> dict:
+        """Replay every traversal with the cotangents `g` of its outputs: gradients of the arguments by name."""
         t, view = self.view.t, self.view
-        g, grads = self.grad_out(), self._grads()
+        grads = self._grads()
         lanes = [dr.zeros(t.Float, view.pixels) for _ in self.lanes]
         dr.eval(g)
         gathered = lambda name, i, active: dr.gather(t.Float, g[name], i, active)  # noqa: E731
@@ -189,18 +194,12 @@ class Composite(dr.CustomOp):
                     dr.eval(grads, lanes)
         i = dr.arange(t.UInt32, dr.width(grads["record"]) // RECORD)
         used = set(self.model.slots("depth" in view.want))
-        self.set_grad_in(
-            "record",
-            [
-                dr.gather(t.Float, grads["record"], i * RECORD + k) if k in used else dr.zeros(t.Float, dr.width(i))
-                for k in range(self.entries)
-            ],
-        )
-        for name in ("sh", "features"):
-            if name in grads:
-                self.set_grad_in(name, grads[name])
-        if lanes:
-            self.set_grad_in("lanes", lanes)
+        record = grads.pop("record")
+        grads["record"] = [
+            dr.gather(t.Float, record, i * RECORD + k) if k in used else dr.zeros(t.Float, dr.width(i))
+            for k in range(self.entries)
+        ]
+        return grads | ({"lanes": lanes} if lanes else {})
 
     def forward(self):
         """Dr.Jit forward mode: one tangent."""

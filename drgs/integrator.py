@@ -26,7 +26,7 @@ from drgs.composite import Composite, View, _pack  # noqa: E402
 from drgs.tiles import build  # noqa: E402
 from drgs.walk import tile_part  # noqa: E402
 
-__all__ = ["EPS_ALPHA", "OUTPUTS", "Output", "render", "render_jvp", "render_rays"]
+__all__ = ["EPS_ALPHA", "OUTPUTS", "Output", "Scene", "render", "render_jvp", "render_rays"]
 
 OUTPUTS = ("depth", "median_depth", "count", "visibility")
 EPS_ALPHA = 1e-10
@@ -85,12 +85,7 @@ def render(
         Kerbl et al. 2023 (compositing, SH); Moenne-Loccoz et al. 2024 (response at the peak of the ray).
     """
     settings = settings or RenderSettings.preset("exact")
-    if settings.traversal == "tiles" and camera.is_distorted:
-        raise NotImplementedError(
-            f"render: traversal='tiles' must have a pinhole camera, got model {camera.model!r} with distortion; "
-            "use traversal='bvh' (true rays) or camera.undistorted()"
-        )
-    scene = _Scene(gaussians, camera, settings, _wanted(outputs))
+    scene = Scene(gaussians, camera, settings, _wanted(outputs))
     return scene.output(_differentiable(scene))
 
 
@@ -110,7 +105,7 @@ def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth
         ValueError: If a name or shape is wrong.
     """
     settings = settings or RenderSettings.preset("exact")
-    scene = _Scene(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
+    scene = Scene(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
     return scene.jvp(tangents)
 
 
@@ -127,7 +122,7 @@ def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",
     settings = settings or RenderSettings.preset("exact", traversal="bvh")
     if settings.traversal != "bvh":
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
-    scene = _Scene(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
+    scene = Scene(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
     return scene.output(_differentiable(scene))
 
 
@@ -140,11 +135,21 @@ def _wanted(outputs) -> frozenset:
     return frozenset(_NAMES[name] for name in outputs)
 
 
-class _Scene:
-    """One call of `render`: its tensors, and the Dr.Jit function from them to images."""
+class Scene:
+    """One call of `render`: its tensors, and the Dr.Jit function from them to images.
+
+    Attributes:
+        inputs: Torch tensors by name: the raw parameters, `w2c` (12 floats), rays where they are traced.
+        view: The `View` of the last `prepare`.
+    """
 
     def __init__(self, gaussians, camera, settings, want, rays=None):
         self.t, self.settings, self.camera, self.want = runtime.dr_types(), settings, camera, want
+        if settings.traversal == "tiles" and camera.is_distorted:
+            raise NotImplementedError(
+                f"render: traversal='tiles' must have a pinhole camera, got model {camera.model!r} with distortion; "
+                "use traversal='bvh' (true rays) or camera.undistorted()"
+            )
         gaussians.validate("render")
         self.device = gaussians.means.device
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
@@ -331,7 +336,7 @@ class _Scene:
         column = {name: given[name].to(self.home) for name in self.inputs if name in given}
         if "rotations" in given:
             q = self.inputs["quats"].to(torch.float64)
-            column["quats"] = column.get("quats", 0) + 0.5 * _quaternion_product(given["rotations"].to(self.home), q)
+            column["quats"] = column.get("quats", 0) + 0.5 * quaternion_product(given["rotations"].to(self.home), q)
         if "camera" in given:
             omega, v = given["camera"][:3], given["camera"][3:]
             twist = torch.zeros(4, 4, dtype=torch.float64)
@@ -354,7 +359,7 @@ class _Scene:
     def _push_forward(self, columns: list[dict]) -> tuple[dict, list[dict]]:
         """Primal images and K tangent images (flat Dr.Jit arrays)."""
         t = self.t
-        inputs = {name: _tensor(t, x) for name, x in self.inputs.items()}
+        inputs = {name: to_drjit(t, x) for name, x in self.inputs.items()}
         buffers, lanes = [], []
         arguments = None
         for column in columns:
@@ -365,7 +370,7 @@ class _Scene:
             _, record, sh, features, lane, _ = arguments
             for name, x in inputs.items():
                 if name in column:
-                    dr.set_grad(x, _tensor(t, column[name].to(self.inputs[name].dtype)))
+                    dr.set_grad(x, to_drjit(t, column[name].to(self.inputs[name].dtype)))
             # A ray's direction is a lane and on the way to its SH basis: interior tangents are kept.
             dr.forward_to(record, sh, features, lane, flags=dr.ADFlag.ClearEdges)
             buffers.append({"record": _pack(t, [t.Float(dr.grad(x)) for x in record])})
@@ -384,7 +389,7 @@ class _Scene:
         return primal, images
 
 
-def _jvp_output(scene: _Scene, pushed, batched: bool) -> Output:
+def _jvp_output(scene: Scene, pushed, batched: bool) -> Output:
     primal, images = pushed
     outputs = []
     alpha = primal["alpha"].torch().to(torch.float64)
@@ -405,7 +410,7 @@ def _jvp_output(scene: _Scene, pushed, batched: bool) -> Output:
     return Output(**outputs[0])
 
 
-def _differentiable(scene: _Scene) -> dict:
+def _differentiable(scene: Scene) -> dict:
     """Run `scene.trace` on its torch inputs, through whichever bridge their derivative needs."""
     values = scene.inputs.values()
     if scene.count == 0:
@@ -416,7 +421,7 @@ def _differentiable(scene: _Scene) -> dict:
         return dict(zip(scene.result_names, results, strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
         return dr.wrap(source="torch", target="drjit")(scene.trace)(**scene.inputs)
-    images = scene.trace(**{name: _tensor(scene.t, x) for name, x in scene.inputs.items()})
+    images = scene.trace(**{name: to_drjit(scene.t, x) for name, x in scene.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
 
 
@@ -477,10 +482,10 @@ def _plain(t, x):
     with torch._C._DisableFuncTorch():
         while F.is_functorch_wrapped_tensor(x):
             x = F.get_unwrapped(x)
-        return _tensor(t, x)
+        return to_drjit(t, x)
 
 
-def _tensor(t, x):
+def to_drjit(t, x):
     return (t.TensorXf64 if x.dtype == torch.float64 else t.TensorXf)(x.detach().contiguous())
 
 
@@ -510,7 +515,7 @@ def _cross_matrix(w):
     )
 
 
-def _quaternion_product(w, q):
+def quaternion_product(w, q):
     """(0, w) * q for (N, 3) and (N, 4) wxyz."""
     s, v = q[:, :1], q[:, 1:]
     return torch.cat([-(w * v).sum(1, keepdim=True), s * w + torch.cross(w, v, dim=1)], 1)

@@ -53,11 +53,13 @@ class Projected:
         lower: (N,) float, no hit has an order key below it; detached.
         alive: (N,) mask of Gaussians that can have a hit.
         ellipsoids: World records only: mean (3), quaternion wxyz (4) and half axes of the extent (3); detached.
+        frame: Not of `ewa`: rotation (3, 3) to world axes, scales (3), and of the local frame, on the screen only, the
+            plane (u, v) of o' x d' and the axes (f1, f2, f3) that directions are stored along.
     """
 
-    def __init__(self, record, key, bounds, lower, alive, ellipsoids=None):
+    def __init__(self, record, key, bounds, lower, alive, ellipsoids=None, frame=None):
         self.record, self.key, self.bounds, self.lower, self.alive = record, key, bounds, lower, alive
-        self.ellipsoids = ellipsoids
+        self.ellipsoids, self.frame = ellipsoids, frame
 
 
 def sh_basis(direction, coefficients: int) -> list:
@@ -206,9 +208,10 @@ def project_screen(t, p, w2c, pinhole, settings: RenderSettings, width: int, hei
     ax = dr.clip(dr.floor(px), 0, width - 1) + 0.5
     ay = dr.clip(dr.floor(py), 0, height - 1) + 0.5
     if settings.response == "ewa":
+        frame = None
         shape, bounds, alive = _ewa(g, pinhole, ax, ay, settings, width, height)
     else:
-        shape = _peak(g, ax, ay, dx, dy, pinhole)
+        shape, frame = _peak(g, ax, ay, dx, dy, pinhole)
         bounds, alive = _silhouette(g, pinhole, settings, width, height)
     distance = g.distance()
     if settings.response == "ewa":
@@ -224,11 +227,11 @@ def project_screen(t, p, w2c, pinhole, settings: RenderSettings, width: int, hei
     # Peaks lie inside the extent ellipsoid, so no t* is nearer than its nearest point.
     reach = g.extent * dr.maximum(dr.maximum(g.scale[0], g.scale[1]), g.scale[2])
     lower = dr.maximum(dr.detach(distance - reach), 0) * (1 - 1e-6)
-    return Projected(record, Float(key), [Float(b) for b in bounds], Float(lower), alive)
+    return Projected(record, Float(key), [Float(b) for b in bounds], Float(lower), alive, frame=frame)
 
 
 def _peak(g: _Activated, ax, ay, dx, dy, pinhole):
-    """The 15 numbers of rho^2, t* and |d'| around the anchor (module docstring)."""
+    """The 15 numbers of rho^2, t* and |d'| around the anchor (module docstring), and `Projected.frame`."""
     fx, skew, cx, fy, cy = pinhole
     inverse = [dr.rcp(s) for s in g.scale]
     volume = inverse[0] * inverse[1] * inverse[2]
@@ -258,7 +261,8 @@ def _peak(g: _Activated, ax, ay, dx, dy, pinhole):
     f2 = _scaled(rest, dr.rcp(e4))
     f3 = _cross(f1, f2)
     h = _scaled(local(g.center, inverse), unit)
-    return [*r, e2, e3, e4, _dot(f2, Dy), _dot(f3, Dy), _dot(f1, h), _dot(f2, h), _dot(f3, h), norm]
+    numbers = [*r, e2, e3, e4, _dot(f2, Dy), _dot(f3, Dy), _dot(f1, h), _dot(f2, h), _dot(f3, h), norm]
+    return numbers, (g.rotation, g.scale, (u, v), (f1, f2, f3))
 
 
 def _frame(n):
@@ -411,4 +415,5 @@ def project_world(t, p, w2c, settings: RenderSettings, coefficients: int):
     # The proxies of `bvh` may stop where alpha_min cuts, unless it is their entry points that order the hits.
     extent = dr.detach(g.extent) if settings.order == "entry" else _listed_extent(g, settings)
     ellipsoids = [*g.mean, *g.quat, *[dr.detach(s) * extent for s in g.scale]]
-    return Projected(record, Float(key), None, None, alive & (extent > 0), [dr.detach(x) for x in ellipsoids])
+    frame = g.rotation, g.scale, None, None
+    return Projected(record, Float(key), None, None, alive & (extent > 0), [dr.detach(x) for x in ellipsoids], frame)
