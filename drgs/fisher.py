@@ -137,7 +137,7 @@ def coverage(
     total = torch.zeros(len(gaussians), dtype=torch.float64)
     for camera in _cameras(cameras):
         if len(gaussians):
-            total += _Pass(gaussians, camera, settings).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
+            total += _Pass(gaussians, camera, settings, geometry=False).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
     return total
 
 
@@ -254,7 +254,7 @@ def _column_shape(gaussians: Gaussians, group: str) -> tuple[int, ...]:
 class _Pass:
     """A view rendered once, to be replayed for information."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings):
+    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True):
         if settings.sh_direction == "ray":
             raise NotImplementedError(
                 "fisher: sh_direction must be 'gaussian' here, got 'ray'; use method 'columns' or 'probes'"
@@ -269,6 +269,9 @@ class _Pass:
         with dr.suspend_grad():
             self.operation.eval(*arguments[:-1], True)
         p = {name: x.array for name, x in self.inputs.items()}
+        self.color, self.extras = False, None
+        if not geometry:
+            return
         self.lit, self.basis, moved_color = self._colors(p)
         self.color = moved_color is not None
         self.extras = extras(t, settings, p, view.projected, view.world, self._moved_records(), moved_color)

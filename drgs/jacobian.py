@@ -65,8 +65,8 @@ def extras(t, settings, inputs, projected, world: bool, moved: list | None, colo
     buffer = dr.zeros(F, count * stride)
     zero = dr.zeros(F, count)
     for k in range(0, stride, 16):
-        for n, x in enumerate(columns[k : k + 16]):
-            dr.scatter(buffer, x + zero, i * stride + (k + n))
+        packet = t.ArrayXf([x + zero for x in columns[k : k + 16]])
+        dr.scatter(buffer, packet, i * (stride // 16) + k // 16)
     return buffer
 
 
@@ -164,7 +164,7 @@ class Rows:
     """Replay of a primal pass that hands the Jacobian's rows of every hit to a sink.
 
     Args:
-        buffer: From `extras`.
+        buffer: From `extras`; None leaves the geometry out, only w is known then.
         sink: What becomes of them: `Diagonal`, `Blocks` or `Variance`.
         finals: Per shared ray, the final state of the Primal pass.
         color: The color depends on the mean, through the direction.
@@ -172,7 +172,7 @@ class Rows:
 
     def __init__(self, model, source, buffer, sink, finals, color: bool):
         self.m, self.source, self.sink, self.finals = model, source, sink, finals
-        self.geometry, self.color = _Geometry(model, buffer), color
+        self.geometry, self.color = buffer is not None and _Geometry(model, buffer), color
         self.pending = iter(finals)
 
     def init(self, alive, place) -> dict:
@@ -190,28 +190,32 @@ class Rows:
         D = t.Float64
         going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
         record = self.source.load(t, index, rays[0], going)["record"]
-        extra = self.geometry.load(index, going)
+        extra = self.geometry.load(index, going) if self.geometry else None
         first = layout.W_RGB if m.world else layout.RGB
         color = record[first : first + 3]
         hits = t.Bool(False)
         for ray, st, final, place in zip(rays, states, self.finals, places, strict=True):
             a, _, ok = m.hit(record, ray, active & (st["alive"] != 0))
             T, left = st["T"], 1 - a
-            w = dr.select(ok, T * a, 0)
-            rest = [r - D(w) * D(c) for r, c in zip(st["rest"], color, strict=True)]
-            share = dr.select(left > 0, dr.rcp(dr.select(left > 0, left, 1)), 0)
-            g = [dr.select(ok, dr.fma(T, c, -t.Float(r) * share), 0) for c, r in zip(color, rest, strict=True)]
-            moves = ok
-            if m.s.alpha_max < 1 and m.s.alpha_max_gradient != "pass":
-                moves &= a < m.alpha_max
-            # Far from the ellipsoid 0 times infinity is possible.
-            slopes = [dr.select(moves, x, 0) for x in self.geometry.slopes(record, extra, ray)]
-            turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)] if self.color else None
+            w, rest = dr.select(ok, T * a, 0), st["rest"]
+            slopes = g = turned = None
+            if self.geometry:
+                rest = [r - D(w) * D(c) for r, c in zip(rest, color, strict=True)]
+                share = dr.select(left > 0, dr.rcp(dr.select(left > 0, left, 1)), 0)
+                g = [dr.select(ok, dr.fma(T, c, -t.Float(r) * share), 0) for c, r in zip(color, rest, strict=True)]
+                moves = ok
+                if m.s.alpha_max < 1 and m.s.alpha_max_gradient != "pass":
+                    moves &= a < m.alpha_max
+                # Far from the ellipsoid 0 times infinity is possible.
+                slopes = [dr.select(moves, x, 0) for x in self.geometry.slopes(record, extra, ray)]
+                if self.color:
+                    turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
             rows.append((slopes, g, w, turned))
             hits |= ok
             new = dict(st)
             new["T"] = dr.select(ok, T * left, T)
-            new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
+            if self.geometry:
+                new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
             at_end = ok
             for p, q in zip(place, final["place"], strict=True):
                 at_end &= p == q

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from scenes_random import camera, gaussians
+from scenes_random import camera, gaussians, twist_basis
 
 from drgs import reference
 
@@ -26,9 +25,7 @@ def jacobian(g, out) -> dict[str, torch.Tensor]:
     flat = out.rgb.reshape(-1)
     leaves = [x for name, x in g.parameters().items() if name != "features"]
     names = [name for name in g.parameters() if name != "features"]
-    rows = torch.autograd.grad(
-        flat, leaves, torch.eye(len(flat), dtype=flat.dtype), is_grads_batched=True, allow_unused=True
-    )
+    rows = _rows(flat, leaves)
     J = {
         name: torch.zeros(len(flat), *x.shape, dtype=torch.float64) if row is None else row.double()
         for name, x, row in zip(names, leaves, rows, strict=True)
@@ -62,6 +59,12 @@ def error(a: torch.Tensor, b: torch.Tensor) -> float:
     return float((a - b).abs().max() / b.abs().max().clamp_min(1e-12))
 
 
-def rng_of(seed) -> np.random.Generator:
-    """Shorthand."""
-    return np.random.default_rng(seed)
+def pose_jacobian(cam, out) -> torch.Tensor:
+    """(3 P, 6) derivative of the oracle's rgb along world-frame twists of the pose."""
+    (rows,) = _rows(out.rgb.reshape(-1), [cam.w2c])
+    return torch.einsum("pij,kij->pk", rows, -cam.w2c.detach() @ twist_basis())
+
+
+def _rows(flat, leaves):
+    identity = torch.eye(len(flat), dtype=flat.dtype)
+    return torch.autograd.grad(flat, leaves, identity, True, is_grads_batched=True, allow_unused=True)
