@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from drgs.kernels import Adjoint, Model, Primal, Ray, Source, Tangent
+from drgs.kernels import Adjoint, Model, Primal, Ray, Source, Tangent, pack
 from drgs.projection import RECORD
 from drgs.walk import Part
 
@@ -203,7 +203,7 @@ class Composite(dr.CustomOp):
 
     def forward(self):
         """Dr.Jit forward mode: one tangent."""
-        tangent = {"record": _pack(self.view.t, self.grad_in("record"))}
+        tangent = {"record": self.grad_in("record")}
         for name in ("sh", "features"):
             if name in self.buffers:
                 tangent[name] = self.grad_in(name)
@@ -211,15 +211,21 @@ class Composite(dr.CustomOp):
         self.set_grad_out(self.tangents([tangent], [lanes])[0])
 
     def tangents(self, buffers: list[dict], lanes: list[list]) -> list[dict]:
-        """Images of K tangents: dicts like the output of `eval`."""
+        """Images of K tangents: dicts like the output of `eval`.
+
+        Args:
+            buffers: Per tangent, that of the arguments `record` (a list), `sh` and `features`.
+            lanes: Per tangent, that of the argument `lanes`.
+        """
         t, view, results = self.view.t, self.view, []
-        if 1 not in self.parts:
-            self.parts[1] = view.parts_of(view, self.model, self.buffers["record"], self._ray, 1)
-        for name in buffers[0]:
-            for b in buffers:
-                if dr.width(b[name]) != dr.width(self.buffers[name]):
-                    b[name] = dr.zeros(t.Float, dr.width(self.buffers[name])) + b[name]
-        dr.eval(buffers, lanes)
+        slots = self.model.slots("depth" in view.want)
+        count = dr.width(self.buffers["record"]) // RECORD
+        records = pack(t, [b["record"][k] for k in slots for b in buffers], count)
+        rest = [{name: x for name, x in b.items() if name != "record"} for b in buffers]
+        for b in rest:
+            for name, x in b.items():
+                b[name] = x + dr.zeros(t.Float, dr.width(self.buffers[name]))
+        dr.eval(records, rest, lanes)
         for _ in buffers:
             out = {"rgb": dr.zeros(t.Float, 3 * view.pixels), "alpha": dr.zeros(t.Float, view.pixels)}
             if "depth" in view.want:
@@ -229,23 +235,24 @@ class Composite(dr.CustomOp):
             results.append(out)
         for source in self.passes:
             depth = view.want & {"depth"} if source.color else frozenset()
-            for part in self.parts[1]:
+            for part in self._parts(source):
                 carried = [
-                    [dr.gather(t.Float, v, part.flat[0], part.inside[0]) for v in per_tangent] for per_tangent in lanes
+                    [[dr.gather(t.Float, v, at, inside) for v in per_tangent] for per_tangent in lanes]
+                    for at, inside in zip(part.flat, part.inside, strict=True)
                 ]
-                kernel = Tangent(Primal(self.model, source, depth), buffers, carried)
-                (state,) = part.run(kernel)
-                dr.eval(state)
-                for out, d in zip(results, state["d"], strict=True):
-                    self._write_tangent(out, source, part, d)
+                states = part.run(Tangent(Primal(self.model, source, depth), records, slots, rest, carried))
+                dr.eval(states)
+                for at, inside, state in zip(part.flat, part.inside, states, strict=True):
+                    for out, d in zip(results, state["d"], strict=True):
+                        self._write_tangent(out, source, at, inside, d)
         return results
 
-    def _write_tangent(self, out, source, part, d):
-        at, inside, view = part.flat[0], part.inside[0], self.view
+    def _write_tangent(self, out, source, at, inside, d):
+        view = self.view
         if source.color:
             for c in range(3):
                 dr.scatter(out["rgb"], dr.fma(d["T"], self.model.background[c], d["sum"][c]), 3 * at + c, inside)
-            dr.scatter(out["alpha"], d["alpha"], at, inside)
+            dr.scatter(out["alpha"], -d["T"], at, inside)
             if "depth" in d:
                 dr.scatter(out["depth"], d["depth"], at, inside)
         first = 3 if source.color else 0

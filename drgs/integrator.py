@@ -22,7 +22,7 @@ runtime.backend()  # chooses libLLVM, which has to happen before drjit is import
 import drjit as dr  # noqa: E402
 
 from drgs import projection  # noqa: E402
-from drgs.composite import Composite, View, _pack  # noqa: E402
+from drgs.composite import Composite, View  # noqa: E402
 from drgs.tiles import build  # noqa: E402
 from drgs.walk import tile_part  # noqa: E402
 
@@ -373,7 +373,7 @@ class Scene:
                     dr.set_grad(x, to_drjit(t, column[name].to(self.inputs[name].dtype)))
             # A ray's direction is a lane and on the way to its SH basis: interior tangents are kept.
             dr.forward_to(record, sh, features, lane, flags=dr.ADFlag.ClearEdges)
-            buffers.append({"record": _pack(t, [t.Float(dr.grad(x)) for x in record])})
+            buffers.append({"record": [t.Float(dr.grad(x)) for x in record]})
             if sh is not None:
                 buffers[-1]["sh"] = dr.grad(sh)
             if features is not None:

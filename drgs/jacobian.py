@@ -17,18 +17,18 @@ from __future__ import annotations
 import drjit as dr
 
 from drgs import projection as layout
+from drgs.kernels import load_packed, pack, packed_size
 from drgs.projection import _cross, _dot
 
-__all__ = ["GEOMETRY", "STRIDE", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
+__all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
 
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
 _OPACITY, _COLOR, _SHAPE = 0, 1, 10  # entries of `extras`: d strength / dlogit, dc/dmu (9), then matrices
 _EWA = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
-STRIDE = {True: 64, False: 48}  # floats a Gaussian, by whether the response is `ewa`
 
 
 def extras(t, settings, inputs, projected, world: bool, moved: list | None, color: list | None):
-    """What hits need besides the record, STRIDE floats a Gaussian.
+    """What hits need besides the record, packed (kernels.pack).
 
     Args:
         inputs: Flat parameter arrays, as `projection` gets them.
@@ -44,7 +44,6 @@ def extras(t, settings, inputs, projected, world: bool, moved: list | None, colo
         slope = opacity / (dr.maximum(logit, 0) + dr.log(1 + e))
     else:
         slope = dr.select(logit >= 0, e, 1) / (1 + e)
-    count = dr.width(logit)
     columns = [F(slope)]
     columns += [F(x) for channel in color for x in channel] if color else [F(0)] * 9
     if settings.response == "ewa":
@@ -59,15 +58,7 @@ def extras(t, settings, inputs, projected, world: bool, moved: list | None, colo
                 F(sum(rotation[r][k] * weight[k] * local[k][i] for k in range(3))) for r in range(3) for i in range(3)
             ]
         columns += [F(local[k][i]) for k in range(3) for i in range(3)]
-    stride = STRIDE[settings.response == "ewa"]
-    columns += [F(0)] * (stride - len(columns))
-    i = dr.arange(t.UInt32, count)
-    buffer = dr.zeros(F, count * stride)
-    zero = dr.zeros(F, count)
-    for k in range(0, stride, 16):
-        packet = t.ArrayXf([x + zero for x in columns[k : k + 16]])
-        dr.scatter(buffer, packet, i * (stride // 16) + k // 16)
-    return buffer
+    return pack(t, columns, dr.width(logit))
 
 
 class _Geometry:
@@ -75,15 +66,12 @@ class _Geometry:
 
     def __init__(self, model, buffer):
         self.m, self.t, self.buffer = model, model.t, buffer
-        self.stride = STRIDE[model.s.response == "ewa"]
+        # `extras` has 10 numbers, then 45 or 33 of the shape.
+        self.size = packed_size(_SHAPE + (45 if model.s.response == "ewa" else 33))
 
     def load(self, index, active) -> list:
         """The extras of a Gaussian."""
-        t, values = self.t, []
-        for k in range(0, self.stride, 16):
-            at = index * (self.stride // 16) + k // 16
-            values += list(dr.gather(t.ArrayXf, self.buffer, at, active, shape=(16, dr.width(index))))
-        return values
+        return load_packed(self.t, self.buffer, self.size, index, active)
 
     def slopes(self, record, extra, ray) -> list:
         """The GEOMETRY derivatives of the opacity of a hit."""

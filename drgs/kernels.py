@@ -23,7 +23,7 @@ import drjit as dr
 from drgs import projection as layout
 from drgs.projection import RECORD
 
-__all__ = ["Adjoint", "Model", "Primal", "Ray", "Source", "Tangent"]
+__all__ = ["Adjoint", "Model", "Primal", "Ray", "Source", "Tangent", "load_packed", "pack", "packed_size"]
 
 
 @dataclasses.dataclass
@@ -163,6 +163,8 @@ class Source:
         """What a hit of Gaussian `index` reads, name -> list of floats."""
         buffers, loaded = buffers or self.buffers, {}
         for name, (stride, offset, count) in self.layout(ray).items():
+            if name not in buffers:
+                continue
             if name == "record":
                 packet = dr.gather(t.ArrayXf, buffers[name], index, active, shape=(RECORD, dr.width(index)))
                 loaded[name] = list(packet)
@@ -180,6 +182,29 @@ class Source:
             first = layout.W_RGB if model.world else layout.RGB
             values += loaded["record"][first : first + 3]
         return values + loaded.get("features", [])
+
+
+def packed_size(count: int) -> int:
+    """Floats a Gaussian in a packed buffer of `count`: whole packets of 16."""
+    return -(-count // 16) * 16
+
+
+def pack(t, columns: list, count: int):
+    """Interleave per-Gaussian floats: `packed_size(len(columns))` of each of `count` Gaussians together."""
+    size, i, zero = packed_size(len(columns)), dr.arange(t.UInt32, count), dr.zeros(t.Float, count)
+    buffer = dr.zeros(t.Float, count * size)
+    columns = [x + zero for x in columns] + [zero] * (size - len(columns))
+    for k in range(0, size, 16):
+        dr.scatter(buffer, t.ArrayXf(columns[k : k + 16]), i * (size // 16) + k // 16)
+    return buffer
+
+
+def load_packed(t, buffer, size: int, index, active) -> list:
+    """The `size` floats of a Gaussian."""
+    values = []
+    for k in range(size // 16):
+        values += list(dr.gather(t.ArrayXf, buffer, index * (size // 16) + k, active, shape=(16, dr.width(index))))
+    return values
 
 
 class Primal:
@@ -342,18 +367,20 @@ class Tangent:
     """Forward mode: K tangents carried through one front-to-back traversal.
 
     Args:
-        tangents: K dicts of buffers laid out like `source.buffers`.
-        lanes: Per tangent, the tangent of every ray's `lane`.
+        records: Tangents of the records, from `pack`: slot by slot, the K columns of each side by side.
+        slots: Entries of a record that they hold.
+        tangents: K dicts of buffers laid out like those of `source.buffers` besides the records.
+        lanes: Per shared ray and tangent, the tangent of the ray's `lane`.
     """
 
-    def __init__(self, primal: Primal, tangents: list[dict], lanes: list[list]):
+    def __init__(self, primal: Primal, records, slots: list[int], tangents: list[dict], lanes: list[list]):
         self.primal, self.m, self.source = primal, primal.m, primal.source
-        self.tangents, self.lanes = tangents, lanes
+        self.records, self.slots, self.tangents, self.lanes = records, slots, tangents, lanes
 
     def init(self, alive, place) -> dict:
         """State of a ray: the primal's, and `d` with a tangent of it for each column."""
         t, state = self.m.t, self.primal.init(alive, place)
-        names = ["T", "alpha", *(["depth"] if "depth" in state else [])]
+        names = ["T", *(["depth"] if "depth" in state else [])]  # sum w is 1 - T
         state["d"] = [
             {**{n: t.Float(0) for n in names}, "sum": [t.Float(0) for _ in range(self.source.outputs)]}
             for _ in self.tangents
@@ -361,46 +388,75 @@ class Tangent:
         return state
 
     def shade(self, index, rays, states, places, active):
-        """As Primal.shade for one ray a lane, with the tangents."""
-        (ray,), (st,), m = rays, states, self.m
-        live = active & (st["alive"] != 0)
-        loaded = dr.detach(self.source.load(m.t, index, ray, live))
-        (new,) = self.primal.shade(index, rays, [{k: v for k, v in st.items() if k != "d"}], places, active)
-        # The primal wrote what it decided: the weight is what T lost, and 0 where there was no hit.
-        a0, depth0, ok = m.hit(loaded["record"], ray, live)
-        if m.s.stop != "after":
-            ok &= new["alive"] != 0
-        T, w = st["T"], dr.select(ok, st["T"] * a0, 0)
-        values0 = self.source.values(m, loaded, ray)
-        new["d"] = []
-        for tangent, lane, old in zip(self.tangents, self.lanes, st["d"], strict=True):
-            speed = self.source.load(m.t, index, ray, ok, tangent)
-            with dr.resume_grad():
-                moved = {name: [dr.detach(x) for x in xs] for name, xs in loaded.items()}
-                dr.enable_grad(moved)
-                along = dataclasses.replace(ray, lane=[dr.detach(x) for x in ray.lane])
-                dr.enable_grad(along.lane)
-                for name, xs in moved.items():
-                    for x, v in zip(xs, speed[name], strict=True):
-                        dr.set_grad(x, v)
-                for x, v in zip(along.lane, lane, strict=True):
-                    dr.set_grad(x, v)
-                a, depth, _ = m.hit(moved["record"], along, live)
-                values = self.source.values(m, moved, along)
-                results = [a, depth, *values]
-                dr.enqueue(dr.ADMode.Forward, moved, along.lane)
-                # Depth may lie on the way to the opacity: interior tangents are kept.
-                dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-                da, ddepth, *dvalues = [dr.grad(x) for x in results]
-            dw = dr.select(ok, dr.fma(old["T"], a0, T * da), 0)
-            fresh = dict(old)
-            fresh["T"] = dr.select(ok, old["T"] * (1 - a0) - T * da, old["T"])
-            fresh["alpha"] = old["alpha"] + dw
-            fresh["sum"] = [
-                dr.fma(dw, v, dr.fma(w, dr.select(ok, dv, 0), s))
-                for v, dv, s in zip(values0, dvalues, old["sum"], strict=True)
-            ]
-            if "depth" in old:
-                fresh["depth"] = dr.fma(dw, depth0, dr.fma(w, dr.select(ok, ddepth, 0), old["depth"]))
-            new["d"].append(fresh)
-        return [new]
+        """As Primal.shade, with the tangents."""
+        m, t = self.m, self.m.t
+        going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
+        loaded = dr.detach(self.source.load(t, index, rays[0], going))
+        speeds = self._load(index, rays[0], going)
+        primal = [{k: v for k, v in st.items() if k != "d"} for st in states]
+        out = self.primal.shade(index, rays, primal, places, active)
+        for ray, lanes, st, new in zip(rays, self.lanes, states, out, strict=True):
+            live = active & (st["alive"] != 0)
+            # The primal wrote what it decided: the weight is what T lost, and 0 where there was no hit.
+            a0, depth0, ok = m.hit(loaded["record"], ray, live)
+            if m.s.stop != "after":
+                ok &= new["alive"] != 0
+            T, w = st["T"], dr.select(ok, st["T"] * a0, 0)
+            values0 = self.source.values(m, loaded, ray)
+            # One gradient of the hit serves all columns.
+            slopes = [self._slopes(loaded["record"], ray, live, k) for k in range(2 if "depth" in new else 1)]
+            new["d"] = []
+            for speed, lane, old in zip(speeds, lanes, st["d"], strict=True):
+                da = dr.select(ok, _along(slopes[0], speed["record"], lane), 0)
+                dvalues = self._moved_values(loaded, speed, ray, lane)
+                dw = dr.fma(old["T"], dr.select(ok, a0, 0), T * da)
+                fresh = dict(old)
+                fresh["T"] = dr.select(ok, old["T"] * (1 - a0), old["T"]) - T * da
+                fresh["sum"] = [
+                    dr.fma(dw, v, dr.fma(w, dv, s)) for v, dv, s in zip(values0, dvalues, old["sum"], strict=True)
+                ]
+                if "depth" in old:
+                    ddepth = dr.select(ok, _along(slopes[1], speed["record"], lane), 0)
+                    fresh["depth"] = dr.fma(dw, dr.select(ok, depth0, 0), dr.fma(w, ddepth, old["depth"]))
+                new["d"].append(fresh)
+        return out
+
+    def _load(self, index, ray, active) -> list[dict]:
+        """Tangents of what a hit reads, by column."""
+        t, count = self.m.t, len(self.tangents)
+        flat = load_packed(t, self.records, packed_size(len(self.slots) * count), index, active)
+        speeds = [self.source.load(t, index, ray, active, tangent) for tangent in self.tangents]
+        for k, speed in enumerate(speeds):
+            speed["record"] = {slot: flat[j * count + k] for j, slot in enumerate(self.slots)}
+        return speeds
+
+    def _slopes(self, record, ray, live, which: int):
+        """Gradient of a hit's opacity (0) or depth (1): {slot: value}, and of what the ray carries."""
+        with dr.resume_grad():
+            record = [dr.detach(x) for x in record]
+            ray = dataclasses.replace(ray, lane=[dr.detach(x) for x in ray.lane])
+            dr.enable_grad(record, ray.lane)
+            dr.backward_from(self.m.hit(record, ray, live)[which])
+            return {k: dr.grad(record[k]) for k in self.slots}, [dr.grad(x) for x in ray.lane]
+
+    def _moved_values(self, loaded, speed, ray, lane) -> list:
+        """Tangents of the channels of a hit."""
+        if not (self.source.color and ray.basis):
+            first = layout.W_RGB if self.m.world else layout.RGB
+            color = [speed["record"][first + c] for c in range(3)] if self.source.color else []
+            return color + speed.get("features", [])
+        with dr.resume_grad():
+            moved = [dr.detach(x) for x in loaded["sh"]]
+            basis = [dr.detach(x) for x in ray.lane[: ray.basis]]
+            dr.enable_grad(moved, basis)
+            for x, v in zip(moved + basis, speed["sh"] + lane[: ray.basis], strict=True):
+                dr.set_grad(x, v)
+            color = layout.sh_color(basis, lambda k, c: moved[3 * k + c])
+            dr.forward_to(color)
+            return [dr.grad(x) for x in color] + speed.get("features", [])
+
+
+def _along(slopes, record, lane):
+    """A gradient times a tangent."""
+    of_record, of_lane = slopes
+    return sum(x * record[k] for k, x in of_record.items()) + sum(x * v for x, v in zip(of_lane, lane, strict=True))
