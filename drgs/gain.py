@@ -1,0 +1,395 @@
+"""What a view would add to what is known: information gain from Fisher information.
+
+Symbols: H Fisher information of the training views, Hc of a candidate (sums of squared derivatives of the image, unit
+noise on every channel), l the prior's precision lambda, in the inverse squared unit of its parameter. An Information is
+a dict group -> tensor with one entry a parameter, as `drgs.fisher.diagonal` returns it. docs/information.md says what
+the criteria mean, where they come from and where they differ from what others publish under the same names.
+
+References:
+    [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771: `eig`, section 3.3.
+    [2] Jiang et al., FisherRF, ECCV 2024: `eig` of a diagonal, lambda = 1e-6.
+    [3] Wilson et al., POp-GS, CVPR 2025: `logdet` ("D-opt"), `trace_cov` ("T-opt"), one block a Gaussian.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+
+import torch
+
+__all__ = [
+    "BLOCK_LAYOUT",
+    "CRITERIA",
+    "Chain",
+    "Gain",
+    "Information",
+    "Prior",
+    "block_gain",
+    "check",
+    "dense",
+    "information_gain",
+    "scorer",
+    "variances",
+]
+
+Information = Mapping[str, torch.Tensor]
+
+CRITERIA = ("logdet", "eig", "trace_cov", "block_logdet")
+
+BLOCK_LAYOUT = {
+    "means": slice(0, 3),
+    "rotations": slice(3, 6),
+    "log_scales": slice(6, 9),
+    "logit_opacities": slice(9, 10),
+    "sh": slice(10, 13),
+}
+"""Places of the groups in a block of `drgs.fisher.blocks`; of `sh` it holds the base color."""
+
+BLOCKS = "blocks"
+"""Name under which blocks (N, 13, 13) travel as an Information."""
+
+_ROUNDING = 1e-7  # relative to the diagonal: what a float32 sum leaves of an eigenvalue that is 0
+_SINGULAR = 1e-13  # of a column's length: what float64 leaves of a column that depends on the others
+
+
+@dataclasses.dataclass(frozen=True)
+class Prior:
+    """lambda: how precisely each parameter is known before any view, added to H once.
+
+    Attributes:
+        value: lambda of every group, >= 0. With 0, parameters that no training view sees are left out of every score.
+        relative: Multiply lambda by the median of the group's positive entries of H, which makes `eig` and `logdet`
+            independent of the group's unit. A group that no view sees has no median: its lambda is 0.
+        groups: Group -> lambda in place of `value`.
+    Raises:
+        ValueError: If a lambda is negative, infinite or NaN.
+    """
+
+    value: float = 1e-6
+    relative: bool = False
+    groups: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        for name, value in (("value", self.value), *self.groups.items()):
+            if not (isinstance(value, (int, float)) and 0 <= value < math.inf):
+                raise ValueError(f"Prior: lambda ({name}) must be in [0, inf), got {value!r}; try 1e-6")
+
+    def per_group(self, train: Information) -> dict[str, float]:
+        """lambda of every group of H.
+
+        Raises:
+            ValueError: If `groups` names one that H does not have.
+        """
+        for name in self.groups:
+            if name not in train:
+                raise ValueError(f"Prior: groups must be among {', '.join(train)}, got {name!r}; correct or drop it")
+        values = {name: float(self.groups.get(name, self.value)) for name in train}
+        if self.relative:
+            for name, H in train.items():
+                positive = H[H > 0]
+                values[name] *= float(positive.median()) if positive.numel() else 0.0
+        return values
+
+
+@dataclasses.dataclass(frozen=True)
+class Gain:
+    """The score of a candidate, in nats for `logdet` (twice the mutual information of independent parameters).
+
+    Attributes:
+        total: Sum of the parts.
+        parts: Group -> its share, weight included.
+        left_out: Group -> number of parameters that were not counted: lambda = 0 and H = 0.
+        unseen: Group -> the share of its part that comes from parameters with H = 0, which lambda alone decides.
+        repaired: Blocks that rounding had made indefinite (`block_gain` only).
+    """
+
+    total: float
+    parts: dict[str, float]
+    left_out: dict[str, int]
+    unseen: dict[str, float] = dataclasses.field(default_factory=dict)
+    repaired: int = 0
+
+
+def information_gain(
+    candidate: Information,
+    train: Information,
+    criterion: str = "logdet",
+    prior: Prior | None = None,
+    weights: Mapping[str, float] | None = None,
+) -> Gain:
+    """How much a candidate view adds to the training views, parameters taken as independent.
+
+    `eig` = sum Hc / (H + l), `logdet` = sum log(1 + Hc / (H + l)), `trace_cov` = sum 1 / (H + l) - 1 / (H + Hc + l).
+    Features count once: all D channels have the same information, which divides out of the mean over them.
+
+    Args:
+        candidate, train: Same groups and shapes, entries >= 0.
+        criterion: One of `CRITERIA`; `block_logdet` takes {"blocks": (N, 13, 13)}, see `block_gain`.
+        prior: Default `Prior()`, lambda = 1e-6 everywhere.
+        weights: Group -> factor >= 0, default 1. `trace_cov` adds variances of different units unless they say how.
+    Raises:
+        ValueError: If groups, shapes, criterion or weights are wrong, or an entry is negative, NaN or infinite.
+    """
+    check("information_gain: train", train, criterion)
+    check("information_gain: candidate", candidate, criterion)
+    return scorer(train, criterion, prior, weights)(candidate)
+
+
+def scorer(
+    train: Information,
+    criterion: str = "logdet",
+    prior: Prior | None = None,
+    weights: Mapping[str, float] | None = None,
+) -> Callable[[Information], Gain]:
+    """`information_gain` against a fixed H: what does not depend on the candidate is done once.
+
+    Neither H nor candidates are searched for NaN here, see `check`; a score that is not finite raises all the same.
+    """
+    if criterion not in CRITERIA:
+        raise ValueError(f"information_gain: criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}")
+    prior = prior or Prior()
+    if criterion == "block_logdet":
+        if weights:
+            raise ValueError(
+                f"information_gain: weights must be None for block_logdet, got {dict(weights)}; a block has no parts"
+            )
+        return _Blocks(train[BLOCKS], prior, BLOCK_LAYOUT)
+    return _Diagonal(train, criterion, prior, dict(weights or {}))
+
+
+def variances(train: Information, prior: Prior | None = None) -> dict[str, torch.Tensor]:
+    """1 / (H + l) a parameter, 0 where both are 0: what `drgs.fisher.variance_map` weighs a pixel's derivatives by.
+
+    Raises:
+        ValueError: If the prior names a group that H does not have.
+    """
+    lambdas, result = (prior or Prior()).per_group(train), {}
+    for name, H in train.items():
+        precision = H.to(torch.float64) + lambdas[name]
+        # 1 / 0 would be inf and inf * 0 NaN; a variance of 0 drops the parameter from every criterion.
+        result[name] = torch.where(precision > 0, precision.reciprocal(), 0.0)
+    return result
+
+
+def check(where: str, information: Information, criterion: str = "logdet") -> None:
+    """Raise ValueError, naming group and index, unless every entry is finite and, off blocks, >= 0."""
+    lowest = -math.inf if criterion == "block_logdet" else 0.0
+    for name, x in information.items():
+        if not x.numel():
+            continue
+        low, high = (float(v) for v in torch.aminmax(x))  # NaN comes through
+        if lowest <= low and -math.inf < low and high < math.inf:
+            continue
+        bad = ~torch.isfinite(x) | (x < lowest)
+        first = tuple(bad.nonzero()[0].tolist())
+        raise ValueError(
+            f"{where}: information must be finite{' and >= 0' if lowest == 0 else ''}, got {float(x[first]):g} in "
+            f"{name} at {first} ({int(bad.sum())} of {x.numel()} entries); check the Gaussians and the camera"
+        )
+
+
+class _Diagonal:
+    """Scores of candidates against a diagonal H."""
+
+    def __init__(self, train: Information, criterion: str, prior: Prior, weights: dict):
+        for name, weight in weights.items():
+            if name not in train:
+                raise ValueError(f"information_gain: weights must be of {', '.join(train)}, got {name!r}; drop it")
+            if not 0 <= weight < math.inf:
+                raise ValueError(f"information_gain: weight of {name} must be in [0, inf), got {weight}; correct it")
+        self.criterion, self.weights = criterion, weights
+        self.inverse = variances(train, prior)
+        self.left_out = {name: int((x == 0).sum()) for name, x in self.inverse.items()}
+        self.unseen = {name: (H.flatten() == 0).nonzero()[:, 0] for name, H in train.items()}
+
+    def __call__(self, candidate: Information) -> Gain:
+        """The gain of one candidate."""
+        if candidate.keys() != self.inverse.keys():
+            raise ValueError(
+                f"information_gain: candidate must have the groups of train, {', '.join(self.inverse)}, got "
+                f"{', '.join(candidate)}; compute both alike"
+            )
+        parts, unseen = {}, {}
+        for name, variance in self.inverse.items():
+            Hc, weight = candidate[name], float(self.weights.get(name, 1.0))
+            if Hc.shape != variance.shape:
+                raise ValueError(
+                    f"information_gain: {name} must have the shape of train, {tuple(variance.shape)}, got "
+                    f"{tuple(Hc.shape)}; use the same Gaussians for both"
+                )
+            value = Hc * variance
+            if self.criterion == "logdet":
+                value = value.log1p_()
+            elif self.criterion == "trace_cov":
+                # 1/a - 1/(a + c) = (c/a) (1/a) / (1 + c/a): no difference of nearly equal numbers.
+                value = value.div_(value + 1).mul_(variance)
+            parts[name] = weight * float(value.sum())
+            unseen[name] = weight * float(value.flatten()[self.unseen[name]].sum())
+        total = math.fsum(parts.values()) if all(map(math.isfinite, parts.values())) else math.nan
+        if not math.isfinite(total):
+            raise ValueError(
+                f"information_gain: {self.criterion} must be finite, got {parts}; H + lambda is too small for float64, "
+                "raise lambda or check the information for NaN"
+            )
+        return Gain(total, parts, dict(self.left_out), unseen)
+
+
+# -------------------------------------------------- one block a Gaussian
+
+
+def block_gain(
+    candidate: torch.Tensor,
+    train: torch.Tensor,
+    prior: Prior | None = None,
+    layout: Mapping[str, slice] | None = None,
+    rounding: float = _ROUNDING,
+) -> Gain:
+    """sum_i logdet(I + (H_i + L)^-1 Hc_i): what `logdet` becomes when the parameters of a Gaussian are not independent.
+
+    Args:
+        candidate, train: (N, B, B), symmetric up to rounding, from `drgs.fisher.blocks`.
+        prior: lambda per group of `layout`, on the diagonal.
+        layout: Group -> slice of the block, default `BLOCK_LAYOUT`.
+        rounding: H and Hc are taken as uncertain by this share of their diagonals, which is added to them: one or two
+            views leave directions without information, and there the rounding of float32 sums would decide. 0 for
+            blocks that are exact in float64.
+    Returns:
+        A `Gain` with one part, `blocks`. Parameters with lambda = 0 and H = 0 are left out; other singular directions
+        get the gain that `rounding` allows.
+    Raises:
+        ValueError: If shapes are wrong, a value is not finite, or a block is not positive (semi)definite.
+    """
+    for where, x in (("train", train), ("candidate", candidate)):
+        check(f"block_gain: {where}", {BLOCKS: x}, "block_logdet")
+    return _Blocks(train, prior or Prior(), layout or BLOCK_LAYOUT, rounding)({BLOCKS: candidate})
+
+
+class _Blocks:
+    """Scores of candidates against one block a Gaussian."""
+
+    def __init__(self, train: torch.Tensor, prior: Prior, layout: Mapping[str, slice], rounding: float = _ROUNDING):
+        if train.ndim != 3 or train.shape[1] != train.shape[2]:
+            raise ValueError(
+                f"block_gain: train must have shape (N, B, B), got {tuple(train.shape)}; use fisher.blocks"
+            )
+        if sorted(k for x in layout.values() for k in range(*x.indices(1 << 30))) != list(range(train.shape[1])):
+            raise ValueError(
+                f"block_gain: layout must cover 0..{train.shape[1] - 1} once, got {dict(layout)}; correct it"
+            )
+        self.rounding, self.H = rounding, train.to(torch.float64)
+        diagonal = self.H.diagonal(dim1=1, dim2=2)
+        lambdas = prior.per_group({name: diagonal[:, place] for name, place in layout.items()})
+        self.added = torch.empty(train.shape[1], dtype=torch.float64)
+        for name, place in layout.items():
+            self.added[place] = lambdas[name]
+        self.keep = diagonal + self.added > 0
+        self.left_out = {name: int((~self.keep[:, place]).sum()) for name, place in layout.items()}
+        self.before, self.repaired = self._logdet(self.H)
+
+    def _logdet(self, H: torch.Tensor) -> tuple[torch.Tensor, int]:
+        """(N,) log determinants of H + L without what is left out, and how many blocks needed help."""
+        diagonal = H.diagonal(dim1=1, dim2=2) * (1 + self.rounding) + self.added
+        scale = torch.where(self.keep, diagonal.rsqrt(), 0.0)
+        # Units differ by many powers of ten; with 1 on the diagonal Cholesky loses none of the small ones.
+        A = scale[:, :, None] * (0.5 * (H + H.mT)) * scale[:, None, :]
+        A.diagonal(dim1=1, dim2=2).fill_(1.0)
+        factor, failed = torch.linalg.cholesky_ex(A)
+        bad = failed.nonzero()[:, 0]
+        repaired, ridge = len(bad), _ROUNDING
+        while len(bad):
+            if ridge > 1e-2:
+                raise ValueError(
+                    f"block_gain: H + lambda must be positive definite, but is not for Gaussian {int(bad[0])}; "
+                    "raise lambda or pass blocks that are sums of outer products"
+                )
+            again = A[bad]
+            again.diagonal(dim1=1, dim2=2).add_(ridge)
+            factor[bad], failed = torch.linalg.cholesky_ex(again)
+            bad, ridge = bad[failed > 0], 10 * ridge
+        logs = 2 * factor.diagonal(dim1=1, dim2=2).log() + torch.where(self.keep, diagonal, 1.0).log()
+        return logs.sum(1), repaired
+
+    def __call__(self, candidate: Information) -> Gain:
+        """The gain of one candidate."""
+        Hc = candidate[BLOCKS]
+        if Hc.shape != self.H.shape:
+            raise ValueError(
+                f"block_gain: candidate must have the shape of train, {tuple(self.H.shape)}, got {tuple(Hc.shape)}; "
+                "use the same Gaussians for both"
+            )
+        after, repaired = self._logdet(self.H + Hc)
+        gains = after - self.before
+        total, unseen = float(gains.sum()), float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())
+        return Gain(total, {BLOCKS: total}, dict(self.left_out), {BLOCKS: unseen}, self.repaired + repaired)
+
+
+# -------------------------------------------------- everything, on scenes where it fits
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """From the exact expected information gain of a linear model to what is computed on real scenes, all in nats.
+
+    Attributes:
+        mutual_information: 0.5 logdet(I + R^-T Hc R^-1), R^T R = H + L, full matrices.
+        trace_bound: 0.5 tr((H + L)^-1 Hc) >= mutual_information.
+        block_logdet: 0.5 sum_b logdet(I + (H_b + L_b)^-1 Hc_b) over the diagonal blocks, None without labels.
+        logdet, eig: 0.5 times the criteria of the diagonals. Neither bounds the two above.
+        left_out: Parameters with lambda = 0 that no training row moves.
+    """
+
+    mutual_information: float
+    trace_bound: float
+    block_logdet: float | None
+    logdet: float
+    eig: float
+    left_out: int
+
+
+def dense(candidate: torch.Tensor, train: torch.Tensor, prior, labels: torch.Tensor | None = None) -> Chain:
+    """The chain of [1], section 3.3, from whole Jacobians: P up to a few thousand.
+
+    Args:
+        candidate, train: (M, P) and (M', P) Jacobians, one row a pixel and channel.
+        prior: lambda, a number or (P,).
+        labels: (P,) integers, the block each parameter belongs to.
+    Raises:
+        ValueError: If a shape is wrong, or H + lambda is singular after leaving out what no row moves.
+    """
+    Jc, J = candidate.to(torch.float64), train.to(torch.float64)
+    if Jc.ndim != 2 or J.ndim != 2 or Jc.shape[1] != J.shape[1]:
+        raise ValueError(
+            f"dense: candidate and train must be (M, P) and (M', P), got {tuple(Jc.shape)} and {tuple(J.shape)}; "
+            "one column a parameter"
+        )
+    added = torch.as_tensor(prior, dtype=torch.float64).expand(J.shape[1])
+    keep = (J != 0).any(0) | (added > 0)
+    Jc, J, added = Jc[:, keep], J[:, keep], added[keep]
+    # R from the rows themselves: H = J^T J would square the condition number.
+    rows = torch.cat([J, added.sqrt().diag()])
+    length = rows.norm(dim=0)
+    R = torch.linalg.qr(rows / length, mode="r")[1]
+    if len(R) and not bool((R.diagonal().abs() > _SINGULAR).all()):
+        raise ValueError(
+            "dense: H + lambda must be positive definite, got parameters that training rows cannot tell apart; "
+            "use lambda > 0"
+        )
+    whitened = torch.linalg.solve_triangular(R, Jc / length, upper=True, left=False)
+    spectrum = torch.linalg.svdvals(whitened).square()
+    H, Hc = J.square().sum(0) + added, Jc.square().sum(0)
+    ratio, blocks = Hc / H, None
+    if labels is not None:
+        labels, blocks = torch.as_tensor(labels)[keep], 0.0
+        for label in labels.unique():
+            one = labels == label
+            blocks += dense(Jc[:, one], J[:, one], added[one]).mutual_information
+    return Chain(
+        mutual_information=0.5 * float(spectrum.log1p().sum()),
+        trace_bound=0.5 * float(spectrum.sum()),
+        block_logdet=blocks,
+        logdet=0.5 * float(ratio.log1p().sum()),
+        eig=0.5 * float(ratio.sum()),
+        left_out=int((~keep).sum()),
+    )
