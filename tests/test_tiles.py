@@ -11,7 +11,7 @@ import torch
 from scenes_random import around_camera, camera, gaussians
 
 from drgs import reference, runtime
-from drgs.integrator import _Scene, _tensor, render
+from drgs.integrator import Scene, render, to_drjit
 from drgs.settings import RenderSettings
 
 runtime.backend()
@@ -23,9 +23,9 @@ from drgs.tiles import TILE, build  # noqa: E402
 
 def _scene(g, cam, settings):
     """The `Projected` and the `Lists` of a view."""
-    scene = _Scene(g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings, frozenset())
+    scene = Scene(g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings, frozenset())
     t = runtime.dr_types()
-    view, (_, record, *_) = scene.prepare({n: _tensor(t, x) for n, x in scene.inputs.items()})
+    view, (_, record, *_) = scene.prepare({n: to_drjit(t, x) for n, x in scene.inputs.items()})
     lists = build(t, view.projected, settings, cam.width, cam.height, _pack(t, record))
     dr.eval(lists.index, lists.start, lists.end)
     return view.projected, lists
