@@ -51,6 +51,7 @@ BLOCKS = "blocks"
 """Name under which blocks (N, 13, 13) travel as an Information."""
 
 _ROUNDING = 1e-7  # relative to the diagonal: what a float32 sum leaves of an eigenvalue that is 0
+_CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is twice as fast
 _SINGULAR = 1e-13  # of a column's length: what float64 leaves of a column that depends on the others
 
 
@@ -202,7 +203,7 @@ class _Diagonal:
         self.criterion, self.weights = criterion, weights
         self.inverse = variances(train, prior)
         self.left_out = {name: int((x == 0).sum()) for name, x in self.inverse.items()}
-        self.unseen = {name: (H.flatten() == 0).nonzero()[:, 0] for name, H in train.items()}
+        self.unseen = {name: (H == 0).to(torch.float64) for name, H in train.items()}
 
     def __call__(self, candidate: Information) -> Gain:
         """The gain of one candidate."""
@@ -219,14 +220,12 @@ class _Diagonal:
                     f"information_gain: {name} must have the shape of train, {tuple(variance.shape)}, got "
                     f"{tuple(Hc.shape)}; use the same Gaussians for both"
                 )
-            value = Hc * variance
-            if self.criterion == "logdet":
-                value = value.log1p_()
-            elif self.criterion == "trace_cov":
-                # 1/a - 1/(a + c) = (c/a) (1/a) / (1 + c/a): no difference of nearly equal numbers.
-                value = value.div_(value + 1).mul_(variance)
-            parts[name] = weight * float(value.sum())
-            unseen[name] = weight * float(value.flatten()[self.unseen[name]].sum())
+            sums = [0.0, 0.0]
+            for one in zip(*(x.flatten().split(_CHUNK) for x in (Hc, variance, self.unseen[name])), strict=True):
+                value = self._values(*one[:2])
+                sums[0] += float(value.sum())
+                sums[1] += float(value @ one[2])
+            parts[name], unseen[name] = weight * sums[0], weight * sums[1]
         total = math.fsum(parts.values()) if all(map(math.isfinite, parts.values())) else math.nan
         if not math.isfinite(total):
             raise ValueError(
@@ -234,6 +233,16 @@ class _Diagonal:
                 "raise lambda or check the information for NaN"
             )
         return Gain(total, parts, dict(self.left_out), unseen)
+
+    def _values(self, Hc: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+        """The criterion's terms, float64, whatever Hc is."""
+        ratio = Hc.to(torch.float64, copy=True).mul_(variance)
+        if self.criterion == "logdet":
+            return ratio.log1p_()
+        if self.criterion == "trace_cov":
+            # 1/a - 1/(a + c) = (1/a) / (1 + a/c): no difference of nearly equal numbers; c = 0 gives 1 / inf.
+            return ratio.reciprocal_().add_(1).reciprocal_().mul_(variance)
+        return ratio
 
 
 # -------------------------------------------------- one block a Gaussian
