@@ -17,7 +17,7 @@ from __future__ import annotations
 import drjit as dr
 
 from drgs import projection as layout
-from drgs.kernels import load_packed, pack, packed_size
+from drgs.kernels import if_any_hit, load_packed, pack, packed_size
 from drgs.projection import _cross, _dot
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
@@ -174,40 +174,39 @@ class Rows:
 
     def shade(self, index, rays, states, places, active):
         """One hit of each of `rays`."""
-        m, t, out, rows = self.m, self.m.t, [], []
+        return if_any_hit(self.m, self.source, index, rays, states, places, active, self._take)
+
+    def _take(self, index, rays, states, places, active):
+        m, t, rows, out = self.m, self.m.t, [], []
         D = t.Float64
         going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
-        record = self.source.load(t, index, rays[0], going)["record"]
+        record = self.source.load(t, index, rays[0], going, only="record")["record"]
         extra = self.geometry.load(index, going) if self.geometry else None
         first = layout.W_RGB if m.world else layout.RGB
-        color = record[first : first + 3]
-        hits = t.Bool(False)
+        color, hits = record[first : first + 3], t.Bool(False)
         for ray, st, final, place in zip(rays, states, self.finals, places, strict=True):
             a, _, ok = m.hit(record, ray, active & (st["alive"] != 0))
-            T, left = st["T"], 1 - a
-            w, rest = dr.select(ok, T * a, 0), st["rest"]
+            T, left, new, at_end = st["T"], 1 - a, dict(st), ok
+            w = dr.select(ok, T * a, 0)
+            new["T"] = dr.select(ok, T * left, T)
+            for p, q in zip(place, final["place"], strict=True):
+                at_end = at_end & (p == q)
+            new["alive"] = dr.select(at_end, 0, st["alive"])
             slopes = g = turned = None
             if self.geometry:
-                rest = [r - D(w) * D(c) for r, c in zip(rest, color, strict=True)]
+                rest = [r - D(w) * D(c) for r, c in zip(st["rest"], color, strict=True)]
+                new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
                 share = dr.select(left > 0, dr.rcp(dr.select(left > 0, left, 1)), 0)
                 g = [dr.select(ok, dr.fma(T, c, -t.Float(r) * share), 0) for c, r in zip(color, rest, strict=True)]
                 moves = ok
                 if m.s.alpha_max < 1 and m.s.alpha_max_gradient != "pass":
-                    moves &= a < m.alpha_max
+                    moves = ok & (a < m.alpha_max)
                 # Far from the ellipsoid 0 times infinity is possible.
                 slopes = [dr.select(moves, x, 0) for x in self.geometry.slopes(record, extra, ray)]
                 if self.color:
                     turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
             rows.append((slopes, g, w, turned))
             hits |= ok
-            new = dict(st)
-            new["T"] = dr.select(ok, T * left, T)
-            if self.geometry:
-                new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
-            at_end = ok
-            for p, q in zip(place, final["place"], strict=True):
-                at_end &= p == q
-            new["alive"] = dr.select(at_end, 0, st["alive"])
             out.append(new)
         return self.sink.take(t, index, hits, rows, out)
 

@@ -23,7 +23,18 @@ import drjit as dr
 from drgs import projection as layout
 from drgs.projection import RECORD
 
-__all__ = ["Adjoint", "Model", "Primal", "Ray", "Source", "Tangent", "load_packed", "pack", "packed_size"]
+__all__ = [
+    "Adjoint",
+    "Model",
+    "Primal",
+    "Ray",
+    "Source",
+    "Tangent",
+    "if_any_hit",
+    "load_packed",
+    "pack",
+    "packed_size",
+]
 
 
 @dataclasses.dataclass
@@ -159,11 +170,11 @@ class Source:
             table["features"] = (self.width, self.first, self.channels)
         return table
 
-    def load(self, t, index, ray, active, buffers=None) -> dict:
-        """What a hit of Gaussian `index` reads, name -> list of floats."""
+    def load(self, t, index, ray, active, buffers=None, only=None) -> dict:
+        """What a hit of Gaussian `index` reads, name -> list of floats; from other buffers, or `only` of one name."""
         buffers, loaded = buffers or self.buffers, {}
         for name, (stride, offset, count) in self.layout(ray).items():
-            if name not in buffers:
+            if name not in buffers or (only and name != only):
                 continue
             if name == "record":
                 packet = dr.gather(t.ArrayXf, buffers[name], index, active, shape=(RECORD, dr.width(index)))
@@ -278,6 +289,25 @@ def _add(w, value, total):
     return dr.fma(Sum(w), Sum(value), total)
 
 
+def if_any_hit(model, source, index, rays, states, places, active, take):
+    """`take(index, rays, states, places, active)` where a ray of the packet meets the Gaussian, else the same states.
+
+    Most Gaussians of a tile's list miss most packets of its rays, and the branch is cheaper than what it skips.
+    """
+    t = model.t
+    going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
+    record = source.load(t, index, rays[0], going, only="record")["record"]
+    hits = t.Bool(False)
+    for ray, st in zip(rays, states, strict=True):
+        hits |= model.hit(record, ray, active & (st["alive"] != 0))[2]
+    return dr.if_stmt(
+        (states, index, rays, places, active),
+        hits,
+        lambda states, index, rays, places, active: take(index, rays, states, places, active),
+        lambda states, *_: states,
+    )
+
+
 class Adjoint:
     """Replay of a primal pass that scatters the gradient of what every hit reads.
 
@@ -314,6 +344,9 @@ class Adjoint:
 
     def shade(self, index, rays, states, places, active):
         """Back-propagate through Gaussian `index` what the primal pass composited of it."""
+        return if_any_hit(self.m, self.source, index, rays, states, places, active, self._take)
+
+    def _take(self, index, rays, states, places, active):
         m, t, out = self.m, self.m.t, []
         D = t.Float64
         going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
@@ -348,7 +381,7 @@ class Adjoint:
                 # The last composited hit ends the ray, whatever rule ended the primal pass.
                 at_end = ok
                 for p, q in zip(place, final["place"], strict=True):
-                    at_end &= p == q
+                    at_end = at_end & (p == q)
                 new["alive"] = dr.select(at_end, 0, st["alive"])
                 out.append(new)
             dr.backward_from(total)

@@ -252,7 +252,7 @@ def tile_part(t, model, records, lists: Lists, settings, width: int, height: int
     ]
     some = inside[0]
     for other in inside[1:]:
-        some |= other
+        some = some | other
 
     def stream_of(lanes):
         if lanes is None:
