@@ -22,6 +22,8 @@ def load(
     *,
     test_every: int = 8,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    lazy: bool = False,
+    points: bool = True,
 ) -> Dataset:
     """Load a data set; its format is found out from its files. No image is decoded.
 
@@ -34,6 +36,11 @@ def load(
         path: folder or file.
         test_every: every how many views `Dataset.split` holds one out; 0 for none.
         background: color in [0,1] that images with an alpha channel are composited on.
+        lazy: open no image, mask or depth file at all: cameras have the size that the camera file states, until
+            `View.checked` compares it with the image. Where intrinsics are angles and no size is stated (Blender), all
+            views get the size of the first training image, the only one opened.
+        points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
+            from all its images.
 
     Raises:
         FileNotFoundError: nothing there, or photos without poses.
@@ -54,7 +61,7 @@ def load(
         loader = load_llff
     else:
         raise _nothing_found(path)
-    dataset = loader(path, background=background)
+    dataset = loader(path, background=background, test_every=test_every, lazy=lazy, points=points)
     dataset.test_every = test_every
     dataset.split()  # refuses a test_every that cannot be
     return dataset

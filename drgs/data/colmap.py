@@ -5,6 +5,7 @@ been checked.
 from __future__ import annotations
 
 import struct
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +36,20 @@ def find_model(path: Path) -> Path | None:
     return None
 
 
-def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
+def load_colmap(
+    path: Path,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    lazy: bool = False,
+    points: bool = True,
+    **_,
+) -> Dataset:
     """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a
     folder).
 
     Args:
         path: the data set, or the model's own folder.
         background: color that images with alpha are composited on.
+        lazy, points: open no image, read no points and observations, see `drgs.data.load`.
 
     Raises:
         FileNotFoundError: no model, no ``images`` folder, or an image that the model lists is
@@ -55,7 +63,7 @@ def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 
             f"{', '.join(MODEL_FOLDERS)}; "
             "run `drgs sfm`"
         )
-    reconstruction = _read(model)
+    reconstruction = _read(model, points)
     folder = _image_folder(path, model)
     views = []
     # By name: COLMAP numbers images in the order in which its threads finish them.
@@ -74,21 +82,22 @@ def load_colmap(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 
         camera = _camera(reconstruction.cameras[image.camera_id], w2c, image.name, where)
         views.append(
             View(
-                camera=fit_to_image(camera, folder / image.name, where),
+                camera=fit_to_image(camera, folder / image.name, where, lazy),
                 name=str(Path(image.name).with_suffix("")),
                 image_path=folder / image.name,
                 mask_path=_mask(folder, image.name),
                 background=background,
+                is_checked=not lazy,
             )
         )
-    points, colors = _points(reconstruction, model)
-    source = f"COLMAP model {model.name}, {len(points)} points" if len(points) else ""
+    xyz, colors = _points(reconstruction, model)
+    source = f"COLMAP model {model.name}, {len(xyz)} points" if len(xyz) else ""
     return Dataset(
         path=path,
         format="colmap",
         views=views,
-        points=points if len(points) else None,
-        colors=colors if len(points) else None,
+        points=xyz if len(xyz) else None,
+        colors=colors if len(xyz) else None,
         point_source=source,
     )
 
@@ -159,25 +168,41 @@ def _points(reconstruction: object, model: Path) -> tuple[np.ndarray, np.ndarray
 # pycolmap reads
 
 
-def _read(model: Path) -> object:
+def _read(model: Path, points: bool = True) -> object:
     """The reconstruction; every file is walked first, so that pycolmap meets no size that the file
-    does not hold.
+    does not hold. Without `points`, points3D is not opened and observations are skipped.
     """
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name in _REQUIRED:
         if not (model / f"{name}{suffix}").is_file():
             raise FileNotFoundError(f"{model}: must hold {name}{suffix}, found none; copy the whole model")
     check = _check_binary if suffix == ".bin" else _check_text
-    for name in (*_REQUIRED, "rigs", "frames"):
-        if (model / f"{name}{suffix}").is_file():
-            check(model / f"{name}{suffix}", name)
+    read = [name for name in (*_REQUIRED, "rigs", "frames") if points or name != "points3D"]
+    read = [name for name in read if (model / f"{name}{suffix}").is_file()]
+    for name in read:
+        check(model / f"{name}{suffix}", name)
+    if points:
+        return _reconstruction(model, model, suffix)
+    with tempfile.TemporaryDirectory(prefix="drgs-poses-") as folder:
+        for name in read:
+            file = model / f"{name}{suffix}"
+            data = file.read_bytes()
+            if name == "images":
+                data = _without_observations(file, data) if suffix == ".bin" else _poses_only(data)
+            (Path(folder) / file.name).write_bytes(data)
+        (Path(folder) / f"points3D{suffix}").write_bytes(_COUNT.pack(0) if suffix == ".bin" else b"")
+        return _reconstruction(Path(folder), model, suffix)
+
+
+def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
+    """What pycolmap reads in a folder; errors name the model."""
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3
     try:
-        read(str(model))
+        read(str(folder))
     except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
         text = str(error).strip().splitlines()
         raise ValueError(
@@ -193,8 +218,8 @@ def _read(model: Path) -> object:
 class _Walk:
     """A cursor over a binary file that never passes its end."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+    def __init__(self, path: Path, data: bytes | None = None) -> None:
+        self.path, self.data, self.at = path, path.read_bytes() if data is None else data, 0
 
     def need(self, size: int, what: str) -> None:
         if self.at + size > len(self.data):
@@ -258,6 +283,32 @@ def _check_binary(path: Path, kind: str) -> None:
         else:
             entries = walk.take(_FRAME, what)[-1]
             walk.skip(16 * entries, f"the {entries} entries of {what}")
+
+
+def _without_observations(path: Path, data: bytes) -> bytes:
+    """images.bin, already checked, with no observation in any image."""
+    walk = _Walk(path, data)
+    (count,) = walk.take(_COUNT, "a count")
+    kept = [_COUNT.pack(count)]
+    for _ in range(count):
+        start = walk.at
+        walk.take(_IMAGE, "an image")
+        walk.name("a name")
+        kept += [data[start : walk.at], _COUNT.pack(0)]
+        (observations,) = walk.take(_COUNT, "a count")
+        walk.skip(24 * observations, "observations")
+    return b"".join(kept)
+
+
+def _poses_only(data: bytes) -> bytes:
+    """images.txt, already checked, with an empty line for the observations of every image."""
+    kept, wants_pose = [], True
+    for line in data.splitlines():
+        if line.lstrip().startswith(b"#") or (wants_pose and not line.strip()):
+            continue
+        kept.append(line if wants_pose else b"")
+        wants_pose = not wants_pose
+    return b"\n".join([*kept, b""]) + b"\n"
 
 
 def _parameter_count(path: Path, number: int) -> int:

@@ -15,13 +15,14 @@ from drgs.data.views import Dataset, View, fit_to_image
 __all__ = ["load_llff"]
 
 
-def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
+def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), lazy: bool = False, **_) -> Dataset:
     """Load an LLFF data set: (N,17) rows of a 3x5 matrix [pose | height, width, focal] and two
     depth bounds.
 
     Args:
         path: the folder, or the ``.npy`` file.
         background: color that images with alpha are composited on.
+        lazy: open no image, see `drgs.data.load`.
 
     Raises:
         FileNotFoundError: no such file, or no ``images``.
@@ -57,10 +58,11 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
             raise ValueError(f"{where}: {error}") from None
         views.append(
             View(
-                fit_to_image(camera, image, where),
+                fit_to_image(camera, image, where, lazy),
                 name=image.stem,
                 image_path=image,
                 background=background,
+                is_checked=not lazy,
             )
         )
     return Dataset(path, "llff", views)

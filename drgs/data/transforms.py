@@ -40,7 +40,13 @@ def find_transforms(path: Path) -> list[Path]:
     return [file for split in _SPLITS if (file := path / f"transforms_{split}.json").is_file()]
 
 
-def load_transforms(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Dataset:
+def load_transforms(
+    path: Path,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    test_every: int = 8,
+    lazy: bool = False,
+    points: bool = True,
+) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 
     Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x;
@@ -52,6 +58,7 @@ def load_transforms(path: Path, background: tuple[float, float, float] = (0.0, 0
     Args:
         path: the folder, or one JSON file.
         background: color that images with alpha are composited on.
+        test_every, lazy, points: see `drgs.data.load`.
 
     Raises:
         FileNotFoundError: no such file, or an image, mask or depth map that it names is missing.
@@ -63,25 +70,19 @@ def load_transforms(path: Path, background: tuple[float, float, float] = (0.0, 0
             f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
         )
     views: list[View] = []
-    points = colors = None
+    xyz = colors = None
     source = ""
-    for file in files:
-        data = read_json(file)
-        frames = data.get("frames") if isinstance(data, dict) else None
-        if not isinstance(frames, list) or not frames:
-            raise ValueError(f"{file}: must be an object with a list `frames` of at least one frame; check the file")
-        named = _named_splits(data)
+    read = {file: _frames(file) for file in files}
+    first = _FirstImage(path, read, test_every) if lazy else None
+    for file, data in read.items():
         sizes: dict[tuple[int, int], int] = {}
-        for index, frame in enumerate(frames):
+        splits = _splits(file, data)
+        for index, frame in enumerate(data["frames"]):
             where = f"{file}: frame {index}"
-            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-                raise ValueError(f"{where}: must be an object with a file_path, got none; add it")
-            view, own = _view(file.parent, where, data, frame, background)
+            view, own = _view(file.parent, where, data, frame, background, first)
             if not own:
                 sizes.setdefault((view.camera.width, view.camera.height), index)
-            view.split = named.get(frame["file_path"], file.stem.removeprefix("transforms").lstrip("_"))
-            if view.split not in _SPLITS:
-                view.split = ""
+            view.split = splits[index]
             views.append(view)
         if len(sizes) > 1:
             (first, i), (second, j) = list(sizes.items())[:2]
@@ -90,18 +91,64 @@ def load_transforms(path: Path, background: tuple[float, float, float] = (0.0, 0
                 f"{first[0]}x{first[1]} at frame {i} and {second[0]}x{second[1]} at frame {j}; "
                 "write fl_x, w, h a frame"
             )
-        if points is None and isinstance(data.get("ply_file_path"), str):
+        if points and xyz is None and isinstance(data.get("ply_file_path"), str):
             ply = file.parent / data["ply_file_path"]
-            points, colors = read_point_ply(ply)
-            source = f"{ply.name}, {len(points)} points"
+            xyz, colors = read_point_ply(ply)
+            source = f"{ply.name}, {len(xyz)} points"
     _make_unique(views)
-    return Dataset(path, "transforms", views, points, colors, source)
+    return Dataset(path, "transforms", views, xyz, colors, source)
+
+
+def _frames(file: Path) -> dict:
+    """A transforms file, known to have frames with file paths."""
+    data = read_json(file)
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise ValueError(f"{file}: must be an object with a list `frames` of at least one frame; check the file")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise ValueError(f"{file}: frame {index}: must be an object with a file_path, got none; add it")
+    return data
+
+
+def _splits(file: Path, data: dict) -> list[str]:
+    """The split of every frame, empty where the files do not say."""
+    named = _named_splits(data)
+    default = file.stem.removeprefix("transforms").lstrip("_")
+    splits = [named.get(frame["file_path"], default) for frame in data["frames"]]
+    return [split if split in _SPLITS else "" for split in splits]
+
+
+class _FirstImage:
+    """Size of the first training image, read when it is first asked for."""
+
+    def __init__(self, path: Path, read: dict[Path, dict], test_every: int) -> None:
+        self.path, self.read, self.test_every, self._size = path, read, test_every, None
+
+    def size(self) -> tuple[int, int]:
+        if self._size is None:
+            views = []
+            for file, data in self.read.items():
+                for frame, split in zip(data["frames"], _splits(file, data), strict=True):
+                    image = _image_file(file.parent, frame["file_path"])
+                    views.append(View(None, _view_name(frame["file_path"]), image_path=image, split=split))
+            _make_unique(views)
+            train = Dataset(self.path, "transforms", views, test_every=self.test_every).split()[0]
+            if not train or train[0].image_path is None:
+                raise FileNotFoundError(f"{self.path}: the first training image must exist, found none; restore it")
+            self._size = image_size(train[0].image_path)
+        return self._size
 
 
 def _view(
-    folder: Path, where: str, data: dict, frame: dict, background: tuple[float, float, float]
+    folder: Path,
+    where: str,
+    data: dict,
+    frame: dict,
+    background: tuple[float, float, float],
+    first: _FirstImage | None,
 ) -> tuple[View, bool]:
-    """One view, and whether its frame carries its own intrinsics."""
+    """One view, and whether its frame carries its own intrinsics; `first` where no other image may be opened."""
     image = _image_file(folder, frame["file_path"])
     if image is None:
         raise FileNotFoundError(
@@ -109,30 +156,42 @@ def _view(
         )
     own = any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
     merged = {**{key: value for key, value in data.items() if key != "frames"}, **frame}
-    camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), image)
+    camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), image, first)
     depth = _optional_file(folder, where, frame, "depth_file_path")
     unit = 1.0 if depth is not None and depth.suffix == ".npy" else _MILLIMETER
-    name = Path(frame["file_path"])
-    if name.suffix.lower() in IMAGE_SUFFIXES:
-        name = name.with_suffix("")
-    parts = [part for part in name.parts if part not in (".", "..", "/")]
     view = View(
-        camera=fit_to_image(camera, image, where),
-        name="/".join(parts[1:] if len(parts) > 1 and parts[0] == "images" else parts),
+        camera=fit_to_image(camera, image, where, lazy=first is not None),
+        name=_view_name(frame["file_path"]),
         image_path=image,
         mask_path=_optional_file(folder, where, frame, "mask_path"),
         depth_path=depth,
         depth_scale=_number(where, merged, "depth_unit_scale_factor", unit),
         background=background,
+        is_checked=first is None,
     )
     return view, own
 
 
-def _camera(where: str, values: dict, w2c: np.ndarray, image: Path) -> Camera:
+def _view_name(file_path: str) -> str:
+    name = Path(file_path)
+    if name.suffix.lower() in IMAGE_SUFFIXES:
+        name = name.with_suffix("")
+    parts = [part for part in name.parts if part not in (".", "..", "/")]
+    return "/".join(parts[1:] if len(parts) > 1 and parts[0] == "images" else parts)
+
+
+def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _FirstImage | None) -> Camera:
     if "w" in values and "h" in values:
         width, height = _number(where, values, "w"), _number(where, values, "h")
-    else:
+    elif first is None:
         width, height = image_size(image)
+    elif any(key in values for key in ("fl_x", "fl_y", "cx", "cy")):
+        # Lengths in pixels say nothing without the size, and looking it up would open the image.
+        raise ValueError(
+            f"{where}: must state w and h beside intrinsics in pixels where no image may be opened, got none; add them"
+        )
+    else:
+        width, height = first.size()
     if "fl_x" in values:
         fx = _number(where, values, "fl_x")
         fy = _number(where, values, "fl_y", fx)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ class View:
         depth_scale: scene units in one unit of the depth file.
         background: color in [0,1] that images with an alpha channel are composited on.
         split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
+        is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
     camera: Camera
@@ -40,6 +42,18 @@ class View:
     depth_scale: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     split: str = ""
+    is_checked: bool = True
+
+    def checked(self) -> View:
+        """The view with its camera at the size of its image file, whose header is read now if it has not been.
+
+        Raises:
+            FileNotFoundError, ValueError: as `fit_to_image`.
+        """
+        if self.is_checked or self.image_path is None:
+            return self
+        camera = fit_to_image(self.camera, self.image_path, f"view {self.name!r}")
+        return dataclasses.replace(self, camera=camera, is_checked=True)
 
     def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
         """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted,
@@ -201,10 +215,11 @@ class Dataset:
         return 0 if len(self.views) < 2 else every
 
 
-def fit_to_image(camera: Camera, path: Path, where: str) -> Camera:
+def fit_to_image(camera: Camera, path: Path, where: str, lazy: bool = False) -> Camera:
     """The camera at the size of its image file, from the file's header.
 
-    Data sets are often downscaled after calibration, so K is scaled when the shapes agree to 1 %.
+    Data sets are often downscaled after calibration, so K is scaled when the shapes agree to 1 %. With `lazy` the file
+    must exist, but is not opened, and the camera stays as it is.
 
     Raises:
         FileNotFoundError: no such image.
@@ -212,6 +227,8 @@ def fit_to_image(camera: Camera, path: Path, where: str) -> Camera:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{where}: the image {path} must exist, found none; restore it or drop the view")
+    if lazy:
+        return camera
     width, height = image_size(path)
     if (width, height) == (camera.width, camera.height):
         return camera
