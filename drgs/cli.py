@@ -24,7 +24,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
 
-__all__ = ["Demo", "Eval", "Fit", "Info", "Render", "Sfm", "main"]
+__all__ = ["Demo", "Eval", "Fisher", "Fit", "Info", "Render", "Select", "Sfm", "main"]
 
 _Output = Annotated[Path, arg(aliases=["-o"])]
 
@@ -75,6 +75,32 @@ class _Settings(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class _Information(_Settings):
+    """Options of commands that compute Fisher information."""
+
+    method: Literal["exact", "columns", "probes", "fisherrf"] = "exact"
+    """How the diagonal is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
+    prior: float = 1e-6
+    """lambda: prior precision of every parameter; 0 leaves out what no training view has seen."""
+    relative_prior: bool = False
+    """lambda is --prior times the median of the group's positive information."""
+    info_pixels: int | None = None
+    """Views are reduced to at most this many pixels; default as in the fit."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Policy(_Information):
+    """Options of commands that choose views."""
+
+    policy: Literal["fisher", "fisherrf", "coverage", "farthest", "uniform", "random"] = "fisher"
+    """How the next view is chosen."""
+    criterion: Literal["logdet", "eig", "trace_cov", "block_logdet"] = "logdet"
+    """Score of policy fisher."""
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(_Common):
     """Report backend, libLLVM, CUDA, threads and package versions."""
 
@@ -117,7 +143,7 @@ class Render(_Settings):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(_Settings):
+class Fit(_Policy):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
@@ -132,12 +158,11 @@ class Fit(_Settings):
     """Images are reduced to at most this many pixels."""
     max_gaussians: int = 30_000
     """Budget of the density control."""
-    init_points: Literal["auto", "views"] = "auto"
-    """Initial points: the data set's if it has any, or only what the training views show."""
+    init_points: Literal["auto", "views", "all"] = "auto"
+    """Initial points: only what the training views show (views), or the data set's if it has any (all). auto: all, with
+    --views active: views."""
     test_every: int = 8
     """Every n-th view, by name, is held out; 0 holds out none."""
-    seed: int = 0
-    """Seed of everything random."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the view-dependent color."""
     deterministic: bool = False
@@ -150,10 +175,79 @@ class Fit(_Settings):
     """Outside a mask is nothing (object; auto, if there are mask files), anything (valid), or the image (ignore)."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """RGB in [0, 1] behind everything."""
+    views: Literal["all", "active"] = "all"
+    """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
+    initial: int = 2
+    """Views at the start: the first one, then those farthest away."""
+    add: int = 10
+    """Views to be chosen, one at a time; others are not read."""
+    every: int = 200
+    """Steps between two of them."""
 
     def settings(self):
         """As for every command, with the background that the photographs are composited on."""
         return super().settings().replace(background=self.background)
+
+    def active(self):
+        """The `ActiveConfig` of --views active, else None.
+
+        Raises:
+            ValueError: If an option is out of range, or belongs to --views active and that is missing.
+        """
+        from drgs.active import ActiveConfig
+
+        fields = dataclasses.fields(ActiveConfig)
+        if self.views == "active":
+            return ActiveConfig(**{field.name: getattr(self, field.name) for field in fields})
+        for field in fields:
+            if getattr(self, field.name) != field.default:
+                option = "--" + field.name.replace("_", "-")
+                raise ValueError(f"fit: {option} must have --views active, got --views all; add it or drop {option}")
+        return None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Views(_Information):
+    """Options of commands that compare views with known ones."""
+
+    scene: Positional[Path]
+    """A run folder or a 3DGS point_cloud.ply."""
+    train: str | None = None
+    """Views that are known: a data set, a run, or a cameras.json; default the run's."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which of the other views, where they are a data set's."""
+    count: int = 40
+    """Cameras of an orbit or a dome."""
+    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
+    """World direction that is up on an orbit or a dome; auto: as the known views, else minus-y."""
+    elevation: float | None = None
+    """Degrees of an orbit above its center; default as the known views, else 20."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Select(_Policy, _Views):
+    """Rank cameras by what their views would add to a run, or to a Gaussian PLY."""
+
+    candidates: str
+    """A data set or a run (those of its views that are not known), a cameras.json, orbit, or dome."""
+    k: Annotated[int, arg(aliases=["-k"])] = 1
+    """Views to pick, each given the ones before."""
+    output: _Output = Path("selection.json")
+    """The JSON file."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fisher(_Views):
+    """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
+
+    cameras: str | None = None
+    """Views to draw maps for: a data set, a run, a cameras.json, orbit, or dome; default the known ones."""
+    output: _Output = Path("out/fisher")
+    """Folder for information.safetensors, fisher.json and the maps."""
+    limit: int = 4
+    """Maps of at most this many views, evenly spaced."""
+    pose: bool = False
+    """Also report what each of these views says about its own pose, a 6x6 matrix."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -202,6 +296,8 @@ _RUN = {
     "render": (Render, "drgs.render_command", "run"),
     "fit": (Fit, "drgs.train", "run_fit"),
     "eval": (Eval, "drgs.metrics", "run_eval"),
+    "select": (Select, "drgs.select_command", "run"),
+    "fisher": (Fisher, "drgs.fisher_command", "run"),
     "sfm": (Sfm, "drgs.sfm", "run_command"),
     "demo": (Demo, "drgs.demo", "run"),
 }

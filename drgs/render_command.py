@@ -29,7 +29,16 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
-__all__ = ["render_views", "run"]
+__all__ = [
+    "described",
+    "file_names",
+    "is_camera_list",
+    "load_scene",
+    "make_folder",
+    "render_views",
+    "run",
+    "run_background",
+]
 
 _FORMATS = ("png", "exr", "webm")
 _MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
@@ -40,16 +49,16 @@ def run(args: Render) -> None:
     settings = args.settings()
     formats = _formats(args.format)
     _check_numbers(args)
-    gaussians, folder = _load_scene(args.scene)
+    gaussians, folder = load_scene(args.scene)
     if folder is not None and not any(text.startswith("background=") for text in args.overrides):
         # A run was fitted over its background; over another one its edges show a halo.
-        settings = settings.replace(background=_run_background(folder))
+        settings = settings.replace(background=run_background(folder))
     cameras, source = _cameras(args, gaussians, folder)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
-    _make_folder(args.output)
+    make_folder(args.output)
     with Bar("render", len(cameras), not args.quiet) as bar:
         report = render_views(
             gaussians,
@@ -103,7 +112,7 @@ def render_views(
     views = []
     movie = pictures.Video(out_dir / video, fps) if "webm" in formats else None
     with movie or contextlib.nullcontext():
-        for camera, name in zip(cameras, _file_names(cameras), strict=True):
+        for camera, name in zip(cameras, file_names(cameras), strict=True):
             began = time.perf_counter()
             with torch.no_grad():
                 out = drgs.render(gaussians, camera, settings, outputs)
@@ -124,7 +133,7 @@ def render_views(
             if movie is not None:
                 movie.write(rgb)
             made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
-            views.append({"camera": _described(camera), "files": files, "seconds": seconds, **made})
+            views.append({"camera": described(camera), "files": files, "seconds": seconds, **made})
             if advance:
                 advance()
     times = [view["seconds"] for view in views]
@@ -169,7 +178,7 @@ def _check_numbers(args: Render) -> None:
         raise ValueError(f"render: --elevation must be in [-89, 89] degrees, got {args.elevation}")
 
 
-def _load_scene(path: Path) -> tuple[Gaussians, Run | None]:
+def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
     """The Gaussians, and the run that they belong to if `path` is a run folder."""
     if not path.is_dir():
         return load_ply(path), None
@@ -182,7 +191,8 @@ def _load_scene(path: Path) -> tuple[Gaussians, Run | None]:
     return load_ply(folder.point_cloud), folder
 
 
-def _run_background(folder: Run) -> tuple[float, ...]:
+def run_background(folder: Run) -> tuple[float, ...]:
+    """The RGB that a run was fitted over."""
     try:
         return tuple(folder.config()["fit"]["settings"]["background"])
     except (KeyError, TypeError):
@@ -205,7 +215,7 @@ def _cameras(args: Render, gaussians: Gaussians, folder: Run | None) -> tuple[li
             _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
         return scene_orbit(gaussians, args.frames, up=UP[up], **lens), f"orbit, up {up}"
     path = Path(args.cameras)
-    if _is_camera_list(path):
+    if is_camera_list(path):
         if args.split != "all":
             raise ValueError(f"{path}: --split {args.split} must have a data set, a cameras.json has no split")
         return load_cameras_json(path), str(path)
@@ -218,7 +228,7 @@ def _cameras(args: Render, gaussians: Gaussians, folder: Run | None) -> tuple[li
     return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{path} ({args.split})"
 
 
-def _is_camera_list(path: Path) -> bool:
+def is_camera_list(path: Path) -> bool:
     """Whether a JSON file is a list, as INRIA's cameras.json is, and not a transforms.json."""
     if path.suffix != ".json" or not path.is_file():
         return path.name == "cameras.json"
@@ -258,7 +268,7 @@ def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
 # ----------------------------------------------------------------------------------------- outputs
 
 
-def _make_folder(path: Path) -> None:
+def make_folder(path: Path) -> None:
     """The output folder, found out to be writable before anything is computed."""
     probe = path / ".drgs-probe"
     try:
@@ -270,7 +280,7 @@ def _make_folder(path: Path) -> None:
         raise ValueError(f"{path}: -o must be a folder that can be written, got: {reason}; choose another") from None
 
 
-def _file_names(cameras: list[Camera]) -> list[str]:
+def file_names(cameras: list[Camera]) -> list[str]:
     """One file name a camera: views' names may hold folders, be empty or repeat."""
     names: list[str] = []
     for index, camera in enumerate(cameras):
@@ -280,7 +290,8 @@ def _file_names(cameras: list[Camera]) -> list[str]:
     return names
 
 
-def _described(camera: Camera) -> dict:
+def described(camera: Camera) -> dict:
+    """A camera as JSON."""
     return {
         "name": camera.name,
         "width": camera.width,

@@ -21,6 +21,7 @@ import torch
 
 import drgs
 from drgs import metrics
+from drgs.active import ActiveConfig, ActiveViews
 from drgs.density import Model
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.frames import Frame, load_frames
@@ -28,7 +29,7 @@ from drgs.trainer import FitConfig, Trainer
 
 if TYPE_CHECKING:
     from drgs.cli import Fit
-    from drgs.data import Dataset
+    from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["FitConfig", "FitResult", "Trainer", "fit", "run_fit"]
@@ -61,6 +62,7 @@ def fit(
     out_dir: str | Path,
     config: FitConfig | None = None,
     *,
+    active: ActiveConfig | None = None,
     resume: bool = False,
     progress: bool = True,
 ) -> FitResult:
@@ -70,6 +72,8 @@ def fit(
         dataset: As `drgs.data.load` returns it.
         out_dir: The run folder: new, or with `resume` one that a fit of the same config has begun.
         config: What to do; the defaults if left out.
+        active: Start with a few views and choose more on the way; the data set is best loaded with `lazy=True` and
+            without points, so that nothing of views that are not chosen is read.
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, a line for each preview elsewhere.
     Raises:
@@ -84,15 +88,25 @@ def fit(
         # Atomic additions of several threads come in any order, and float additions do not commute with that.
         dr.set_thread_count(1)
     train, test = dataset.split(config.test_every)
-    frames = load_frames(train, config.max_pixels, config.mask)
-    held_out = load_frames(test, config.max_pixels, config.mask)
+    plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
-    if resume and run.state.is_file():
-        tensors, header = load_state(run.state)
+    tensors, header = load_state(run.state) if resume and run.state.is_file() else (None, None)
+    if header:
+        was, now = ("active" if x else "all" for x in (header.get("active"), plan))
+        if was != now:
+            raise ValueError(
+                f"{run.path}: --resume must continue the same fit, --views was {was!r} and is {now!r}; "
+                "repeat the options or choose another run folder"
+            )
+        if plan:
+            plan.restore(tensors, header, str(run.path))
+    frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
+    held_out = load_frames(test, config.max_pixels, config.mask)
+    if header:
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path))
         seconds, source = header["seconds"], header["point_source"]
     else:
-        trainer, source = _start(dataset, train, frames, config)
+        trainer, source = _start(dataset, plan.start_views() if plan else train, frames, config, plan is not None)
         seconds = 0.0
     recorded = {
         "command": "fit",
@@ -106,9 +120,13 @@ def fit(
         "points": source,
         "fit": config.to_json(),
     }
+    if plan:
+        recorded |= {"active": active.to_json(), "pool": [view.name for view in train], "pool_leak": plan.pool_leak}
     run.start(recorded, resume=resume)
+    if plan:
+        plan.write(run)  # forgets picks that no checkpoint knows of
     run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.model))
-    loop = _Loop(run, trainer, held_out, source, seconds)
+    loop = _Loop(run, trainer, held_out, source, seconds, plan)
     with _fewer_torch_threads(), _Progress(config.max_steps, trainer.step_index, progress) as bar:
         loop.run(bar)
     g = trainer.gaussians()
@@ -123,6 +141,7 @@ def fit(
         step=trainer.step_index,
         seconds=loop.seconds,
         bad_steps=trainer.bad_steps,
+        **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
     )
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"])
     return FitResult(g, written, run, loop.seconds)
@@ -135,30 +154,39 @@ def run_fit(args: Fit) -> None:
     settings = args.settings().replace(background=args.background)
     names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
     config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
+    active = args.active()
     if not args.resume and (args.output / "config.json").exists():
         # Found out before minutes of reading images and triangulating points.
         raise ValueError(
             f"{args.output}: must be a new run folder, holds a run already; add --resume or choose another"
         )
-    dataset = load(args.data, test_every=config.test_every, background=config.settings.background)
-    result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet)
+    dataset = load(
+        args.data,
+        test_every=config.test_every,
+        background=config.settings.background,
+        lazy=active is not None,
+        points=active is None or config.init_points == "all",
+    )
+    result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
     metrics.print_table(result.metrics)
     print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
 
 
-def _start(dataset: Dataset, train: list, frames: list[Frame], config: FitConfig) -> tuple[Trainer, str]:
-    """A trainer at step 0, and where its points come from."""
+def _start(
+    dataset: Dataset, views: list[View], frames: list[Frame], config: FitConfig, strict: bool
+) -> tuple[Trainer, str]:
+    """A trainer at step 0, and where its points come from: by default, if `strict`, only from `views`."""
     from drgs.data import initial_points, scene_extent
 
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
-    given = config.init_points == "auto" and dataset.points is not None
+    given = config.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     points, colors, source = initial_points(
-        dataset if given else train, seed=config.seed, max_points=config.max_gaussians
+        dataset if given else views, seed=config.seed, max_points=config.max_gaussians
     )
     extent = scene_extent([frame.camera for frame in frames], points)
-    dense = not (given and dataset.points is not None) and any(view.depth_path is not None for view in train)
+    dense = not given and any(view.depth_path is not None for view in views)
     opacity, scale = (config.dense_opacity, config.dense_scale) if dense else (config.initial_opacity, 1.0)
     model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), opacity, scale)
     _log.info("%d initial points: %s", len(points), source)
@@ -168,9 +196,17 @@ def _start(dataset: Dataset, train: list, frames: list[Frame], config: FitConfig
 class _Loop:
     """Steps, and the files that are due at them."""
 
-    def __init__(self, run: Run, trainer: Trainer, held_out: list[Frame], source: str, seconds: float):
+    def __init__(
+        self,
+        run: Run,
+        trainer: Trainer,
+        held_out: list[Frame],
+        source: str,
+        seconds: float,
+        plan: ActiveViews | None,
+    ):
         self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
-        self.seconds = seconds
+        self.seconds, self.plan = seconds, plan
         self._recent: list[dict] = []
 
     def run(self, bar: _Progress) -> None:
@@ -182,6 +218,8 @@ class _Loop:
                     self.run_folder.log("interrupted", step=trainer.step_index)
                     self.save()
                     raise KeyboardInterrupt
+                while self.plan and self.plan.is_due(trainer.step_index):
+                    self._pick(bar)
                 began = time.perf_counter()
                 row = trainer.step()
                 self.seconds += time.perf_counter() - began
@@ -199,8 +237,25 @@ class _Loop:
         tensors, header = self.trainer.state()
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
         header |= {"seconds": self.seconds, "point_source": self.source}
+        if self.plan:
+            more_tensors, more_header = self.plan.state()
+            tensors, header = tensors | more_tensors, header | more_header
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index)
+
+    def _pick(self, bar: _Progress) -> None:
+        """One more view."""
+        trainer, plan = self.trainer, self.plan
+        frame, record = plan.pick(trainer.gaussians(), trainer.frames, trainer.step_index)
+        trainer.add_frame(frame)
+        plan.write(self.run_folder)
+        shown = ("step", "number", "index", "name", "score", "parts", "margin", "seconds")
+        self.run_folder.log("pick", **{key: record[key] for key in shown}, candidates=len(record["candidates"]))
+        self.save()
+        bar.note(
+            f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.active.add}, chosen by "
+            f"{plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
+        )
 
     def _log(self, row: dict) -> None:
         done = self.trainer.step_index
@@ -276,11 +331,17 @@ class _Progress:
         shown = "" if self._psnr is None else f"{self._psnr:.2f}"
         self._bar.update(self._task, completed=done, psnr=shown, count=count, rate=f"{rate:.1f}")
 
-    def report(self, done: int, psnr: float | None, count: int, seconds: float) -> None:
-        if self._show and not self._bar:
-            held_out = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
-            text = f"step {done} of {self._total}: {count} Gaussians{held_out}, {seconds:.0f} s"
+    def note(self, text: str) -> None:
+        """A line above the bar, or by itself."""
+        if self._bar:
+            self._bar.console.print(text, markup=False, highlight=False)
+        elif self._show:
             print(text, file=sys.stderr, flush=True)
+
+    def report(self, done: int, psnr: float | None, count: int, seconds: float) -> None:
+        if not self._bar:
+            held_out = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
+            self.note(f"step {done} of {self._total}: {count} Gaussians{held_out}, {seconds:.0f} s")
 
 
 @contextlib.contextmanager

@@ -36,7 +36,8 @@ class FitConfig:
         max_steps: Optimizer steps.
         max_pixels: Images are reduced to at most this many pixels.
         max_gaussians: Budget of the density control, at the start as later.
-        init_points: `auto` (the data set's points, else `views`) or `views` (only what the training views show).
+        init_points: `auto` (the data set's points, else `views`), `views` (only what the training views show) or, in
+            an active fit, where `auto` is `views`, `all` (the data set's points, else what all its views show).
         test_every: Every n-th view by name is held out; 0 holds out none.
         seed: Of everything random.
         sh_degree: Highest degree of the view-dependent color.
@@ -102,7 +103,7 @@ class FitConfig:
                 raise ValueError(f"fit: {name} must be a whole number >= {low}, got {value!r}")
         for name, allowed in {
             "mask": ("auto", "object", "valid", "ignore"),
-            "init_points": ("auto", "views"),
+            "init_points": ("auto", "views", "all"),
             "sh_degree": (0, 1, 2, 3),
         }.items():
             value = getattr(self, name)
@@ -145,6 +146,11 @@ class Trainer:
         self._generator = torch.Generator().manual_seed(config.seed)
         self._queue = torch.zeros(0, dtype=torch.int64)
         self._start_count = len(model)
+
+    def add_frame(self, frame: Frame) -> None:
+        """One more photograph; the epoch begins anew, so that it is seen soon."""
+        self.frames = [*self.frames, frame]
+        self._queue = self._queue[:0]
 
     def step(self) -> dict:
         """One view, one optimizer step, and what is due at it.

@@ -1,0 +1,212 @@
+"""`drgs fisher`: what known views say about every Gaussian, and what other views would still find uncertain.
+
+Two maps a view, both sums over the parameters k of squared derivatives J_pk of a pixel p, with H the information of the
+known views and Hc that of the view itself:
+
+    variance    sum_k J_pk^2 / (H_k + lambda): predictive variance of the pixel for unit noise; its sum is `eig`
+    share       sum_k J_pk^2 / Hc_k log(1 + Hc_k / (H_k + lambda)): the pixel's share of the view's `logdet`
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs import pictures
+from drgs.files import SCHEMA, save_state, write_json
+from drgs.progress import Bar
+from drgs.render_command import described, file_names, make_folder
+from drgs.viewpoints import known_views, other_views, scene_of
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.cli import Fisher
+    from drgs.fisher import Information
+    from drgs.gain import Prior
+    from drgs.viewpoints import Scene
+
+__all__ = ["map_picture", "map_weights", "run"]
+
+_INK = (235, 235, 235)
+_NOTHING = 64  # gray of pixels that no parameter moves
+_DECADES = 6.0  # at most so many are told apart by color
+
+
+def run(args: Fisher) -> None:
+    """`drgs fisher SCENE`."""
+    from drgs import fisher
+    from drgs.gain import Prior
+
+    if not 1 <= args.limit <= 10_000:
+        raise ValueError(f"fisher: --limit must be in [1, 10000], got {args.limit}; correct it")
+    prior = Prior(value=args.prior, relative=args.relative_prior)
+    scene = scene_of(args)
+    text = args.train
+    if text is None and scene.run is None:
+        if args.cameras in (None, "orbit", "dome"):
+            raise ValueError(
+                "a PLY has no record of its views: --train or --cameras must name a data set, a run or a cameras.json"
+            )
+        text = args.cameras
+    known = known_views(text, scene)
+    views, source = known.cameras, known.source
+    if args.cameras is not None:
+        views, source = other_views("--cameras", args.cameras, args, scene, known, fresh=False)
+    views = _evenly(views, args.limit)
+    make_folder(args.output)
+    with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
+        H: Information = {}
+        for camera in known.cameras:
+            part = fisher.diagonal(scene.gaussians, camera, scene.settings, args.method)
+            H = {name: x + H[name] if H else x for name, x in part.items()}
+            bar.advance()
+        rows = []
+        for camera, name in zip(views, file_names(views), strict=True):
+            rows.append(_view(args, scene, camera, name, H, prior))
+            bar.advance()
+    header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": scene.settings}
+    save_state(args.output / "information.safetensors", H, header)
+    report = {
+        "schema": SCHEMA,
+        "command": "fisher",
+        "scene": str(args.scene),
+        "gaussians": len(scene.gaussians),
+        "method": args.method,
+        "prior": {"value": args.prior, "relative": args.relative_prior},
+        "settings": dataclasses.asdict(scene.settings),
+        "pixels": scene.pixels,
+        "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
+        "groups": {name: _summary(x) for name, x in H.items()},
+        "source": source,
+        "views": rows,
+    }
+    write_json(args.output / "fisher.json", report)
+    if not args.quiet:
+        _print(report, args)
+
+
+def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[Information, Information]:
+    """Weights of `drgs.fisher.variance_map` for the two maps of the module's text.
+
+    Args:
+        H, candidate: Information of the known views and of the view shown, same groups.
+        prior: lambda; parameters with H + lambda = 0 weigh nothing.
+    Returns:
+        Those of `variance` and of `share`.
+    """
+    variance, share = {}, {}
+    for name, added in prior.per_group(H).items():
+        precision = H[name].double() + added
+        variance[name] = torch.where(precision > 0, precision.reciprocal(), 0.0)
+        Hc = candidate[name].double()
+        # log(1 + x) / Hc tends to the variance where the view says nothing about a parameter.
+        share[name] = torch.where(Hc > 0, (Hc * variance[name]).log1p() / Hc, variance[name])
+    return variance, share
+
+
+def map_picture(values: np.ndarray) -> np.ndarray:
+    """(H, W + bar, 3) uint8: bright is large, on a logarithmic scale, with a labeled color bar; gray where it is 0.
+
+    The scale ends at the largest value and covers what lies between it and the 1st percentile, at most six decades.
+
+    Args:
+        values: (H, W), finite, >= 0.
+    """
+    import cv2
+
+    known = values > 0
+    top = np.log10(values[known].max()) if known.any() else 0.0
+    low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
+    low = min(max(low, top - _DECADES), top - 1e-3)
+
+    def colors(exponents: np.ndarray) -> np.ndarray:
+        return cv2.applyColorMap(pictures.to_bytes((exponents - low) / (top - low)), cv2.COLORMAP_INFERNO)[..., ::-1]
+
+    picture = colors(np.log10(np.where(known, values, 10.0**low)))
+    picture[~known] = _NOTHING
+    height = len(values)
+    bar = np.zeros((height, 76, 3), np.uint8)
+    bar[:, 4:16] = colors(np.linspace(top, low, height)[:, None].repeat(12, 1))
+    inset = min(12, max(height - 2, 0))
+    for row, exponent in ((inset, top), (height // 2 + 4, (low + top) / 2), (height - 4, low)):
+        if exponent in (low, top) or height >= 48:
+            text = f"{10.0**exponent:.2g}"
+            cv2.putText(bar, text, (20, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([picture, bar], axis=1)
+
+
+def _view(args: Fisher, scene: Scene, camera: Camera, name: str, H: Information, prior: Prior) -> dict:
+    """Maps of one view, and what it says."""
+    from drgs import fisher
+    from drgs.gain import information_gain
+
+    g, settings = scene.gaussians, scene.settings
+    Hc = fisher.diagonal(g, camera, settings, args.method)
+    row = {"name": camera.name, "camera": described(camera), "files": []}
+    row["gain"] = {c: information_gain(Hc, H, c, prior).total for c in ("logdet", "eig")}
+    # Maps are of the image's colors; features have an image of their own.
+    parts = map_weights(*({k: x for k, x in y.items() if k != "features"} for y in (H, Hc)), prior)
+    for kind, weights in zip(("variance", "share"), parts, strict=True):
+        values = fisher.variance_map(g, camera, weights, settings).numpy()
+        pictures.write_png(args.output / f"{name}.{kind}.png", map_picture(values))
+        row["files"].append(f"{name}.{kind}.png")
+        row[kind] = {
+            "sum": float(values.sum(dtype=np.float64)),
+            "mean": float(values.mean()),
+            "max": float(values.max()),
+        }
+    if args.pose:
+        pose = fisher.pose_information(g, camera, settings)
+        row["pose"] = {"information": pose.tolist(), "eigenvalues": torch.linalg.eigvalsh(pose).tolist()}
+    return row
+
+
+def _evenly(views: list, limit: int) -> list:
+    """At most `limit` of them, the first one among them."""
+    if len(views) <= limit:
+        return views
+    return [views[i * len(views) // limit] for i in range(limit)]
+
+
+def _summary(x: torch.Tensor) -> dict:
+    positive = x[x > 0]
+    return {
+        "shape": list(x.shape),
+        "sum": float(x.sum()),
+        "median_of_positive": float(positive.median()) if positive.numel() else None,
+        "zero": int((x == 0).sum()),
+    }
+
+
+def _print(report: dict, args: Fisher) -> None:
+    """What was found, as tables on stdout."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title=f"information of {len(report['known']['names'])} views ({report['known']['source']})")
+    for name in ("group", "shape", "sum", "median > 0", "nothing known"):
+        table.add_column(name, justify="left" if name == "group" else "right")
+    for name, row in report["groups"].items():
+        median, count = row["median_of_positive"], int(np.prod(row["shape"]))
+        share = f"{row['zero'] / max(count, 1):.1%}"
+        table.add_row(name, "x".join(map(str, row["shape"])), f"{row['sum']:.4g}", f"{median or 0:.4g}", share)
+    console.print(table)
+    table = Table(title=f"views ({report['source']})")
+    columns = ["view", "logdet", "eig", "mean variance", *(["eigenvalues of the pose"] * args.pose)]
+    for name in columns:
+        table.add_column(name, justify="left" if name == "view" else "right", overflow="fold")
+    for row in report["views"]:
+        pose = [" ".join(f"{x:.2g}" for x in row["pose"]["eigenvalues"])] if args.pose else []
+        gain = row["gain"]
+        table.add_row(
+            row["name"], f"{gain['logdet']:.4g}", f"{gain['eig']:.4g}", f"{row['variance']['mean']:.3g}", *pose
+        )
+    console.print(table)
+    files = sum(len(row["files"]) for row in report["views"])
+    console.print(
+        f"information.safetensors, fisher.json and {files} maps: {args.output}", highlight=False, markup=False
+    )

@@ -1,0 +1,102 @@
+"""`drgs select`: which cameras would tell most about a scene, as a table and as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs.files import SCHEMA, write_json
+from drgs.progress import Bar
+from drgs.render_command import described
+from drgs.viewpoints import known_views, other_views, scene_of
+
+if TYPE_CHECKING:
+    from drgs.cli import Select
+    from drgs.greedy import Selection
+
+__all__ = ["run"]
+
+
+def run(args: Select) -> None:
+    """`drgs select SCENE --candidates ...`."""
+    import torch
+
+    from drgs.gain import Prior
+    from drgs.select import select
+
+    if args.output.is_dir():
+        raise ValueError(f"{args.output}: -o must be a file for the JSON, is a folder; name a file in it")
+    prior = Prior(value=args.prior, relative=args.relative_prior)
+    scene = scene_of(args)
+    known = known_views(args.train, scene)
+    candidates, source = other_views("--candidates", args.candidates, args, scene, known, fresh=True)
+    with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
+        selection = select(
+            scene.gaussians,
+            candidates,
+            known.cameras,
+            args.k,
+            args.policy,
+            criterion=args.criterion,
+            settings=scene.settings,
+            method=args.method,
+            prior=prior,
+            rng=torch.Generator().manual_seed(args.seed),
+            progress=bar.update,
+        )
+    nothing = [None] * len(candidates)
+    rows = zip(candidates, selection.scores, selection.parts or nothing, selection.unseen or nothing, strict=True)
+    report = {
+        "schema": SCHEMA,
+        "command": "select",
+        "scene": str(args.scene),
+        "gaussians": len(scene.gaussians),
+        "policy": args.policy,
+        "criterion": args.criterion,
+        "method": args.method,
+        "prior": {"value": args.prior, "relative": args.relative_prior},
+        "seed": args.seed,
+        "settings": dataclasses.asdict(scene.settings),
+        "pixels": scene.pixels,
+        "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
+        "source": source,
+        "picks": [
+            {"rank": rank, **dataclasses.asdict(pick), "camera": described(candidates[pick.index])}
+            for rank, pick in enumerate(selection.picks, 1)
+        ],
+        "candidates": [
+            {"index": i, "name": camera.name, "score": score, "parts": parts, "unseen": unseen}
+            for i, (camera, score, parts, unseen) in enumerate(rows)
+        ],
+        "left_out": selection.left_out,
+        "notes": selection.notes,
+        "evaluations": selection.evaluations,
+        "seconds": selection.seconds,
+    }
+    write_json(args.output, report)
+    if not args.quiet:
+        print_table(report, selection, args.output)
+
+
+def print_table(report: dict, selection: Selection, output: Path) -> None:
+    """The picks with parts per group, and what to know about them, on stdout."""
+    from rich.console import Console
+    from rich.table import Table
+
+    title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
+    table = Table(title=f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}")
+    groups = list(selection.picks[0].parts)
+    for name in ("rank", "view", "score", "margin", *groups):
+        table.add_column(name, justify="left" if name == "view" else "right", overflow="fold")
+    for rank, pick in enumerate(selection.picks, 1):
+        margin = "-" if pick.margin is None else f"{pick.margin:.4g}"
+        parts = (f"{pick.parts[name]:.4g}" for name in groups)
+        table.add_row(str(rank), pick.name, f"{pick.score:.6g}", margin, *parts)
+    console = Console()
+    console.print(table)
+    for note in selection.notes:
+        console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
+    known = report["known"]
+    text = f"{len(known['names'])} known views ({known['source']}); {report['seconds']:.1f} s: {output}"
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
