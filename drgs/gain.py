@@ -50,7 +50,7 @@ BLOCK_LAYOUT = {
 BLOCKS = "blocks"
 """Name under which blocks (N, 13, 13) travel as an Information."""
 
-_ROUNDING = 1e-7  # relative to the diagonal: what a float32 sum leaves of an eigenvalue that is 0
+_ROUNDING = 1e-6  # relative to the diagonal: what float32 sums leave of an eigenvalue that is 0, on a real scene
 _CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is twice as fast
 _SINGULAR = 1e-13  # of a column's length: what float64 leaves of a column that depends on the others
 

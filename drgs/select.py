@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["POLICIES", "Cache", "Pick", "Pool", "Selection", "select"]
 
-# One for the process: a new one each call, or the same seed again, would make "random" a function of the list's length.
+# One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
 
 

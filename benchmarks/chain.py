@@ -1,0 +1,85 @@
+"""How far the criteria are from the mutual information they stand for, on scenes where it can be computed.
+
+python benchmarks/chain.py [--scenes 24] [--print]
+
+Random scenes of 12 Gaussians (SH degree 0, 156 parameters), Jacobians of the float64 oracle at 12x10 pixels; 1, 2 or 4
+training views and 8 candidates in random directions. Writes the table of docs/information.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import dense_jacobian  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from scenes_random import camera, gaussians  # noqa: E402
+
+from drgs import reference  # noqa: E402
+from drgs.gain import dense  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+
+BEGIN, END = "<!-- chain: begin -->", "<!-- chain: end -->"
+FORMS = ("trace_bound", "eig", "logdet", "block_logdet")
+GAUSSIANS, CANDIDATES, TRAIN, LAMBDAS = 12, 8, (1, 2, 4), (1e-6, 1e-3, 1.0)
+
+
+def views(seed: int) -> tuple[list[torch.Tensor], torch.Tensor]:
+    """Jacobians of max(TRAIN) + CANDIDATES views of a random scene, and the Gaussian of each column."""
+    rng, settings, rows = np.random.default_rng(seed), RenderSettings.preset("exact"), []
+    g = gaussians(rng, GAUSSIANS, 1, scale=0.25)
+    for _ in range(max(TRAIN) + CANDIDATES):
+        out = reference.render(g, camera(rng, (12, 10), turn=1.5), settings)
+        rows.append(dense_jacobian.stacked(dense_jacobian.jacobian(g, out)))
+    return [x.flatten(1) for x in rows], torch.arange(13 * GAUSSIANS) // 13
+
+
+def kendall(a, b) -> float:
+    """Kendall's tau-a of two score lists."""
+    i, j = np.triu_indices(len(a), 1)
+    return float(np.mean(np.sign(np.subtract(a[i], a[j])) * np.sign(np.subtract(b[i], b[j]))))
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", type=int, default=24)
+    parser.add_argument("--print", action="store_true", help="do not touch docs/information.md")
+    args = parser.parse_args()
+    found = {}
+    for seed in range(args.scenes):
+        J, labels = views(seed)
+        for count in TRAIN:
+            for value in LAMBDAS:
+                chains = [dense(x, torch.cat(J[:count]), value, labels) for x in J[max(TRAIN) :]]
+                truth = np.array([x.mutual_information for x in chains])
+                for form in FORMS:
+                    scores = np.array([getattr(x, form) for x in chains])
+                    regret = 1 - truth[scores.argmax()] / truth.max()
+                    found.setdefault((value, count, form), []).append((scores / truth, kendall(scores, truth), regret))
+    lines = [
+        "| lambda | training views | form | form / mutual information: median (5 %, 95 %) | Kendall tau "
+        "| regret: mean, worst |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (value, count, form), results in found.items():
+        ratios, tau, regret = (np.concatenate([x[0] for x in results]), *np.array([x[1:] for x in results]).T)
+        low, middle, high = np.quantile(ratios, (0.05, 0.5, 0.95))
+        lines.append(
+            f"| {value:g} | {count} | `{form}` | {middle:.3g} ({low:.3g}, {high:.3g}) | {tau.mean():.2f} "
+            f"| {100 * regret.mean():.1f} %, {100 * regret.max():.0f} % |"
+        )
+    print("\n".join(lines))
+    page = ROOT / "docs" / "information.md"
+    if not args.print:
+        text = page.read_text(encoding="utf-8")
+        start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+        page.write_text(text[:start] + "\n" + "\n".join(lines) + "\n" + text[end:], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
