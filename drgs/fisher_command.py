@@ -32,13 +32,13 @@ __all__ = ["map_picture", "map_weights", "run"]
 
 _INK = (235, 235, 235)
 _NOTHING = 64  # gray of pixels that no parameter moves
-_DECADES = 6.0  # at most so many are told apart by color
+_DECADES = 3.0  # at most so many are told apart by color
 
 
 def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
     from drgs import fisher
-    from drgs.gain import Prior
+    from drgs.gain import Prior, check
 
     if not 1 <= args.limit <= 10_000:
         raise ValueError(f"fisher: --limit must be in [1, 10000], got {args.limit}; correct it")
@@ -61,6 +61,7 @@ def run(args: Fisher) -> None:
         H: Information = {}
         for camera in known.cameras:
             part = fisher.diagonal(scene.gaussians, camera, scene.settings, args.method)
+            check(f"fisher: view {camera.name}", part)
             H = {name: x + H[name] if H else x for name, x in part.items()}
             bar.advance()
         rows = []
@@ -110,7 +111,7 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
 def map_picture(values: np.ndarray) -> np.ndarray:
     """(H, W + bar, 3) uint8: bright is large, on a logarithmic scale, with a labeled color bar; gray where it is 0.
 
-    The scale ends at the largest value and covers what lies between it and the 1st percentile, at most six decades.
+    The scale ends at the largest value and covers what lies between it and the 1st percentile, at most three decades.
 
     Args:
         values: (H, W), finite, >= 0.

@@ -210,6 +210,7 @@ def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fie
 
 def run_eval(args: Eval) -> None:
     """`drgs eval RUN`."""
+    from drgs.active import fitted_views
     from drgs.data import load
     from drgs.frames import load_frames
     from drgs.trainer import FitConfig
@@ -221,6 +222,9 @@ def run_eval(args: Eval) -> None:
     g = load_ply(run.point_cloud)
     dataset = load(recorded["data"], test_every=config.test_every, background=config.settings.background)
     train, test = dataset.split()
+    if recorded.get("active"):  # the rest of the training split was never seen
+        fitted = fitted_views(run)
+        train = [view for view in train if view.name in fitted]
     views = {"test": test, "train": train, "all": train + test}[args.split]
     if not views:
         raise ValueError(f"eval: split {args.split} must hold a view, holds none ({dataset.split_rule()}); use --split")

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from drgs.cli import Select
     from drgs.greedy import Selection
 
-__all__ = ["run"]
+__all__ = ["print_table", "run"]
+
+_SHORT = {"rotations": "rot.", "log_scales": "scales", "logit_opacities": "opac."}  # a table has 80 columns
 
 
 def run(args: Select) -> None:
@@ -87,12 +89,13 @@ def print_table(report: dict, selection: Selection, output: Path) -> None:
     title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
     table = Table(title=f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}")
     groups = list(selection.picks[0].parts)
-    for name in ("rank", "view", "score", "margin", *groups):
-        table.add_column(name, justify="left" if name == "view" else "right", overflow="fold")
-    for rank, pick in enumerate(selection.picks, 1):
-        margin = "-" if pick.margin is None else f"{pick.margin:.4g}"
-        parts = (f"{pick.parts[name]:.4g}" for name in groups)
-        table.add_row(str(rank), pick.name, f"{pick.score:.6g}", margin, *parts)
+    table.add_column("view", no_wrap=True)
+    for name in ("score", "margin", *groups):
+        table.add_column(_SHORT.get(name, name), justify="right", overflow="fold")
+    for pick in selection.picks:
+        margin = "-" if pick.margin is None else f"{pick.margin:.3g}"
+        parts = (f"{pick.parts[name]:.3g}" for name in groups)
+        table.add_row(pick.name, f"{pick.score:.5g}", margin, *parts)
     console = Console()
     console.print(table)
     for note in selection.notes:

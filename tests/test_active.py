@@ -76,10 +76,8 @@ def reads(seen: list[str], folder: Path) -> dict[str, list[int]]:
 # ---- data
 
 
-@pytest.fixture(scope="module")
-def still(tmp_path_factory):
-    """A transforms.json data set: nine views of blobs with depth maps and object masks, names 0..8."""
-    folder = tmp_path_factory.mktemp("still")
+def write_still(folder: Path):
+    """A transforms.json data set: nine views of blobs with depth maps and object masks, names 0..8. The blobs."""
     generator = torch.Generator().manual_seed(1)
     n = 30
     g = drgs.Gaussians.from_arrays(
@@ -100,6 +98,13 @@ def still(tmp_path_factory):
     K = camera.K
     lens = {"w": SIZE, "h": SIZE, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     save(folder, {**lens, "frames": frames})
+    return g
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("still")
+    write_still(folder)
     return folder
 
 
@@ -306,6 +311,8 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
     assert [(event["name"], event["step"]) for event in events] == [(p["name"], p["step"]) for p in record["picks"]]
     names = [view["name"] for view in (*record["start"], *record["picks"])]
     assert fitted_views(result.run) == names == result.metrics["fitted"]
+    assert cli.main(["eval", str(result.run.path), "--split", "train"]) == 0
+    assert {view["name"] for view in json.loads((tmp_path / "run/metrics.json").read_text())["views"]} == set(names)
     assert result.run.config()["active"]["criterion"] == "eig"
     assert set(result.run.config()["pool"]) >= set(names)
 

@@ -1,0 +1,160 @@
+"""`drgs fisher`: information in a file, maps whose sums are the scores, pose information, and bad input."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from test_active import SIZE, config, lazily, plan, write_still
+
+from drgs import cli, fisher
+from drgs.cameras import Camera, load_cameras_json, look_at, orbit, save_cameras_json
+from drgs.data import load
+from drgs.files import load_ply, load_state, save_ply
+from drgs.fisher_command import map_picture, map_weights
+from drgs.gain import Prior
+from drgs.train import fit
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """`data`, an active run `run` on it, `scene.ply`, `cameras.json`."""
+    folder = tmp_path_factory.mktemp("fisher")
+    save_ply(write_still(folder / "data"), folder / "scene.ply")
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 5, width=SIZE, height=20))
+    return folder
+
+
+def run(line: str, place, monkeypatch, capsys) -> tuple[dict, str]:
+    monkeypatch.chdir(place)
+    assert cli.main(["fisher", *line.split(), "-o", "out"]) == 0, capsys.readouterr().err
+    return json.loads((place / "out/fisher.json").read_text()), capsys.readouterr().out
+
+
+def test_information_of_a_run(place, monkeypatch, capsys):
+    """The file holds the sum over the run's views, group by group; maps are drawn for them."""
+    report, text = run("run --limit 3 --preset fast", place, monkeypatch, capsys)
+    tensors, header = load_state(place / "out/information.safetensors")
+    from drgs.settings import RenderSettings
+
+    views = {view.name: view.camera for view in load(place / "data").views}
+    cameras = [views[name] for name in report["known"]["names"]]
+    truth = fisher.diagonal(load_ply(place / "run/point_cloud.ply"), cameras, RenderSettings.preset("fast"))
+    assert list(tensors) == sorted(truth)
+    for name, x in truth.items():
+        assert tensors[name].dtype == torch.float64
+        torch.testing.assert_close(tensors[name], x, rtol=1e-5, atol=1e-9 * float(x.max()))
+    assert header["views"] == report["known"]["names"]
+    assert len(report["views"]) == 3
+    for row in report["views"]:
+        for file in row["files"]:
+            assert cv2.imread(str(place / "out" / file)).shape == (SIZE, SIZE + 76, 3)
+    assert "information of 4 views (run)" in text
+    assert "pose" not in text
+
+
+def test_maps_add_up_to_the_scores(place, monkeypatch, capsys):
+    """The sum of the variance map is `eig`, that of the share map is `logdet`, to 1e-4 (measured: 1e-6)."""
+    report, _ = run("run --cameras cameras.json --limit 2", place, monkeypatch, capsys)
+    for row in report["views"]:
+        assert row["variance"]["sum"] == pytest.approx(row["gain"]["eig"], rel=1e-4)
+        assert row["share"]["sum"] == pytest.approx(row["gain"]["logdet"], rel=1e-4)
+        assert row["gain"]["logdet"] < row["gain"]["eig"]
+
+
+def test_lambda_zero_leaves_unseen_parameters_out(place, monkeypatch, capsys):
+    """One known view and lambda = 0: finite maps, and still the scores' sums."""
+    known = load_cameras_json(place / "cameras.json")[:1]
+    save_cameras_json(place / "one.json", known)
+    line = "scene.ply --train one.json --cameras cameras.json --prior 0 --limit 2"
+    report, _ = run(line, place, monkeypatch, capsys)
+    for row in report["views"]:
+        assert row["variance"]["sum"] == pytest.approx(row["gain"]["eig"], rel=1e-4)
+        assert row["share"]["sum"] == pytest.approx(row["gain"]["logdet"], rel=1e-4)
+
+
+def test_share_tends_to_the_variance():
+    """A parameter that the view hardly sees weighs the same in both; one that nothing sees at lambda = 0 weighs 0."""
+    H = {"means": torch.tensor([[2.0, 0.0, 4.0]], dtype=torch.float64)}
+    Hc = {"means": torch.tensor([[0.0, 3.0, 1e-9]], dtype=torch.float64)}
+    variance, share = map_weights(H, Hc, Prior(0.0))
+    assert variance["means"].tolist() == [[0.5, 0.0, 0.25]]
+    torch.testing.assert_close(share["means"], variance["means"])
+    _, share = map_weights(H, {"means": torch.full((1, 3), 2.0)}, Prior(0.0))
+    assert share["means"][0, 0] == pytest.approx(np.log(2) / 2)
+
+
+def test_pose_information(place, monkeypatch, capsys):
+    """--pose: the 6x6 matrix of drgs.fisher, symmetric, with its eigenvalues in the table."""
+    report, text = run("scene.ply --cameras cameras.json --limit 1 --pose", place, monkeypatch, capsys)
+    (row,) = report["views"]
+    camera = load_cameras_json(place / "cameras.json")[0]
+    truth = fisher.pose_information(load_ply(place / "scene.ply"), camera)
+    np.testing.assert_allclose(row["pose"]["information"], truth.numpy(), rtol=1e-5)
+    np.testing.assert_allclose(row["pose"]["eigenvalues"], np.linalg.eigvalsh(truth.numpy()), rtol=1e-4)
+    assert min(row["pose"]["eigenvalues"]) > 0
+    assert f"{row['pose']['eigenvalues'][0]:.2g}" in text
+
+
+def test_plain_ply(place, monkeypatch, capsys):
+    """Without a record the cameras given are the known ones, unless --train names others."""
+    report, _ = run("scene.ply --cameras cameras.json", place, monkeypatch, capsys)
+    assert (len(report["known"]["names"]), len(report["views"])) == (5, 4)
+    report, _ = run("scene.ply --train cameras.json --cameras orbit --count 3 --up z", place, monkeypatch, capsys)
+    assert [row["name"] for row in report["views"]] == ["orbit_0000", "orbit_0001", "orbit_0002"]
+    report, _ = run("run --cameras data --split test", place, monkeypatch, capsys)
+    assert [row["name"] for row in report["views"]] == ["0", "4", "8"]
+
+
+def test_views_that_see_nothing(place, monkeypatch, capsys):
+    """Zero information: maps are gray, sums 0, nothing fails."""
+    away = Camera(
+        load(place / "data").views[0].camera.K, look_at((0, 0, 50), (0, 0, 60), (0, 1, 0)), SIZE, SIZE, name="away"
+    )
+    save_cameras_json(place / "away.json", [away])
+    report, _ = run("run --cameras away.json --pose", place, monkeypatch, capsys)
+    (row,) = report["views"]
+    assert row["gain"] == {"logdet": 0, "eig": 0}
+    assert row["pose"]["eigenvalues"] == [0] * 6
+    assert (cv2.imread(str(place / "out/away.variance.png"))[:, :SIZE] == 64).all()
+
+
+def test_picture_is_logarithmic():
+    """Each decade takes the same part of the bar, zero is gray, and the largest value is brightest."""
+    values = np.array([[0.0, 1.0, 10.0, 100.0]] * 50)
+    picture = map_picture(values).astype(int)
+    assert picture.shape == (50, 80, 3)
+    assert (picture[:, 0] == 64).all()
+    brightness = picture[0, 1:4].sum(1)
+    assert brightness[0] < brightness[1] < brightness[2]
+    np.testing.assert_array_equal(picture[0, 3], picture[0, 4 + 4])  # the top of the bar
+    assert map_picture(np.zeros((1, 3))).shape == (1, 79, 3)
+    assert map_picture(np.full((2, 2), 5.0)).dtype == np.uint8
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("scene.ply", "--train or --cameras must name a data set, a run or a cameras.json"),
+        ("scene.ply --cameras dome", "--train or --cameras must name a data set, a run or a cameras.json"),
+        ("run --limit 0", "--limit must be in [1, 10000], got 0"),
+        ("run --cameras cameras.json --split test", "--split test must have --cameras DATA"),
+        ("run --prior nan", "lambda (value) must be in [0, inf), got nan"),
+        ("nowhere.ply", "nowhere.ply: must be a PLY file, found none"),
+        ("early", "must hold point_cloud.ply, found none"),
+    ],
+)
+def test_bad_input_is_one_line(place, tmp_path, monkeypatch, capsys, line, message):
+    """Exit code 2, one line, no folder."""
+    monkeypatch.chdir(place)
+    (place / "early").mkdir(exist_ok=True)
+    (place / "early/config.json").write_text((place / "run/config.json").read_text())
+    assert cli.main(["fisher", *line.split(), "-o", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,176 @@
+"""`drgs select`: candidates from everywhere, the table and the JSON, and one line for everything that can be wrong."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from test_active import SIZE, config, lazily, plan, write_still
+
+import drgs
+from drgs import cli, fisher
+from drgs.cameras import Camera, look_at, orbit, save_cameras_json
+from drgs.data import load
+from drgs.files import Run, load_ply, save_ply
+from drgs.gain import Prior, information_gain
+from drgs.train import fit
+from drgs.viewpoints import dome
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """`data`, an active run `run` on it (views 1, 5 and two more), `scene.ply`, `cameras.json`."""
+    folder = tmp_path_factory.mktemp("select")
+    save_ply(write_still(folder / "data"), folder / "scene.ply")
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=SIZE))
+    return folder
+
+
+def select(line: str, folder, monkeypatch, capsys) -> tuple[dict, str]:
+    monkeypatch.chdir(folder)
+    assert cli.main(["select", *line.split()]) == 0, capsys.readouterr().err
+    return json.loads((folder / "selection.json").read_text()), capsys.readouterr().out
+
+
+def test_unused_views_of_a_run(place, monkeypatch, capsys):
+    """Candidates are what the run has not been fitted to; scores are information_gain's, parts add up."""
+    report, text = select("run --candidates data -k 2 --preset fast", place, monkeypatch, capsys)
+    seen = report["known"]["names"]
+    assert seen == [view["name"] for key in ("start", "picks") for view in _selection(place)[key]]
+    assert sorted(row["name"] for row in report["candidates"]) == sorted(set("012345678") - set(seen))
+    views = {view.name: view.camera for view in load(place / "data").views}
+    g, settings = load_ply(place / "run/point_cloud.ply"), drgs.RenderSettings.preset("fast")
+    H = fisher.diagonal(g, [views[name] for name in seen], settings)
+    for row in report["candidates"]:
+        gain = information_gain(fisher.diagonal(g, views[row["name"]], settings), H, "logdet", Prior())
+        assert row["score"] == pytest.approx(gain.total, rel=1e-4)
+    first, second = report["picks"]
+    assert first["score"] == max(row["score"] for row in report["candidates"])
+    assert sum(first["parts"].values()) == pytest.approx(first["score"])
+    assert second["name"] != first["name"]
+    np.testing.assert_allclose(np.linalg.inv(first["camera"]["c2w"]), views[first["name"]].w2c, atol=1e-9)
+    assert "fisher (logdet): 2 of 5 views" in text
+    assert all(word in text for word in ("means", "rot.", "scales", "opac.", "sh", "margin"))
+
+
+def _selection(place) -> dict:
+    return json.loads((place / "run/selection.json").read_text())
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_split_of_candidates(place, monkeypatch, capsys, split):
+    """The run's rule of the split applies; a run may be named for its data set."""
+    report, _ = select(f"run --candidates run --split {split} --policy uniform", place, monkeypatch, capsys)
+    names = {row["name"] for row in report["candidates"]}
+    config = Run(place / "run").config()
+    expected = config["test"] if split == "test" else set(config["pool"]) - set(report["known"]["names"])
+    assert names == set(expected)
+
+
+@pytest.mark.parametrize("kind", ["orbit", "dome"])
+def test_made_candidates_have_the_lens_of_the_known_views(place, monkeypatch, capsys, kind):
+    """As many as asked for, around what the known views look at, at their distance."""
+    report, _ = select(f"run --candidates {kind} --count 10 --policy farthest -k 10", place, monkeypatch, capsys)
+    cameras = [pick["camera"] for pick in report["picks"]]
+    assert len({camera["name"] for camera in cameras}) == 10
+    K = load(place / "data").views[0].camera.K
+    for camera in cameras:
+        np.testing.assert_allclose(camera["K"], K)
+        eye, axis = np.array(camera["c2w"])[:3, 3], np.array(camera["c2w"])[:3, 2]
+        assert np.linalg.norm(eye) == pytest.approx(3.0, rel=0.02)
+        assert axis @ -eye / 3 > 0.999
+
+
+def test_plain_ply_with_a_list_of_cameras(place, monkeypatch, capsys):
+    """No training record: H from the cameras given; a cameras.json is a list of candidates as well."""
+    line = "scene.ply --train cameras.json --candidates orbit --count 5 --up z --policy coverage"
+    report, text = select(line, place, monkeypatch, capsys)
+    assert len(report["known"]["names"]) == 4
+    assert (report["gaussians"], len(report["candidates"])) == (30, 5)
+    assert "4 known views (cameras.json)" in text
+    report, _ = select("scene.ply --train data --candidates cameras.json --info-pixels 64", place, monkeypatch, capsys)
+    assert len(report["candidates"]) == 4
+    assert report["picks"][0]["camera"]["width"] == 8
+
+
+def test_cameras_that_see_nothing_have_a_defined_answer(place, monkeypatch, capsys):
+    """Every score is 0: the first one is picked, and a note says why."""
+    away = look_at((0, 0, 50), (0, 0, 60), (0, 1, 0))
+    K = load(place / "data").views[0].camera.K
+    save_cameras_json(place / "away.json", [Camera(K, away, SIZE, SIZE, name=f"away{i}") for i in range(2)])
+    report, text = select("run --candidates away.json", place, monkeypatch, capsys)
+    assert [row["score"] for row in report["candidates"]] == [0, 0]
+    assert (report["picks"][0]["name"], report["picks"][0]["margin"]) == ("away0", 0)
+    assert "every score is 0" in text
+
+
+def test_same_command_same_file(place, monkeypatch, capsys):
+    """`random` is drawn from --seed."""
+    picks = []
+    for seed in (1, 1, 2):
+        report, _ = select(f"run --candidates data --policy random -k 5 --seed {seed}", place, monkeypatch, capsys)
+        picks.append([pick["name"] for pick in report["picks"]])
+    assert picks[0] == picks[1] != picks[2]
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 40, 100])
+def test_dome_is_even(count):
+    """All cameras on the upper half, and no two much nearer than even spacing puts them."""
+    cameras = dome(orbit((1, 2, 3), 2.0, 24, 0.0, width=16, height=12), count)
+    centers = np.stack([camera.center for camera in cameras]) - (1, 2, 3)
+    assert len(cameras) == count
+    np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 2.0)
+    assert (centers[:, 2] > 0).all()
+    if count > 1:
+        distance = np.linalg.norm(centers[:, None] - centers[None], axis=2) + 9 * np.eye(count)
+        assert distance.min() > 0.5 * 2.0 * np.sqrt(2 * np.pi / count)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("run --candidates data -k 6", "k must be a whole number in 1..5 candidates, got 6"),
+        ("run --candidates data -k 0", "k must be a whole number in 1..5 candidates, got 0"),
+        ("run --candidates run --train data", "must hold a view that is not known yet, all 9 of split all are"),
+        ("scene.ply --candidates orbit", "a PLY has no record of its views: --train must name"),
+        ("run --candidates data --policy best", "--policy"),
+        ("run --candidates data --prior -1", "lambda (value) must be in [0, inf), got -1"),
+        ("run --candidates orbit --split test", "--split test must have --candidates DATA, orbit has no split"),
+        ("run --candidates orbit --count 0", "--count must be in [1, 10000], got 0"),
+        ("run --candidates orbit --elevation 90", "--elevation must be in [-89, 89], got 90"),
+        ("run --candidates nowhere", "nowhere: must be a data set, found no such file or folder"),
+        ("data --candidates orbit", "must be a run folder, found no config.json"),
+        ("run --candidates empty.json", "must be a list of at least one camera"),
+        ("early --candidates orbit", "must hold point_cloud.ply, found none; the fit has not reached"),
+        ("run --candidates data -o data", "-o must be a file for the JSON, is a folder"),
+        ("run --candidates data --method best", "--method"),
+    ],
+)
+def test_bad_input_is_one_line(place, monkeypatch, capsys, line, message):
+    """Exit code 2, one line, nothing written."""
+    monkeypatch.chdir(place)
+    (place / "empty.json").write_text("[]")
+    (place / "early").mkdir(exist_ok=True)
+    (place / "early/config.json").write_text((place / "run/config.json").read_text())
+    (place / "selection.json").unlink(missing_ok=True)
+    try:
+        assert cli.main(["select", *line.split()]) == 2
+    except SystemExit as end:  # usage errors leave as argparse's do
+        assert end.code == 2  # noqa: PT017
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (place / "selection.json").exists()
+
+
+def test_run_whose_views_are_gone(place, tmp_path, capsys):
+    """A run's data set must still hold what it was fitted to."""
+    import shutil
+
+    shutil.copytree(place / "run", tmp_path / "run")
+    file = tmp_path / "run/selection.json"
+    file.write_text(file.read_text().replace('"name": "5"', '"name": "gone"'))
+    assert cli.main(["select", str(tmp_path / "run"), "--candidates", "orbit"]) == 2
+    assert "'gone' is gone; restore it" in capsys.readouterr().err
