@@ -34,10 +34,13 @@ _MODULES = frozenset(
         "demo",
         "ellipsoids",
         "files",
+        "fisher",
+        "gain",
         "integrator",
         "metrics",
         "reference",
         "runtime",
+        "select",
         "settings",
         "sfm",
         "tiles",
@@ -51,16 +54,19 @@ __all__ = [
     "RenderSettings",
     "__version__",
     "data",
+    "fisher",
+    "gain",
     "load_ply",
     "reference",
     "render",
     "render_jvp",
     "runtime",
     "save_ply",
+    "select",
 ]
 
 if TYPE_CHECKING:
-    from drgs import data, reference, runtime
+    from drgs import data, fisher, gain, reference, runtime, select
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply

@@ -1,0 +1,198 @@
+"""Does the score of a view predict what adding it does?
+
+    python benchmarks/predict.py [--scenes office head still_life] [--runs runs/studies]
+
+On a fit to 6 views every other view of the pool is added alone, the fit goes on for a while, and the drop of the error
+of held-out views is compared with the score that each policy gave the view before. Also the AUSE of the variance map:
+whether pixels that it calls uncertain are wrong. Results go to docs/active-static.md and benchmarks/predict.json;
+candidates that have been measured are not measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+import numpy as np
+import studies
+import torch
+from studies import ROOT
+
+import drgs
+from drgs import fisher
+from drgs.gain import Prior, variances
+from drgs.select import select
+
+BEGIN, END = "<!-- predict: begin -->", "<!-- predict: end -->"
+VIEWS, STEPS, MORE = 6, 1000, 200
+SCORES = {
+    "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
+    "fisher, logdet, relative 1e-3": {
+        "policy": "fisher",
+        "criterion": "logdet",
+        "prior": Prior(1e-3, relative=True),
+    },
+    "fisher, eig": {"policy": "fisher", "criterion": "eig"},
+    "fisher, eig, relative 1e-3": {"policy": "fisher", "criterion": "eig", "prior": Prior(1e-3, relative=True)},
+    "fisher, trace_cov": {"policy": "fisher", "criterion": "trace_cov"},
+    "fisher, trace_cov, relative 1e-3": {
+        "policy": "fisher",
+        "criterion": "trace_cov",
+        "prior": Prior(1e-3, relative=True),
+    },
+    "fisher, block_logdet": {"policy": "fisher", "criterion": "block_logdet"},
+    "fisherrf": {"policy": "fisherrf"},
+    "coverage": {"policy": "coverage"},
+    "farthest": {"policy": "farthest"},
+}
+
+
+def error(g, frames: list, settings) -> float:
+    """Mean squared error of held-out views, inside their masks."""
+    values = []
+    for frame in frames:
+        with torch.no_grad():
+            rgb = drgs.render(g, frame.camera, settings, outputs=()).rgb.clamp(0, 1)
+        wrong = (rgb - frame.image()).square().mean(2)
+        weight = torch.ones_like(wrong) if frame.mask is None else frame.mask
+        values.append(float((wrong * weight).sum() / weight.sum()))
+    return float(np.mean(values))
+
+
+def drops(name: str, runs: Path) -> dict:
+    """Scores and realised drops of every candidate of a scene."""
+    trainer, pool, chosen, held_out = studies.base(name, runs, VIEWS, STEPS)
+    left = [i for i in range(len(pool)) if i not in chosen]
+    train, settings = [pool[i] for i in chosen], trainer.config.settings
+    g = trainer.gaussians()
+    store = runs / "predict" / f"{name}.json"
+    done = studies.read_rows(store, {})
+    if "scores" not in done:
+        done["scores"] = {
+            label: select(
+                g, [pool[i].camera for i in left], [f.camera for f in train], settings=settings, **options
+            ).scores
+            for label, options in SCORES.items()
+        }
+        done["ause"] = ause(g, [f.camera for f in train], held_out, settings)
+        # What going on without a new view does is no merit of a view.
+        control = [error(studies.continued(trainer, train, MORE).gaussians(), held_out, settings) for _ in range(3)]
+        done |= {"names": [pool[i].name for i in left], "control": control, "after": []}
+        studies.write_rows(store, done)
+    while len(done["after"]) < len(left):
+        i = left[len(done["after"])]
+        done["after"].append(error(studies.continued(trainer, [*train, pool[i]], MORE).gaussians(), held_out, settings))
+        studies.write_rows(store, done)
+        print(name, len(done["after"]), "of", len(left), flush=True)
+    return done
+
+
+def ause(g, train: list, held_out: list, settings) -> dict:
+    """Area between the sparsification curves of the variance map and of the error itself; 0 is perfect.
+
+    Root of the mean squared error of what is left when the fraction of pixels called most uncertain is taken out, both
+    curves divided by the error of all pixels; also of a constant map (random order) and of 1 - alpha.
+    """
+    H = fisher.diagonal(g, train, settings)
+    weights, maps = variances(H, Prior(1e-3, relative=True)), {"variance": [], "1 - alpha": [], "random": []}
+    wrong = []
+    generator = torch.Generator().manual_seed(0)
+    for frame in held_out:
+        camera = frame.camera
+        with torch.no_grad():
+            out = drgs.render(g, camera, settings, outputs=())
+        keep = torch.ones(camera.height, camera.width, dtype=torch.bool) if frame.mask is None else frame.mask > 0.5
+        wrong.append((out.rgb.clamp(0, 1) - frame.image()).square().mean(2)[keep])
+        maps["variance"].append(fisher.variance_map(g, camera, weights, settings)[keep])
+        maps["1 - alpha"].append(1 - out.alpha[keep])
+        maps["random"].append(torch.rand(int(keep.sum()), generator=generator))
+    wrong = torch.cat(wrong).double()
+    best = curve(wrong, wrong)
+    return {name: float((curve(wrong, torch.cat(x)) - best).mean()) for name, x in maps.items()}
+
+
+def curve(wrong: torch.Tensor, order: torch.Tensor, points: int = 100) -> torch.Tensor:
+    """RMSE of the pixels left after removing the share k / points with the largest `order`, relative to all."""
+    sums = wrong[order.argsort()].cumsum(0)
+    kept = torch.tensor([max(1, round(len(wrong) * (1 - k / points))) for k in range(points)])
+    rmse = (sums[kept - 1] / kept).sqrt()
+    return rmse / rmse[0]
+
+
+def report(result: dict, made: str) -> str:
+    """The part of docs/active-static.md."""
+    names = list(result)
+    lines = [
+        f"Made by {made}",
+        "",
+        f"A fit to {VIEWS} views ({STEPS:,} steps, `--scale small`), then each candidate added alone for {MORE} more",
+        "steps.",
+        "Spearman's rho between the score and the realised drop of the held-out squared error, over the candidates;",
+        "in brackets what 95 % of random rankings stay below.",
+        "",
+        "| score | " + " | ".join(f"{name}, {len(result[name]['names'])} candidates" for name in names) + " | mean |",
+        "|---|" + "---|" * (len(names) + 1),
+    ]
+    for label in SCORES:
+        values = []
+        for name in names:
+            r = result[name]
+            drop = np.mean(r["control"]) - np.asarray(r["after"])
+            values.append(studies.rank_correlation(r["scores"][label], drop))
+        lines.append(f"| {label} | " + " | ".join(f"{v:.2f}" for v in values) + f" | {np.mean(values):.2f} |")
+    bounds = [1.645 / math.sqrt(len(result[name]["names"]) - 1) for name in names]
+    lines.append("| (random) | " + " | ".join(f"({b:.2f})" for b in bounds) + " | |")
+    lines += [
+        "",
+        "Held-out PSNR of these fits, in dB:",
+        "",
+        "| | " + " | ".join(names) + " |",
+        "|---|" + "---|" * len(names),
+    ]
+    psnr = lambda x: -10 * math.log10(x)  # noqa: E731
+    for label, of in (
+        ("no view added (3 runs)", lambda r: f"{psnr(np.mean(r['control'])):.2f}"),
+        ("spread of these runs", lambda r: f"{psnr(min(r['control'])) - psnr(max(r['control'])):.2f}"),
+        ("worst view added", lambda r: f"{psnr(max(r['after'])):.2f}"),
+        ("median view added", lambda r: f"{psnr(np.median(r['after'])):.2f}"),
+        ("best view added", lambda r: f"{psnr(min(r['after'])):.2f}"),
+        (
+            "picked by fisher, logdet",
+            lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, logdet']))]):.2f}",
+        ),
+        ("picked by fisherrf", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisherrf']))]):.2f}"),
+        ("picked by coverage", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['coverage']))]):.2f}"),
+        ("picked by farthest", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['farthest']))]):.2f}"),
+    ):
+        lines.append(f"| {label} | " + " | ".join(of(result[name]) for name in names) + " |")
+    lines += [
+        "",
+        "AUSE of the predictive variance per pixel on the held-out views (RMSE; 0 is the order of the true error):",
+        "",
+        "| map | " + " | ".join(names) + " |",
+        "|---|" + "---|" * len(names),
+    ]
+    for label in ("variance", "1 - alpha", "random"):
+        lines.append(f"| {label} | " + " | ".join(f"{result[name]['ause'][label]:.3f}" for name in names) + " |")
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", nargs="+", default=list(studies.SCENES))
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
+    args = parser.parse_args()
+    result = {name: drops(name, args.runs) for name in args.scenes}
+    made = studies.stamp("predict")
+    text = report(result, made)
+    print(text)
+    if tuple(args.scenes) == studies.SCENES:
+        studies.write_rows(ROOT / "benchmarks" / "predict.json", {"made": made, "scenes": result})
+        page = ROOT / "docs" / "active-static.md"
+        before, _, rest = page.read_text().partition(BEGIN)
+        page.write_text(before + BEGIN + "\n\n" + text + "\n\n" + END + rest.partition(END)[2])
+
+
+if __name__ == "__main__":
+    main()

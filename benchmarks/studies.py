@@ -1,0 +1,128 @@
+"""What the studies share: scenes at `--scale small`, base models, statistics, and the line that says where and when.
+
+`small` is 15,000 Gaussians, at most 12,000 pixels and a fifth of the paper's steps (a pick every 40 of 1,400);
+`paper` is 30,000 Gaussians, 130,000 pixels and its 7,000 steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import numpy as np  # noqa: E402
+
+from drgs import runtime  # noqa: E402
+from drgs.active import initial_views  # noqa: E402
+from drgs.data import initial_points, load, scene_extent  # noqa: E402
+from drgs.density import Model  # noqa: E402
+from drgs.files import load_state, save_state  # noqa: E402
+from drgs.frames import load_frames  # noqa: E402
+from drgs.trainer import FitConfig, Trainer  # noqa: E402
+
+__all__ = ["SCALES", "SCENES", "base", "dataset", "interval", "rank_correlation", "read_rows", "stamp", "write_rows"]
+
+DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
+SCENES = ("office", "head", "still_life")
+SCALES = {
+    "small": {"max_pixels": 12_000, "max_gaussians": 15_000, "max_steps": 1400, "every": 40},
+    "paper": {"max_pixels": 130_000, "max_gaussians": 30_000, "max_steps": 7000, "every": 200},
+}
+
+
+def dataset(name: str, runs: Path):
+    """A scene's views; the still life is made where it is not there yet."""
+    if name != "still_life":
+        return load(DATA / name)
+    from scenes import still_life
+
+    return load(still_life.generate(runs / "still_life", views=40, width=240, height=180))
+
+
+def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") -> tuple:
+    """(trainer, pool frames, indices of the training views among them, held-out frames) of a fit to a few views.
+
+    The first training view and those farthest from it; kept as a checkpoint for the next call.
+    """
+    train, test = dataset(name, runs).split(8)
+    size = SCALES[scale]
+    config = FitConfig(max_pixels=size["max_pixels"], max_gaussians=size["max_gaussians"], max_steps=steps)
+    chosen = initial_views([view.camera for view in train], views)
+    pool, held_out = load_frames(train, config.max_pixels), load_frames(test, config.max_pixels)
+    frames = [pool[i] for i in chosen]
+    path = runs / "base" / f"{name}-{scale}-{views}-{steps}.safetensors"
+    if path.exists():
+        tensors, header = load_state(path)
+        return Trainer.from_state(config, frames, tensors, header, str(path)), pool, chosen, held_out
+    views_seen = [train[i] for i in chosen]
+    points, colors, _ = initial_points(views_seen, seed=0, max_points=config.max_gaussians)
+    dense = any(view.depth_path is not None for view in views_seen)
+    import torch
+
+    model = Model.from_points(
+        torch.from_numpy(points),
+        torch.from_numpy(colors),
+        config.dense_opacity if dense else config.initial_opacity,
+        config.dense_scale if dense else 1.0,
+    )
+    trainer = Trainer(config, frames, model, scene_extent([f.camera for f in frames], points))
+    while trainer.step_index < steps:
+        trainer.step()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_state(path, *trainer.state())
+    return trainer, pool, chosen, held_out
+
+
+def continued(trainer: Trainer, frames: list, steps: int) -> Trainer:
+    """A copy of a fit that goes on with other frames, at its last learning rates and without density control."""
+    tensors, _ = trainer.state()
+    config = dataclasses.replace(trainer.config, max_steps=trainer.config.max_steps + steps, refine_stop=0.0)
+    copy = Trainer(config, frames, Model.from_state({k: v.clone() for k, v in tensors.items()}), trainer.extent)
+    copy.step_index = trainer.config.max_steps
+    for _ in range(steps):
+        copy.step()
+    return copy
+
+
+def rank_correlation(a, b, kind: str = "spearman") -> float:
+    """Spearman's rho, or Kendall's tau-b."""
+    from scipy import stats
+
+    return float((stats.spearmanr if kind == "spearman" else stats.kendalltau)(a, b).statistic)
+
+
+def interval(values, draws: int = 10_000) -> tuple[float, float, float]:
+    """Mean and the 95 % bootstrap interval of the mean."""
+    values = np.asarray(values, float)
+    rng = np.random.default_rng(0)
+    means = values[rng.integers(0, len(values), (draws, len(values)))].mean(1)
+    return float(values.mean()), float(np.quantile(means, 0.025)), float(np.quantile(means, 0.975))
+
+
+def stamp(script: str) -> str:
+    """Where and when a study ran."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    return (
+        f"`python benchmarks/{script}.py`, {runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
+        f"{runtime.backend().variant}, {datetime.date.today().isoformat()}, commit {commit.stdout.strip()}."
+    )
+
+
+def write_rows(path: Path, rows) -> None:
+    """JSON, atomically: studies are resumed from it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(rows, indent=1) + "\n")
+    part.replace(path)
+
+
+def read_rows(path: Path, default):
+    """What `write_rows` wrote, or the default."""
+    return json.loads(path.read_text()) if path.exists() else default

@@ -1,0 +1,207 @@
+"""What cheaper estimates of the Fisher information cost in accuracy and give in speed.
+
+    python benchmarks/tradeoff_fisher.py [--scenes office still_life cube] [--runs runs/studies]
+
+Every method computes H of the training views and of every candidate, scores the candidates by `logdet` (relative prior
+1e-3) and picks; `exact` on preset `exact` is the truth. Results go to docs/tradeoff-fisher.md (tables, one plot) and
+benchmarks/tradeoff_fisher.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import studies
+import torch
+from cubes import cube
+from studies import ROOT
+
+import drgs
+from drgs import fisher
+from drgs.cameras import Camera, look_at
+from drgs.gain import Prior, information_gain
+
+Preset = drgs.RenderSettings.preset
+PRIOR = Prior(1e-3, relative=True)
+CHUNKS = (1, 3, 12, 48)  # probes are drawn in these, so that K = 1, 4, 16, 64 share them
+METHODS = {
+    "exact": (Preset("exact"), "exact", 1.0),
+    "integral": (Preset("exact", response="integral"), "exact", 1.0),
+    "order=center": (Preset("exact", order="center"), "exact", 1.0),
+    "fast": (Preset("fast"), "exact", 1.0),
+    "fast, half resolution": (Preset("fast"), "exact", 0.5),
+    "fast, quarter resolution": (Preset("fast"), "exact", 0.25),
+    "gsplat (ewa)": (Preset("gsplat"), "exact", 1.0),
+    "fisherrf": (Preset("exact"), "fisherrf", 1.0),
+    "fisherrf, inria": (Preset("inria"), "fisherrf", 1.0),
+}
+
+
+def made_cube() -> tuple:
+    """Random Gaussians in a cube, 30 cameras around it."""
+    g, rng, cameras = cube(15_000, scale=0.03, sh_degree=1), np.random.default_rng(0), []
+    for k in range(30):
+        eye = rng.normal(size=3)
+        eye *= 4 / np.linalg.norm(eye)
+        K = np.array([[180.0, 0, 80], [0, 180.0, 60], [0, 0, 1]])
+        cameras.append(Camera(K=K, w2c=look_at(eye, rng.normal(size=3) * 0.2), width=160, height=120, name=f"{k:02d}"))
+    return g, cameras[:6], cameras[6:]
+
+
+def scene(name: str, runs: Path) -> tuple:
+    """(Gaussians, training cameras, candidates)."""
+    if name == "cube":
+        return made_cube()
+    trainer, pool, chosen, _ = studies.base(name, runs, 6, 1000)
+    left = [frame.camera for i, frame in enumerate(pool) if i not in chosen]
+    return trainer.gaussians(), [pool[i].camera for i in chosen], left[:24]
+
+
+def information(g, camera, settings, method: str, share: float) -> fisher.Information:
+    """One view's, at a share of its resolution, per full-size pixel."""
+    small = camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+    found = fisher.diagonal(g, small, settings, method)
+    scale = camera.width * camera.height / (small.width * small.height)
+    return {name: x.float() * scale for name, x in found.items()}
+
+
+def measure(g, train: list, candidates: list) -> list[dict]:
+    """A row a method."""
+    views, found, seconds = [*train, *candidates], {}, {}
+    for name, (settings, method, share) in METHODS.items():
+        information(g, views[0], settings, method, share)  # compiles
+        start = time.process_time()
+        found[name] = [information(g, camera, settings, method, share) for camera in views]
+        seconds[name] = (time.process_time() - start) / len(views)
+        print(f"  {name}: {seconds[name]:.3f} s a view", flush=True)
+    for label, settings in (("exact", Preset("exact")), ("fast", Preset("fast"))):
+        total, drawn = None, 0
+        spent = 0.0
+        for chunk in CHUNKS:
+            start = time.process_time()
+            new = [
+                fisher.diagonal(g, camera, settings, "probes", probes=chunk, seed=1000 * k + drawn)
+                for k, camera in enumerate(views)
+            ]
+            spent += time.process_time() - start
+            new = [{name: x.float() * chunk for name, x in part.items()} for part in new]
+            total = new if total is None else [{n: a[n] + b[n] for n in a} for a, b in zip(total, new, strict=True)]
+            drawn += chunk
+            name = f"probes on {label}, K = {drawn}"
+            found[name] = [{n: x / drawn for n, x in part.items()} for part in total]
+            seconds[name] = spent / len(views)
+            print(f"  {name}: {seconds[name]:.3f} s a view", flush=True)
+    return [row(name, found[name], found["exact"], seconds, len(train)) for name in found]
+
+
+def row(name: str, parts: list, truth: list, seconds: dict, trained: int) -> dict:
+    """Errors of one method's information, of its ranking and of its choice."""
+    scores, true = (score(x, trained) for x in (parts, truth))
+    best, chosen = int(np.argmax(true)), int(np.argmax(scores))
+    errors = {}
+    for group in parts[0]:
+        a, b = (torch.stack([part[group].reshape(-1) for part in x]).double() for x in (parts, truth))
+        seen = b > 1e-6 * b.max()
+        errors[group] = float(((a - b).abs() / b)[seen].median())
+    return {
+        "method": name,
+        "seconds": seconds[name],
+        "speed-up": seconds["exact"] / seconds[name],
+        "errors": errors,
+        "error": float(np.median(list(errors.values()))),
+        "tau": studies.rank_correlation(scores, true, "kendall"),
+        "regret": (true[best] - true[chosen]) / true[best],
+        "spread": (true[best] - float(np.median(true))) / true[best],
+    }
+
+
+def score(parts: list, trained: int) -> list[float]:
+    """logdet of every candidate."""
+    groups = parts[0]
+    H = {name: sum(part[name].double() for part in parts[:trained]) for name in groups}
+    return [information_gain(part, H, "logdet", PRIOR).total for part in parts[trained:]]
+
+
+def plot(result: dict, path: Path) -> None:
+    """Error against time, a panel a scene."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, len(result), figsize=(4.6 * len(result), 4.2), sharey=True, squeeze=False)
+    for axis, (name, rows) in zip(panels[0], result.items(), strict=True):
+        for kind, marker in (("probes on exact", "o-"), ("probes on fast", "s-")):
+            part = [r for r in rows if r["method"].startswith(kind)]
+            axis.plot([r["seconds"] for r in part], [r["error"] for r in part], marker, label=f"{kind}, K = 1..64")
+        for r in rows:
+            if "probes" not in r["method"] and r["error"] > 0:
+                axis.plot(r["seconds"], r["error"], "x", color="black")
+                axis.annotate(
+                    r["method"], (r["seconds"], r["error"]), fontsize=7, xytext=(3, 3), textcoords="offset points"
+                )
+        axis.axvline(next(r["seconds"] for r in rows if r["method"] == "exact"), color="gray", lw=0.8, ls=":")
+        axis.set(title=name, xscale="log", yscale="log", xlabel="processor seconds a view")
+    panels[0][0].set_ylabel("median relative error of the diagonal")
+    panels[0][0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=90)
+
+
+def report(result: dict, made: str, notes: str) -> str:
+    """The markdown page."""
+    lines = [
+        "# Cheaper Fisher information: what it costs and what it gives",
+        "",
+        f"Made by {made}",
+        "",
+        "Truth: method `exact` on preset `exact`. Error: relative error of the diagonal, its median over all",
+        "parameters that a view sees, then over groups. tau: Kendall's, of the candidates ranked by `logdet` (prior",
+        "1e-3 of each group's median). Regret: by how much the true gain of the view that a method picks falls short",
+        "of the best view's. Time: of the processor, one view, everything included. FisherRF's errors are those of its",
+        "formula in its own units (activations once), without rotations.",
+    ]
+    for name, rows in result.items():
+        lines += [
+            "",
+            f"## {name}",
+            "",
+            f"Median view: {100 * rows[0]['spread']:.1f} % below the best.",
+            "",
+            "| method | ms a view | speed-up | error of the diagonal | tau | regret |",
+            "|---|---|---|---|---|---|",
+            *(
+                f"| {r['method']} | {1e3 * r['seconds']:.0f} | {r['speed-up']:.1f} | {r['error']:.1e} | {r['tau']:.2f} "
+                f"| {100 * r['regret']:.2f} % |"
+                for r in rows
+            ),
+        ]
+    lines += ["", "![error against time](pictures/tradeoff-fisher.png)", ""]
+    return "\n".join(lines) + (f"\n## What to use{notes}" if notes else "")
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", nargs="+", default=["office", "still_life", "cube"])
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
+    parser.add_argument("--page", action="store_true", help="the page of the results that there are")
+    args = parser.parse_args()
+    store = ROOT / "benchmarks" / "tradeoff_fisher.json"
+    result = studies.read_rows(store, {"made": "", "scenes": {}})
+    for name in [] if args.page else args.scenes:
+        print(name, flush=True)
+        result["scenes"][name] = measure(*scene(name, args.runs))
+        result["made"] = studies.stamp("tradeoff_fisher")
+        studies.write_rows(store, result)
+    page = ROOT / "docs" / "tradeoff-fisher.md"
+    notes = page.read_text().partition("\n## What to use")[2] if page.exists() else ""
+    plot(result["scenes"], ROOT / "docs" / "pictures" / "tradeoff-fisher.png")
+    page.write_text(report(result["scenes"], result["made"], notes))
+    print(page.read_text())
+
+
+if __name__ == "__main__":
+    main()
