@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from dense_jacobian import GROUPS, error
+from scenes_extreme import CASES
 from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
@@ -216,6 +217,24 @@ def test_presets(preset):
     exact, columns = fisher.diagonal(g, cam, settings), fisher.diagonal(g, cam, settings, "columns")
     for name in GROUPS:
         assert error(columns[name], exact[name]) <= 1e-4, name
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name.replace("`", ""))
+def test_extremes(case):
+    """Finite where the renderer is, and the squares of the columns: of three random parameters of every group."""
+    rng = np.random.default_rng(3)
+    g, cam = case.build(rng)
+    found = fisher.diagonal(g, cam, case.settings)
+    assert all(torch.isfinite(x).all() for x in found.values())
+    assert torch.isfinite(fisher.blocks(g, cam, case.settings)).all()
+    for name, x in found.items():
+        if name == "features" or not len(g):
+            continue
+        rows = np.stack([rng.integers(0, n, 3) for n in x.shape], 1)
+        columns = fisher.jacobian_columns(g, cam, {name: rows}, case.settings)[..., :3].double()
+        want = columns.square().sum((1, 2, 3))
+        scale = float(x.max())
+        assert float((x[tuple(rows.T)] - want).abs().max()) <= 1e-4 * max(scale, 1e-30), name
 
 
 def test_nothing_to_see():
