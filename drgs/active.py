@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,10 @@ __all__ = [
 ]
 
 SELECTION = "selection.json"
+PICK_POINTS = ("auto", "uncovered", "none")
+_COVERED = 0.5  # opacity of a pixel that needs no new points
+_MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
+_FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 METHODS = ("exact", "columns", "probes", "fisherrf")
 
 
@@ -56,6 +61,9 @@ class ActiveConfig:
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
         prior: lambda, the prior precision of every parameter.
         relative_prior: lambda is `prior` times the median of the group's positive information.
+        pick_points: `uncovered`: a picked view brings points of its own where the Gaussians are transparent in it, for
+            density control never leaves what it has covered; the budget is divided evenly among the views. `none`: no
+            points after the start [1]. `auto`: `none` with initial points of the whole data set, else `uncovered`.
     """
 
     policy: str = "fisher"
@@ -67,6 +75,7 @@ class ActiveConfig:
     info_pixels: int | None = None
     prior: float = 1e-6
     relative_prior: bool = False
+    pick_points: str = "auto"
 
     def __post_init__(self):
         from drgs.gain import CRITERIA
@@ -79,7 +88,8 @@ class ActiveConfig:
             if not (isinstance(value, int) and value >= low):
                 hint = "; without --views active all views are used" if name == "add" else ""
                 raise ValueError(f"active: {name} must be a whole number >= {low}, got {value!r}{hint}")
-        for name, known in (("policy", POLICIES), ("criterion", CRITERIA), ("method", METHODS)):
+        choices = {"policy": POLICIES, "criterion": CRITERIA, "method": METHODS, "pick_points": PICK_POINTS}
+        for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"active: {name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         self.make_prior()
@@ -123,6 +133,8 @@ class ActiveViews:
         self.chosen = initial_views([view.camera for view in views], active.initial)
         self.picks: list[dict] = []
         self.pool_leak = config.init_points == "all"
+        grows = {"auto": not self.pool_leak, "uncovered": True, "none": False}[active.pick_points]
+        self._share = config.max_gaussians // (active.initial + active.add) if grows else 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
 
@@ -135,6 +147,46 @@ class ActiveViews:
         """The views that initial points may be made from, checked against their images."""
         views = self.views if self.pool_leak else [self.views[i] for i in self.chosen[: self.active.initial]]
         return [view.checked() for view in views]
+
+    @property
+    def reserved(self) -> int:
+        """Gaussians to leave room for: those of views that are still to be picked."""
+        return self._share * (self.active.add - len(self.picks))
+
+    def points(self, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, torch.Tensor, bool]:
+        """Points of the view that was picked last, where the Gaussians leave its pixels more than half transparent.
+
+        Args:
+            frame: Its photograph.
+            gaussians: The scene as it is now.
+        Returns:
+            (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
+        """
+        import drgs
+        from drgs.data import initial_points
+
+        nothing = torch.empty(0, 3), torch.empty(0, 3), False
+        with torch.no_grad():
+            alpha = drgs.render(gaussians, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
+        is_open = alpha < _COVERED
+        if frame.mask is not None:
+            is_open &= frame.mask.numpy() > _COVERED
+        if not self._share or not is_open.any():
+            return nothing
+        seen = [self.views[i] for i in self.chosen]
+        dense = seen[-1].depth_path is not None
+        wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share) if dense else self._share
+        points, colors, _ = initial_points(
+            seen[-1:] if dense else seen, seed=self._config.seed + len(self.picks), max_points=wanted
+        )
+        pixels, depth = frame.camera.project(points)
+        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (frame.camera.width, frame.camera.height)).all(1)
+        columns, rows = pixels[inside].astype(int).T
+        inside[inside] = is_open[rows, columns]
+        kept = np.flatnonzero(inside)[: self._share]
+        if len(kept) < _FEWEST:
+            return nothing
+        return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
 
     def frames(self) -> list[Frame]:
         """The photographs seen so far."""

@@ -183,6 +183,8 @@ class Fit(_Policy):
     """Views to be chosen, one at a time; others are not read."""
     every: int = 200
     """Steps between two of them."""
+    pick_points: Literal["auto", "uncovered", "none"] = "auto"
+    """New points of a picked view where there is nothing yet (uncovered); auto: none with --init-points all."""
 
     def settings(self):
         """As for every command, with the background that the photographs are composited on."""

@@ -106,7 +106,8 @@ def fit(
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path))
         seconds, source = header["seconds"], header["point_source"]
     else:
-        trainer, source = _start(dataset, plan.start_views() if plan else train, frames, config, plan is not None)
+        views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
+        trainer, source = _start(dataset, views, frames, config, plan is not None, room)
         seconds = 0.0
     recorded = {
         "command": "fit",
@@ -173,7 +174,7 @@ def run_fit(args: Fit) -> None:
 
 
 def _start(
-    dataset: Dataset, views: list[View], frames: list[Frame], config: FitConfig, strict: bool
+    dataset: Dataset, views: list[View], frames: list[Frame], config: FitConfig, strict: bool, reserved: int
 ) -> tuple[Trainer, str]:
     """A trainer at step 0, and where its points come from: by default, if `strict`, only from `views`."""
     from drgs.data import initial_points, scene_extent
@@ -183,12 +184,11 @@ def _start(
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
     given = config.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     points, colors, source = initial_points(
-        dataset if given else views, seed=config.seed, max_points=config.max_gaussians
+        dataset if given else views, seed=config.seed, max_points=config.max_gaussians - reserved
     )
     extent = scene_extent([frame.camera for frame in frames], points)
     dense = not given and any(view.depth_path is not None for view in views)
-    opacity, scale = (config.dense_opacity, config.dense_scale) if dense else (config.initial_opacity, 1.0)
-    model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), opacity, scale)
+    model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))
     _log.info("%d initial points: %s", len(points), source)
     return Trainer(config, frames, model, extent), source
 
@@ -212,6 +212,8 @@ class _Loop:
     def run(self, bar: _Progress) -> None:
         trainer, config = self.trainer, self.trainer.config
         preview_every = max(1, config.max_steps // _PREVIEWS)
+        if self.plan:
+            trainer.reserved = self.plan.reserved
         with _interrupt_between_steps() as is_interrupted:
             while trainer.step_index < config.max_steps:
                 if is_interrupted():
@@ -247,9 +249,14 @@ class _Loop:
         """One more view."""
         trainer, plan = self.trainer, self.plan
         frame, record = plan.pick(trainer.gaussians(), trainer.frames, trainer.step_index)
+        points, colors, dense = plan.points(frame, trainer.gaussians())
+        if len(points):
+            trainer.add_points(points, colors, *trainer.config.start_of(dense))
+        record["points"] = len(points)
+        trainer.reserved = plan.reserved
         trainer.add_frame(frame)
         plan.write(self.run_folder)
-        shown = ("step", "number", "index", "name", "score", "parts", "margin", "seconds")
+        shown = ("step", "number", "index", "name", "score", "parts", "margin", "seconds", "points")
         self.run_folder.log("pick", **{key: record[key] for key in shown}, candidates=len(record["candidates"]))
         self.save()
         bar.note(

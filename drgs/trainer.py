@@ -110,6 +110,10 @@ class FitConfig:
             if value not in allowed:
                 raise ValueError(f"fit: {name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
 
+    def start_of(self, dense: bool) -> tuple[float, float]:
+        """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
+        return (self.dense_opacity, self.dense_scale) if dense else (self.initial_opacity, 1.0)
+
     def to_json(self) -> dict:
         """As config.json holds it."""
         return json.loads(json.dumps(dataclasses.asdict(self)))
@@ -134,6 +138,7 @@ class Trainer:
         model: The Gaussians and their optimizer.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
+        reserved: Part of the budget that density control leaves for points of photographs to come.
     """
 
     def __init__(self, config: FitConfig, frames: list[Frame], model: Model, extent: float):
@@ -145,7 +150,13 @@ class Trainer:
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._queue = torch.zeros(0, dtype=torch.int64)
-        self._start_count = len(model)
+        self._start_count, self.reserved = len(model), 0
+
+    def add_points(self, points: torch.Tensor, colors: torch.Tensor, opacity: float, scale: float) -> None:
+        """More Gaussians, arguments as of `Model.from_points`; what there is stays as it is."""
+        rows = {name: x.detach() for name, x in Model.from_points(points, colors, opacity, scale).tensors.items()}
+        rows["sh_rest"] = torch.zeros(len(points), *self.model.tensors["sh_rest"].shape[1:])
+        self.model.append(rows)
 
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
@@ -262,7 +273,7 @@ class Trainer:
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
         full = max(config.grow_until * config.max_steps - start, 1)
         part = min(1.0, (done - start + config.refine_every * config.max_steps) / full)
-        budget = config.max_gaussians
+        budget = config.max_gaussians - self.reserved
         wanted = round(self._start_count * (budget / self._start_count) ** part) if self._start_count < budget else 0
         added = add_gaussians(
             model, min(wanted, budget) - len(model), config.min_opacity, config.jitter, self._generator

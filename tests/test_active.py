@@ -317,6 +317,42 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
     assert set(result.run.config()["pool"]) >= set(names)
 
 
+def test_picked_view_brings_points_where_nothing_is(still):
+    """An even share of the budget, inside the mask; none where Gaussians cover the view, or when not wanted."""
+    train = lazily(still).split(4)[0]
+    views = ActiveViews(plan(), train, config(max_gaussians=80))
+    assert views.reserved == 2 * 20
+    frame = views.frames()[-1]
+
+    def one(z, scale):
+        return drgs.Gaussians.from_arrays([[0, 0, z]], [[1, 0, 0, 0]], [[scale] * 3], [0.999], np.zeros((1, 1, 3)))
+
+    points, colors, dense = views.points(frame, one(1e4, 0.1))
+    assert dense
+    assert points.shape == colors.shape == (20, 3)
+    columns, rows = frame.camera.project(points.numpy())[0].astype(int).T
+    assert (frame.mask.numpy()[rows, columns] > 0.5).all()
+    assert np.linalg.norm(points.numpy(), axis=1).max() < 2  # the blobs, not the background
+    assert len(views.points(frame, one(0.0, 50.0))[0]) == 0
+    for quiet in (plan(pick_points="none"), plan()):
+        leak = quiet.pick_points == "auto"
+        views = ActiveViews(quiet, train, config(max_gaussians=80, init_points="all" if leak else "auto"))
+        assert views.reserved == 0
+        assert len(views.points(frame, one(1e4, 0.1))[0]) == 0
+
+
+def test_points_of_picked_views_keep_to_the_budget(still, tmp_path):
+    """Density control leaves room for the views to come, and nothing exceeds --max-gaussians."""
+    cfg = config(max_steps=30, max_gaussians=60, refine_start=0.0)
+    result = fit(lazily(still), tmp_path / "run", cfg, active=plan(add=3, every=6), progress=False)
+    events = result.run.events()
+    counts = {event["step"]: event["gaussians"] for event in events if event["event"] == "density"}
+    assert max(count for step, count in counts.items() if step < 6) <= 60 - 3 * 12
+    assert max(count for step, count in counts.items() if step < 12) <= 60 - 2 * 12
+    assert max(counts.values()) == len(result.gaussians) <= 60
+    assert all(isinstance(event["points"], int) for event in events if event["event"] == "pick")
+
+
 def test_fitted_views_of_other_runs(still, tmp_path):
     """A fit to all views has no selection.json; a damaged or missing one is named."""
     fit(load(still, test_every=4), tmp_path / "all", config(max_steps=2), progress=False)
