@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import drjit as dr
 
-from drgs.kernels import Adjoint, Model, Primal, Ray, Source, Tangent, pack
+from drgs.derivatives import Adjoint, Tangent
+from drgs.kernels import Model, Primal, Ray, Source, pack
 from drgs.projection import RECORD
 from drgs.walk import Part
 

@@ -17,7 +17,8 @@ from __future__ import annotations
 import drjit as dr
 
 from drgs import projection as layout
-from drgs.kernels import if_any_hit, load_packed, pack, packed_size
+from drgs.derivatives import if_any_hit
+from drgs.kernels import load_packed, pack, packed_size
 from drgs.projection import _cross, _dot
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]

@@ -11,7 +11,8 @@ import torch
 from scenes_random import around_camera, camera, gaussians
 
 from drgs import reference, runtime
-from drgs.integrator import Scene, render, to_drjit
+from drgs.integrator import render
+from drgs.scene import Scene, to_drjit
 from drgs.settings import RenderSettings
 
 runtime.backend()
