@@ -34,10 +34,6 @@ smoke: setup
 	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 40
 	$(BIN)/drgs select out/smoke/run --candidates dome --count 6 -k 2 -o out/smoke/selection.json
 	$(BIN)/drgs fisher out/smoke/run --limit 2 --pose -o out/smoke/fisher
-	$(BIN)/drgs select out/smoke/run --candidates dome --count 8 -k 2 -o out/smoke/selection.json
-	$(BIN)/drgs fisher out/smoke/run --limit 1 --pose -o out/smoke/fisher
-	rm -rf out/smoke/active
-	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 30 --max-gaussians 1500
 
 lint: setup
 	$(BIN)/ruff check .

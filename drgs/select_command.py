@@ -82,7 +82,7 @@ def run(args: Select) -> None:
 
 
 def print_table(report: dict, selection: Selection, output: Path) -> None:
-    """The picks with parts per group, and what to know about them, on stdout."""
+    """The picks with each group's part of the score, and what to know about them, on stdout."""
     from rich.console import Console
     from rich.table import Table
 
@@ -90,11 +90,11 @@ def print_table(report: dict, selection: Selection, output: Path) -> None:
     table = Table(title=f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}")
     groups = list(selection.picks[0].parts)
     table.add_column("view", no_wrap=True)
-    for name in ("score", "margin", *groups):
-        table.add_column(_SHORT.get(name, name), justify="right", overflow="fold")
+    for name in ("score", "margin", *(f"{_SHORT.get(name, name)} %" for name in groups)):
+        table.add_column(name, justify="right", no_wrap=True)
     for pick in selection.picks:
         margin = "-" if pick.margin is None else f"{pick.margin:.3g}"
-        parts = (f"{pick.parts[name]:.3g}" for name in groups)
+        parts = (f"{100 * pick.parts[name] / pick.score:.1f}" if pick.score else "-" for name in groups)
         table.add_row(pick.name, f"{pick.score:.5g}", margin, *parts)
     console = Console()
     console.print(table)
