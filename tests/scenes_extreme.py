@@ -72,6 +72,20 @@ def _at_camera(offset, scale=0.3):
     return _change(change)
 
 
+def _on_axes(rng):
+    """Means exactly on the camera's axes and diagonal, Gaussians aligned with them: ties of every choice of a frame."""
+    g, cam = gaussians(rng, 12, 4), camera(rng, SIZE, turn=0.0)
+    places = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]
+    with torch.no_grad():
+        cam.w2c[:3, 3] = torch.tensor([0.125, -0.125, 4.0])  # as a float32 mean can be
+        for i, place in enumerate(places):
+            g.means[i] = torch.tensor(cam.center + 0.25 * np.array(place))
+            g.quats[i] = torch.tensor([1.0, 0, 0, 0])
+            g.log_scales[i] = math.log(0.25)
+            g.logit_opacities[i] = -1.0
+    return g, cam
+
+
 def _scaled(factor):
     """Everything, the camera's distance included, in other units."""
 
@@ -227,6 +241,8 @@ CASES = (
     Case("mean in the camera plane", _at_camera([0.2, 0.1, 0])),
     Case("mean in the camera plane, `integral`", _at_camera([0.2, 0.1, 0]), {"response": "integral"}),
     Case("mean on the camera's x axis", _at_camera([0.2, 0, 0]), {"response": "integral"}),
+    Case("means exactly on the camera's axes", _on_axes),
+    Case("means exactly on the camera's axes, `integral`", _on_axes, {"response": "integral"}),
     Case("mean just off the camera plane", _at_camera([0.2, 0.1, 1e-6]), {"response": "integral"}),
     Case("crossing the near plane", _at_camera([0, 0, 0.21]), {"near": 0.2}),
     Case("covering the screen, sigma 100", _change(_covering)),
