@@ -42,6 +42,7 @@ __all__ = [
 SELECTION = "selection.json"
 PICK_POINTS = ("auto", "uncovered", "none")
 _COVERED = 0.5  # opacity of a pixel that needs no new points
+_WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 METHODS = ("exact", "columns", "probes", "fisherrf")
@@ -171,7 +172,7 @@ class ActiveViews:
         is_open = alpha < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED
-        if not self._share or not is_open.any():
+        if not self._share or is_open.mean() < _WORTH:
             return nothing
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None
