@@ -50,11 +50,19 @@ def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) 
     from drgs import runtime
 
     mi = runtime.mitsuba()
+    import drjit as dr
+
     planes = [np.asarray(rgb, np.float32), *(np.asarray(x, np.float32)[..., None] for x in channels.values())]
     data = np.ascontiguousarray(np.concatenate(planes, axis=2))
     bitmap = mi.Bitmap(data, mi.Bitmap.PixelFormat.MultiChannel, ["R", "G", "B", *channels])
+    threads = dr.thread_count()
     with _temporary(Path(path)) as name:
-        bitmap.write(name, mi.Bitmap.FileFormat.OpenEXR)
+        try:
+            # The encoder hands its work to the thread pool and waits: with a pool of one, for ever.
+            dr.set_thread_count(max(2, threads))
+            bitmap.write(name, mi.Bitmap.FileFormat.OpenEXR)
+        finally:
+            dr.set_thread_count(threads)
 
 
 def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:

@@ -316,3 +316,12 @@ def test_wolf(data_dir, tmp_path):
         legs, back = (alpha[a:b] > 0.5 for a, b in ((rows.max() - 9, rows.max()), (rows.min(), rows.max() - 9)))
         assert legs.sum() < back.sum()
         assert (alpha[(rows.min() + rows.max()) // 2] > 0.95).any()
+
+
+def test_exr_with_one_thread(scene, tmp_path):
+    """Mitsuba's encoder waits for a second thread: it gets one."""
+    command = [sys.executable, "-m", "drgs", "render", str(scene), "--frames", "1", "--width", "16", "--threads", "1"]
+    command += ["--format", "exr", "-o", str(tmp_path / "o")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "o").glob("*.exr"))) == 1
