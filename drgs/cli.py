@@ -236,6 +236,8 @@ class Select(_Policy, _Views):
     """Views to pick, each given the ones before."""
     output: _Output = Path("selection.json")
     """The JSON file."""
+    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
+    """Render settings of a named system; fast ranks as exact does, in a fraction of the time (docs)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
