@@ -23,6 +23,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
+from drgs.gain import Prior, information_gain
 from drgs.integrator import render_jvp
 from drgs.replay import GEOMETRY, Information, Replay, by_probes
 from drgs.settings import RenderSettings
@@ -31,9 +32,11 @@ __all__ = [
     "BLOCK",
     "GROUPS",
     "Information",
+    "Prior",
     "blocks",
     "coverage",
     "diagonal",
+    "information_gain",
     "jacobian_columns",
     "pose_information",
     "variance_map",
