@@ -188,6 +188,8 @@ class Fit(_Policy):
 
     def settings(self):
         """As for every command, with the background that the photographs are composited on."""
+        if any(text.startswith("background=") for text in self.overrides):
+            raise ValueError("--set background: must be --background here, which photographs are composited on as well")
         return super().settings().replace(background=self.background)
 
     def active(self):

@@ -1,4 +1,4 @@
-"""Replays of the compositing of a ray: the adjoint, and forward mode with any number of tangents.
+"""Derivatives of the compositing of a ray: the adjoint, a replay of it, and forward mode, which goes along with it.
 
     a, T, w as in kernels.py
     s_i   derivative of the loss with respect to w_i: cotangent . (color, features, 1, depth)

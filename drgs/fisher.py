@@ -11,7 +11,8 @@ J^T J of the Jacobian J of S (Gauss-Newton; no photograph is needed). Parameters
     features (N,)            every channel of a feature has the same information, sum_p w_p^2
 
 Sources: Jiang et al. 2024 (FisherRF) for the criterion, with what its code computes instead under method "fisherrf";
-Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering (jacobian.py).
+Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering
+(replay.py, jacobian.py).
 """
 
 from __future__ import annotations
@@ -83,9 +84,7 @@ def diagonal(
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
     cameras, wanted = _cameras(cameras), _groups(gaussians, groups)
-    weights = [float(x) for x in channel_weights]
-    if len(weights) != 3 or not all(np.isfinite(weights)) or min(weights) < 0:
-        raise ValueError(f"fisher.diagonal: channel_weights must be 3 finite numbers >= 0, got {channel_weights}")
+    weights = _weights(channel_weights)
     if method == "fisherrf":
         wanted = tuple(name for name in wanted if name != "rotations")
     total = {name: torch.zeros(_shape(gaussians, name), dtype=torch.float64) for name in wanted}
@@ -121,7 +120,7 @@ def blocks(
     total = torch.zeros(len(gaussians), BLOCK, BLOCK, dtype=torch.float64)
     for camera in _cameras(cameras):
         if len(gaussians):
-            total += Replay(gaussians, camera, settings).blocks([float(x) for x in channel_weights])
+            total += Replay(gaussians, camera, settings).blocks(_weights(channel_weights))
     return total
 
 
@@ -154,8 +153,8 @@ def variance_map(
     """
     settings = settings or RenderSettings.preset("exact")
     for name, x in weights.items():
-        if name not in GROUPS:
-            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(GROUPS)}, got {name!r}")
+        if name not in GROUPS or name == "features":
+            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(GROUPS[:-1])}, got {name!r}")
         if tuple(x.shape) != _shape(gaussians, name):
             raise ValueError(
                 f"fisher.variance_map: weights of {name} must have shape {_shape(gaussians, name)}, "
@@ -163,7 +162,7 @@ def variance_map(
             )
     if not len(gaussians):
         return torch.zeros(camera.height, camera.width)
-    return Replay(gaussians, camera, settings).variance(weights, [float(x) for x in channel_weights])
+    return Replay(gaussians, camera, settings).variance(weights, _weights(channel_weights))
 
 
 def jacobian_columns(
@@ -222,6 +221,13 @@ def _cameras(cameras) -> list[Camera]:
     if not cameras:
         raise ValueError("fisher: there must be at least one camera, got none")
     return cameras
+
+
+def _weights(channel_weights) -> list[float]:
+    weights = [float(x) for x in channel_weights]
+    if len(weights) != 3 or not all(np.isfinite(weights)) or min(weights) < 0:
+        raise ValueError(f"fisher: channel_weights must be 3 finite numbers >= 0, got {channel_weights}")
+    return weights
 
 
 def _groups(gaussians: Gaussians, groups) -> tuple[str, ...]:

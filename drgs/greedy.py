@@ -90,7 +90,7 @@ class Cache:
     """
 
     def __init__(self):
-        self._views, self._tensors, self.hits, self.misses = {}, (), 0, 0
+        self._views, self._tensors, self._origin, self.hits, self.misses = {}, (), b"", 0, 0
 
     def __len__(self) -> int:
         return len(self._views)
@@ -104,12 +104,18 @@ class Cache:
         """What is stored under a hashable `key` for these Gaussians, else what `compute` returns."""
         tensors = tuple(gaussians.parameters().values())
         # Weak: a cache must not keep the Gaussians of an earlier state alive.
-        same = len(tensors) == len(self._tensors) and all(
-            reference() is x and version == x._version
-            for x, (reference, version) in zip(tensors, self._tensors, strict=True)
+        origin = gaussians.origin.tobytes()
+        same = (
+            origin == self._origin
+            and len(tensors) == len(self._tensors)
+            and all(
+                reference() is x and version == x._version
+                for x, (reference, version) in zip(tensors, self._tensors, strict=True)
+            )
         )
         if not same:
             self.invalidate()
+            self._origin = origin
             self._tensors = tuple((weakref.ref(x), x._version) for x in tensors)
         if key not in self._views:
             self._views[key] = compute()

@@ -1,6 +1,6 @@
 """What happens at one hit, and what compositing does with it.
 
-The traversals (`tiles.py`, `bvh.py`) decide which Gaussian a ray meets next; this module evaluates the hit from what is
+`walk.py` decides which Gaussian a ray meets next; this module evaluates the hit from what is
 stored of the Gaussian and updates the state of the ray. All of it runs inside Dr.Jit loops with AD suspended; the
 derivative of a hit is taken by local AD inside the loop, so there is one formula a response.
 

@@ -220,7 +220,14 @@ def run_eval(args: Eval) -> None:
     config = FitConfig.from_json(recorded["fit"])
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
     g = load_ply(run.point_cloud)
-    dataset = load(recorded["data"], test_every=config.test_every, background=config.settings.background)
+    # Of an active run, images may be missing that were never picked.
+    dataset = load(
+        recorded["data"],
+        test_every=config.test_every,
+        background=config.settings.background,
+        lazy=bool(recorded.get("active")),
+        points=False,
+    )
     train, test = dataset.split()
     if recorded.get("active"):  # the rest of the training split was never seen
         fitted = fitted_views(run)

@@ -47,14 +47,12 @@ class DrgsIntegrator(RBIntegrator):
         for field in dataclasses.fields(RenderSettings):
             if field.name in props:
                 fields[field.name] = props[field.name]
-        if preset == "fast" and "order" not in fields:
-            fields["order"] = "center"
         self.settings = RenderSettings.preset(preset, **fields)
-        self.center = None
+        self.pose = None
 
     def sample_rays(self, scene, sensor, *args, **kwargs):
         """Mitsuba's, remembering where the camera is: rays start on the near plane, not at the camera."""
-        self.center = sensor.world_transform().translation()
+        self.pose = sensor.world_transform().matrix
         return super().sample_rays(scene, sensor, *args, **kwargs)
 
     def sample(self, mode, scene, sampler, ray, δL, state_in, active, **kwargs):
@@ -79,9 +77,7 @@ class DrgsIntegrator(RBIntegrator):
         n = dr.width(ray)
         o, d = ([t.Float(x) + dr.zeros(t.Float, n) for x in v] for v in (o, d))
         along_ray = s.sh_direction == "ray"
-        # Only the translation matters: depth keys are distances, SH directions are in world axes.
-        center = self.center if self.center is not None else [dr.gather(t.Float, x, 0) for x in o]
-        w2c = [v for r in range(3) for v in (*[t.Float64(float(r == c)) for c in range(3)], -t.Float64(center[r]))]
+        w2c = [v for row in _camera_axes(t, self.pose, o) for v in row]
         pose = dr.zeros(t.Float64, 12)
         for k, v in enumerate(w2c):
             dr.scatter(pose, v, t.UInt32(k))
@@ -102,6 +98,18 @@ class DrgsIntegrator(RBIntegrator):
         return f"DrgsIntegrator[{self.settings}]"
 
 
+def _camera_axes(t, pose, origins):
+    """Rows of w2c: of the sensor (whose x and y point the other way), or at the first ray's origin in world axes."""
+    if pose is None:
+        axes = [[t.Float64(float(r == c)) for c in range(3)] for r in range(3)]
+        center = [t.Float64(dr.gather(t.Float, x, 0)) for x in origins]
+    else:
+        axes = [[t.Float64(pose[c, r]) * (1 if r == 2 else -1) for c in range(3)] for r in range(3)]
+        axes = [[x * dr.rsqrt(sum(y * y for y in row)) for x in row] for row in axes]
+        center = [t.Float64(pose[c, 3]) for c in range(3)]
+    return [[*row, -sum(x * y for x, y in zip(row, center, strict=True))] for row in axes]
+
+
 def _parameters(t, scene):
     """Raw parameter arrays of the scene's `ellipsoids` shape, attached to its AD graph."""
     shapes = [s for s in scene.shapes() if s.is_ellipsoids()]
@@ -117,14 +125,14 @@ def _parameters(t, scene):
     data, opacity, sh = params["data"], params["opacities"], params["sh_coeffs"]
     count = dr.width(data) // 10
 
-    def columns(width, offset):
+    def columns(width):
         j = dr.arange(t.UInt32, count * width)
-        return j // width * 10, j % width, offset
+        return j // width * 10, j % width
 
-    row, k, offset = columns(3, 0)
-    p = {"means": dr.gather(t.Float, data, row + k + offset)}
+    row, k = columns(3)
+    p = {"means": dr.gather(t.Float, data, row + k)}
     p["log_scales"] = dr.log(dr.gather(t.Float, data, row + k + 3))
-    row, k, _ = columns(4, 6)
+    row, k = columns(4)
     p["quats"] = dr.gather(t.Float, data, row + 6 + (k + 3) % 4)  # xyzw to wxyz
     opacity = dr.clip(opacity, 1e-30, 1 - 6e-8)  # the logit of 0 and 1 is infinite
     p["logit_opacities"] = dr.log(opacity) - dr.log(1 - opacity)

@@ -29,13 +29,12 @@ class Replay:
     """A view rendered once, to be replayed for information."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True):
-        if settings.sh_direction == "ray":
+        if geometry and settings.sh_direction == "ray":
             raise NotImplementedError(
                 "fisher: sh_direction must be 'gaussian' here, got 'ray'; use method 'columns' or 'probes'"
             )
         self.scene = scene = Scene(gaussians.detach().replace(features=None), camera, settings, frozenset())
         self.t, self.settings, self.count = scene.t, settings, len(gaussians)
-        self.featured = gaussians.features is not None
         t = self.t
         self.inputs = {name: to_drjit(t, x) for name, x in scene.inputs.items()}
         view, arguments = scene.prepare(self.inputs)
@@ -192,27 +191,25 @@ class Replay:
 
 
 def by_probes(gaussians, camera, settings, shapes: dict, weights, probes: int, seed: int) -> Information:
-    """Mean of (J^T v)^2 over Rademacher images v."""
+    """Mean of (J^T v)^2 over Rademacher images v; features, whose information is sum w^2, are exact."""
     if probes < 1:
         raise ValueError(f"fisher.diagonal: probes must be >= 1, got {probes}")
-    scene = Scene(gaussians.detach(), camera, settings, frozenset())
+    total = {name: torch.zeros(shape, dtype=torch.float64) for name, shape in shapes.items() if name != "features"}
+    scene = Scene(gaussians.detach().replace(features=None), camera, settings, frozenset())
     t, generator = scene.t, torch.Generator().manual_seed(seed)
     inputs = {name: to_drjit(t, x) for name, x in scene.inputs.items()}
     names = {"means": "means", "rotations": "quats", "log_scales": "log_scales"}
-    wanted_inputs = {names.get(name, name) for name in shapes}
-    dr.enable_grad([inputs[name] for name in wanted_inputs])
+    wanted = {names.get(name, name) for name in total}
+    dr.enable_grad([inputs[name] for name in wanted])
     view, arguments = scene.prepare(inputs)
     operation = Composite()
     with dr.suspend_grad():
         operation.eval(view, *dr.detach(list(arguments[1:5])), True)
-    attached = {"record": arguments[1], "sh": arguments[2], "features": arguments[3]}
-    total = {name: torch.zeros(shapes[name], dtype=torch.float64) for name in shapes}
-    pixels, root = view.pixels, torch.tensor(weights).sqrt()
-    sign = lambda *shape: torch.randint(0, 2, shape, generator=generator).float() * 2 - 1  # noqa: E731
-    for _ in range(probes):
-        cotangent = {"rgb": (sign(pixels, 3) * root).reshape(-1), "alpha": torch.zeros(pixels)}
-        if view.width:
-            cotangent["features"] = sign(pixels * view.width)
+    attached = {"record": arguments[1], "sh": arguments[2]}
+    root = torch.tensor(weights).sqrt()
+    for _ in range(probes if total else 0):
+        sign = torch.randint(0, 2, (view.pixels, 3), generator=generator).float() * 2 - 1
+        cotangent = {"rgb": (sign * root).reshape(-1), "alpha": torch.zeros(view.pixels)}
         g = {name: to_drjit(t, x.to(scene.home)).array for name, x in cotangent.items()}
         with dr.suspend_grad():
             grads = operation.adjoint(g)
@@ -222,15 +219,17 @@ def by_probes(gaussians, camera, settings, shapes: dict, weights, probes: int, s
         dr.enqueue(dr.ADMode.Backward, [x for x, _ in found])
         # The graph is used again by the next probe.
         dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
-        for name in shapes:
-            x = inputs[names.get(name, name)]
-            slope = dr.grad(x).torch().double().cpu()
+        for name in total:
+            slope = dr.grad(inputs[names.get(name, name)]).torch().double().cpu()
             if name == "rotations":
                 slope = _turned(scene.inputs["quats"].double().cpu(), slope)
-            total[name] += slope.square().mean(1) if name == "features" else slope.square()
-        for name in wanted_inputs:
+            total[name] += slope.square()
+        for name in wanted:
             dr.set_grad(inputs[name], 0)
-    return {name: x / probes for name, x in total.items()}
+    result = {name: x / probes for name, x in total.items()}
+    if "features" in shapes:
+        result["features"] = Replay(gaussians, camera, settings, geometry=False).sums((GEOMETRY,), weights)[:, GEOMETRY]
+    return result
 
 
 def _turned(quats: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:

@@ -35,7 +35,7 @@ class Output:
         count: (H, W) int32, composited hits.
         visibility: (N,) sum of w over all pixels; not differentiated.
         features: (H, W, D) when the Gaussians have features.
-        certificate: Of exact order: `rays`, `redone` (rays that needed more passes than one); `pairs` listed.
+        certificate: Of exact order: `rays`, `redone` (rays walked again, along sorted lists); `pairs` listed.
     """
 
     rgb: torch.Tensor
@@ -76,7 +76,7 @@ class Scene:
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
         origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
         if rays is not None:
-            o, d = (torch.as_tensor(x, dtype=torch.float64) for x in rays)
+            o, d = _checked_rays(*rays, settings)
             self.shape = tuple(d.shape[:-1])
             o = o.expand(d.shape).reshape(-1, 3)
             d = torch.nn.functional.normalize(d.reshape(-1, 3), dim=1)
@@ -321,6 +321,25 @@ def _jvp_output(scene: Scene, pushed, batched: bool) -> Output:
     if batched:
         return Output(**{name: torch.stack([o[name] for o in outputs]) for name in outputs[0]})
     return Output(**outputs[0])
+
+
+def _checked_rays(origins, directions, settings):
+    """Float64 tensors of rays that can be traced."""
+    o, d = (torch.as_tensor(x, dtype=torch.float64) for x in (origins, directions))
+    for name, x in (("origins", o), ("directions", d)):
+        if x.ndim == 0 or x.shape[-1] != 3:
+            raise ValueError(f"render_rays: {name} must have shape (..., 3), got {tuple(x.shape)}")
+        bad = ~torch.isfinite(x).all(-1) if name == "origins" else ~((x.norm(dim=-1) > 0) & torch.isfinite(x).all(-1))
+        if bool(bad.any()):
+            at = tuple(bad.nonzero()[0].tolist())
+            must = "finite" if name == "origins" else "finite and not 0"
+            raise ValueError(f"render_rays: {name} must be {must}, got {x[at].tolist()} at index {list(at)}; drop them")
+    if settings.near > 0 or (settings.order == "center" and settings.depth_key == "z"):
+        raise ValueError(
+            "render_rays: near and depth_key='z' are about a camera's axis, rays have none, got "
+            f"near={settings.near:g}, depth_key={settings.depth_key!r}; use near=0 and depth_key='distance'"
+        )
+    return o, d
 
 
 def to_drjit(t, x):

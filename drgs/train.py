@@ -152,7 +152,7 @@ def run_fit(args: Fit) -> None:
     """`drgs fit DATA -o RUN`."""
     from drgs.data import load
 
-    settings = args.settings().replace(background=args.background)
+    settings = args.settings()
     names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
     config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
     active = args.active()

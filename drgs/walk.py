@@ -24,7 +24,7 @@ BUFFER = 16
 EMPTY = -1.0  # order key of "no hit"; keys of hits are >= 0
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
 _LAST = 3.3e38  # a key behind all others
-_MAX_HITS = 1 << 28  # of one sorted list; longer ones are split by rays
+_MAX_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
 
 
 class TileStream:

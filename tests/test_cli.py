@@ -156,12 +156,14 @@ def test_settings_from_options(monkeypatch):
     assert settings.transmittance_min == 0.01  # of the preset
 
 
-def test_background_of_fit(monkeypatch):
+def test_background_of_fit(monkeypatch, capsys):
     """fit renders over the background that it composites photographs on."""
     got = []
     _command(monkeypatch, "fit", lambda args: got.append(args.settings()))
     assert cli.main(["fit", "DATA", "-o", "RUN", "--background", "1", "1", "1"]) == 0
     assert got[0].background == (1.0, 1.0, 1.0)
+    assert cli.main(["fit", "DATA", "-o", "RUN", "--set", "background=1,1,1"]) == 2
+    assert "--set background: must be --background here" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ def test_far(rng, response, ratio):
 
 
 def test_deep_stacks(rng):
-    """Rays that meet more Gaussians than a buffer holds are redone by repeated selection, derivatives too."""
+    """Rays that meet more Gaussians than a buffer holds are redone from sorted lists, derivatives too."""
     cam = camera(rng, (9, 7))
     g = gaussians(rng, 150, 4, 5, scale=0.5)
     with torch.no_grad():
@@ -178,8 +178,8 @@ def test_deep_stacks(rng):
         errors = compare(g, cam, base.replace(traversal=traversal), oracle)
         check(errors)
         assert errors.count <= 1
-        redone = errors.out.certificate["redone"]
-        assert redone > 0 if traversal == "tiles" else redone >= 0
+        if traversal == "tiles":
+            assert errors.out.certificate["redone"] > 0
     center = base.replace(order="center")
     check(compare(g, cam, center, Oracle(g, cam, center, rng)))
 
@@ -501,3 +501,21 @@ def test_no_gaussian(rng, response, order):
         assert all(x is None or not x.any() for x in found)
         pushed = render_jvp(g, cam, {"camera": torch.ones(6)}, settings)
         assert not pushed.rgb.any()
+
+
+@pytest.mark.parametrize(
+    ("origins", "directions", "options", "message"),
+    [
+        ([[0, 0, 0]], [[0, 0, 0]], {}, "directions must be finite and not 0"),
+        ([[0, 0, 0]], [[0, 0, math.nan]], {}, "directions must be finite and not 0"),
+        ([[0, math.inf, 0]], [[0, 0, 1]], {}, "origins must be finite"),
+        ([[0, 0, 0]], [[0, 1]], {}, r"directions must have shape \(..., 3\)"),
+        ([[0, 0, 0]], [[0, 0, 1]], {"near": 0.2}, "near and depth_key='z' are about a camera's axis"),
+        ([[0, 0, 0]], [[0, 0, 1]], {"order": "center", "depth_key": "z"}, "near and depth_key='z' are about"),
+    ],
+)
+def test_rays_that_cannot_be_traced(rng, origins, directions, options, message):
+    """One line that names the first of them."""
+    settings = RenderSettings.preset("exact", traversal="bvh", **options)
+    with pytest.raises(ValueError, match=message):
+        render_rays(gaussians(rng, 3, 1), torch.tensor(origins), torch.tensor(directions), settings)

@@ -50,6 +50,7 @@ def _load(g, cam, **integrator):
         {"preset": "exact", "response": "integral"},
         {"preset": "exact", "sh_direction": "ray"},
         {"preset": "mitsuba"},
+        {"preset": "exact", "near": 3.6, "order": "center", "depth_key": "z"},
     ],
     ids=str,
 )
@@ -58,8 +59,6 @@ def test_the_center_of_a_pixel_is_what_render_shows(options):
     g, cam = _scene()
     image = np.array(mi.render(_load(g, cam, **options), spp=1))
     fields = {name: x for name, x in options.items() if name != "preset"}
-    if options["preset"] == "fast":
-        fields["order"] = "center"
     settings = RenderSettings.preset(options["preset"], traversal="bvh", **fields)
     # Mitsuba's rays start on the near plane, one centimeter on; nothing is there.
     assert np.abs(image - drgs.render(g, cam, settings).rgb.numpy()).max() < 2e-5

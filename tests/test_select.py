@@ -346,6 +346,8 @@ def test_cache():
     assert run().computed == 0
     g = g.replace(sh=g.sh.clone())  # other tensors: noticed
     assert run().computed == 6
+    g = g.replace(origin=np.array([1.0, 0.0, 0.0]))
+    assert run().computed == 6
     cache.invalidate()
     assert len(cache) == 0
     assert run().computed == 6

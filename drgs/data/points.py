@@ -86,7 +86,7 @@ def initial_points(
         points, colors = _from_depth(views, max_points, rng)
         if len(points):
             used = sum(view.depth_path is not None for view in views)
-            return points, colors, f"back-projected from {used} depth maps, {len(points)} points"
+            return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.image_path is not None for view in views):
         points, colors = _triangulated(views, seed, progress)
