@@ -54,8 +54,7 @@ def run(runs: Path, scale: str, name: str, label: str, seed: int) -> None:
     print(folder.name, flush=True)
     size = dict(SCALES[scale])
     every = size.pop("every")
-    data = studies.dataset(name, runs)
-    data.points = None  # made from the views that have been picked
+    data = studies.dataset(name, runs, lazy=True, points=False)
     active = ActiveConfig(initial=2, add=10, every=every, **POLICIES[label])
     fit(data, folder, FitConfig(seed=seed, **size), active=active, resume=folder.exists(), progress=False)
 

@@ -99,14 +99,31 @@ def candidates(g, cameras: list, count: int, turns: int) -> dict:
     return result
 
 
-def memory(g, cameras: list) -> list[dict]:
-    """Peak memory of the process after scoring more and more candidates."""
+def memory(run: Path) -> list[dict]:
+    """Peak memory of a process that scores so many candidates, each in a process of its own."""
     rows = []
     for count in (5, 20, 80):
-        poses = [cameras[k % len(cameras)].undistorted().resized(320, 240) for k in range(count)]
-        select(g, poses, poses[:3], 1, settings=Preset("fast"))
-        rows.append({"candidates": count, "GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6})
+        command = [sys.executable, __file__, "--run", str(run), "--task", str(count)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        rows.append({"candidates": count, "GB": float(done.stdout.split()[-1])})
     return rows
+
+
+def score(run: Path, count: int) -> float:
+    """Peak memory in GB after one pick."""
+    g, cameras = fitted(run)
+    poses = [cameras[k % len(cameras)].undistorted().resized(320, 240) for k in range(count)]
+    select(g, poses, poses[:3], 1, settings=Preset("fast"))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def fitted(run: Path) -> tuple:
+    """Gaussians of a run and the cameras of its data set."""
+    from drgs.data import load
+    from drgs.files import Run
+
+    views = load(Run(run).config()["data"], points=False).views
+    return drgs.load_ply(run / "point_cloud.ply"), [view.camera for view in views]
 
 
 def growth(turns: int, quick: bool) -> list[dict]:
@@ -189,7 +206,11 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
     parser.add_argument("--run", type=Path, help="a fitted run whose cameras are scored")
+    parser.add_argument("--task", type=int, help="only the peak memory of scoring so many candidates")
     args = parser.parse_args()
+    if args.task:
+        print(score(args.run, args.task))
+        return
     turns = 2 if args.quick else 5
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     result = {
@@ -202,15 +223,10 @@ def main():
     }
     run = args.run or next((p for p in (ROOT / "runs/real/office", ROOT / "out/demo/run") if p.is_dir()), None)
     if run:
-        from drgs.data import load
-        from drgs.files import Run
-
-        config = Run(run).config()
-        g = drgs.load_ply(run / "point_cloud.ply")
-        cameras = [view.camera for view in load(config["data"]).views]
+        g, cameras = fitted(run)
         result["run"] = run.name
         result["candidates"] = candidates(g, cameras, 10 if args.quick else 80, turns)
-        result["memory"] = memory(g, cameras)
+        result["memory"] = memory(run)
     result["growth"] = growth(turns, args.quick)
     text = report(result)
     print(text)

@@ -37,13 +37,13 @@ SCALES = {
 }
 
 
-def dataset(name: str, runs: Path):
-    """A scene's views; the still life is made where it is not there yet."""
+def dataset(name: str, runs: Path, **options):
+    """A scene's views; the still life is made where it is not there yet. `options` as of `drgs.data.load`."""
     if name != "still_life":
-        return load(DATA / name)
+        return load(DATA / name, **options)
     from scenes import still_life
 
-    return load(still_life.generate(runs / "still_life", views=40, width=240, height=180))
+    return load(still_life.generate(runs / "still_life", views=40, width=240, height=180), **options)
 
 
 def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") -> tuple:
@@ -80,10 +80,10 @@ def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") ->
     return trainer, pool, chosen, held_out
 
 
-def continued(trainer: Trainer, frames: list, steps: int) -> Trainer:
-    """A copy of a fit that goes on with other frames, at its last learning rates and without density control."""
+def continued(trainer: Trainer, frames: list, steps: int, seed: int = 0) -> Trainer:
+    """A copy of a fit that goes on with other frames: schedule stretched, no density control, another order."""
     tensors, _ = trainer.state()
-    config = dataclasses.replace(trainer.config, max_steps=trainer.config.max_steps + steps, refine_stop=0.0)
+    config = dataclasses.replace(trainer.config, max_steps=trainer.config.max_steps + steps, refine_stop=0.0, seed=seed)
     copy = Trainer(config, frames, Model.from_state({k: v.clone() for k, v in tensors.items()}), trainer.extent)
     copy.step_index = trainer.config.max_steps
     for _ in range(steps):
