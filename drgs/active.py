@@ -236,7 +236,7 @@ class ActiveViews:
             "margin": best.margin,
             "seconds": selection.seconds,
             "policy": active.policy,
-            "criterion": active.criterion,
+            "criterion": active.criterion if active.policy == "fisher" else None,
             "prior": {"value": active.prior, "relative": active.relative_prior},
             "gaussians": len(gaussians),
             "left_out": selection.left_out,

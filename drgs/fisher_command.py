@@ -17,6 +17,7 @@ import torch
 
 from drgs import pictures
 from drgs.files import SCHEMA, save_state, write_json
+from drgs.gain import variances
 from drgs.progress import Bar
 from drgs.render_command import described, file_names, make_folder
 from drgs.viewpoints import known_views, other_views, scene_of
@@ -98,10 +99,8 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     Returns:
         Those of `variance` and of `share`.
     """
-    variance, share = {}, {}
-    for name, added in prior.per_group(H).items():
-        precision = H[name].double() + added
-        variance[name] = torch.where(precision > 0, precision.reciprocal(), 0.0)
+    variance, share = variances(H, prior), {}
+    for name in H:
         Hc = candidate[name].double()
         # log(1 + x) / Hc tends to the variance where the view says nothing about a parameter.
         share[name] = torch.where(Hc > 0, (Hc * variance[name]).log1p() / Hc, variance[name])

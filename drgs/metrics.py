@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 import drgs
-from drgs.files import SCHEMA, Run, atomic_write, load_ply, write_json
+from drgs.files import SCHEMA, Run, load_ply, write_json
+from drgs.pictures import write_png
 
 if TYPE_CHECKING:
     from drgs.cli import Eval
@@ -30,7 +31,6 @@ __all__ = [
     "print_table",
     "psnr",
     "run_eval",
-    "save_png",
     "ssim",
     "write_metrics",
 ]
@@ -188,7 +188,7 @@ def evaluate(
         views.append(row)
         if pictures is not None:
             error = (4 * (shown - target).abs()).clamp(0, 1)
-            save_png(pictures / f"{_file_name(frame.name)}.png", torch.cat([target, shown, error], dim=1))
+            write_png(pictures / f"{_file_name(frame.name)}.png", torch.cat([target, shown, error], dim=1).numpy())
     mean = {}
     for name in METRICS:
         values = [row[name] for row in views if row[name] is not None]
@@ -258,16 +258,6 @@ def print_table(metrics: dict) -> None:
     console.print(table)
     for name, reason in metrics["reasons"].items():
         console.print(f"{name}: none ({reason})", highlight=False, soft_wrap=True)
-
-
-def save_png(path: Path, image: torch.Tensor) -> None:
-    """Write an (H, W, 3) image in [0, 1] as 8-bit PNG, atomically."""
-    import cv2
-
-    data = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()[..., ::-1]
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
-    with atomic_write(path) as file:
-        file.write(encoded.tobytes())
 
 
 def _ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

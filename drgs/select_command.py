@@ -55,7 +55,7 @@ def run(args: Select) -> None:
         "scene": str(args.scene),
         "gaussians": len(scene.gaussians),
         "policy": args.policy,
-        "criterion": args.criterion,
+        "criterion": args.criterion if args.policy == "fisher" else None,
         "method": args.method,
         "prior": {"value": args.prior, "relative": args.relative_prior},
         "seed": args.seed,

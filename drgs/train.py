@@ -25,6 +25,7 @@ from drgs.active import ActiveConfig, ActiveViews
 from drgs.density import Model
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.frames import Frame, load_frames
+from drgs.pictures import write_png
 from drgs.trainer import FitConfig, Trainer
 
 if TYPE_CHECKING:
@@ -293,7 +294,7 @@ class _Loop:
             values.append(metrics.psnr(image, frame.image(), frame.mask))
             if i == 0:
                 pair = torch.cat([frame.image(), image], dim=1)
-                metrics.save_png(self.run_folder.renders / f"preview_{done:06d}.png", pair)
+                write_png(self.run_folder.renders / f"preview_{done:06d}.png", pair.numpy())
         psnr = float(np.mean(values)) if self.held_out else None
         self.run_folder.log("preview", step=done, test_psnr=psnr, gaussians=len(trainer.model), seconds=self.seconds)
         bar.report(done, psnr, len(trainer.model), self.seconds)

@@ -18,6 +18,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.files import load_state
 from drgs.frames import load_frames
 from drgs.losses import photometric_loss, ssim, ssim_map
+from drgs.pictures import write_png
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 32
@@ -41,8 +42,8 @@ def dataset(tmp_path_factory):
     g, views = scene(), []
     for i, camera in enumerate(orbit((0, 0, 0), 3.0, 9, width=SIZE, height=SIZE)):
         out = drgs.render(g, camera, FAST)
-        metrics.save_png(folder / f"{i}.png", out.rgb)
-        metrics.save_png(folder / f"mask_{i}.png", (out.alpha > 0.5).float()[..., None].repeat(1, 1, 3))
+        write_png(folder / f"{i}.png", out.rgb.numpy())
+        write_png(folder / f"mask_{i}.png", (out.alpha > 0.5).float()[..., None].repeat(1, 1, 3).numpy())
         views.append(View(camera=camera, name=str(i), image_path=folder / f"{i}.png"))
     rng = np.random.default_rng(0)
     points = g.means.double().numpy() + 0.05 * rng.standard_normal((len(g), 3))
