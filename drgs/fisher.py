@@ -25,8 +25,10 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.gain import Prior, information_gain
+from drgs.groups import GROUPS, Information, groups_of
 from drgs.integrator import render_jvp
-from drgs.replay import GEOMETRY, Information, Replay, by_probes
+from drgs.jacobian import GEOMETRY
+from drgs.replay import Replay, by_probes
 from drgs.settings import RenderSettings
 
 __all__ = [
@@ -43,7 +45,6 @@ __all__ = [
     "variance_map",
 ]
 
-GROUPS = ("means", "rotations", "log_scales", "logit_opacities", "sh", "features")
 METHODS = ("exact", "columns", "probes", "fisherrf")
 BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 _BATCH = 16  # tangents of one traversal
@@ -83,19 +84,18 @@ def diagonal(
     settings = settings or RenderSettings.preset("exact")
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    cameras, wanted = _cameras(cameras), _groups(gaussians, groups)
+    cameras, wanted = _cameras(cameras), groups_of(gaussians, groups)
     weights = _weights(channel_weights)
     if method == "fisherrf":
-        wanted = tuple(name for name in wanted if name != "rotations")
-    total = {name: torch.zeros(_shape(gaussians, name), dtype=torch.float64) for name in wanted}
+        wanted = {name: group for name, group in wanted.items() if group.fisherrf}
+    total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in wanted.items()}
     for number, camera in enumerate(cameras):
         if not len(gaussians):
             break
         if method == "columns":
             part = _by_columns(gaussians, camera, settings, wanted, weights)
         elif method == "probes":
-            shapes = {name: _shape(gaussians, name) for name in wanted}
-            part = by_probes(gaussians, camera, settings, shapes, weights, probes, seed + number)
+            part = by_probes(gaussians, camera, settings, wanted, weights, probes, seed + number)
         else:
             part = Replay(gaussians, camera, settings).diagonal(wanted, weights, method == "fisherrf")
         for name in wanted:
@@ -152,14 +152,13 @@ def variance_map(
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0.
     """
     settings = settings or RenderSettings.preset("exact")
+    known = {name: group for name, group in groups_of(gaussians).items() if group.spread}
     for name, x in weights.items():
-        if name not in GROUPS or name == "features":
-            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(GROUPS[:-1])}, got {name!r}")
-        if tuple(x.shape) != _shape(gaussians, name):
-            raise ValueError(
-                f"fisher.variance_map: weights of {name} must have shape {_shape(gaussians, name)}, "
-                f"got {tuple(x.shape)}"
-            )
+        if name not in known:
+            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(known)}, got {name!r}")
+        shape = known[name].shape(gaussians)
+        if tuple(x.shape) != shape:
+            raise ValueError(f"fisher.variance_map: weights of {name} must have shape {shape}, got {tuple(x.shape)}")
     if not len(gaussians):
         return torch.zeros(camera.height, camera.width)
     return Replay(gaussians, camera, settings).variance(weights, _weights(channel_weights))
@@ -182,7 +181,7 @@ def jacobian_columns(
     """
     chosen = []
     for name, rows in index.items():
-        shape = (6,) if name == "camera" else _column_shape(gaussians, name)
+        shape = _tangent_shape(gaussians, name)
         rows = np.asarray(rows, np.int64)
         rows = rows[:, None] if rows.ndim == 1 else rows
         if rows.ndim != 2 or rows.shape[1] != len(shape) or (rows < 0).any() or (rows >= shape).any():
@@ -196,7 +195,7 @@ def jacobian_columns(
         part = chosen[start : start + batch]
         tangents = {}
         for k, (name, at) in enumerate(part):
-            shape = (6,) if name == "camera" else _column_shape(gaussians, name)
+            shape = _tangent_shape(gaussians, name)
             tangents.setdefault(name, torch.zeros(len(part), *shape, dtype=torch.float64))[(k, *at)] = 1
         out = render_jvp(gaussians, camera, tangents, settings, outputs=())
         images.append(out.rgb if out.features is None else torch.cat([out.rgb, out.features], -1))
@@ -230,43 +229,26 @@ def _weights(channel_weights) -> list[float]:
     return weights
 
 
-def _groups(gaussians: Gaussians, groups) -> tuple[str, ...]:
-    there = [name for name in GROUPS if name != "features" or gaussians.features is not None]
-    for name in groups or ():
-        if name not in there:
-            raise ValueError(f"fisher.diagonal: groups must be among {', '.join(there)}, got {name!r}")
-    return tuple(name for name in there if groups is None or name in groups)
+def _tangent_shape(gaussians: Gaussians, name: str) -> tuple[int, ...]:
+    """Of a group's tangent, or the pose's."""
+    if name == "camera":
+        return (6,)
+    known = groups_of(gaussians)
+    if name not in known:
+        raise ValueError(f"fisher: a parameter group must be one of {', '.join(known)} or camera, got {name!r}")
+    return known[name].tangent(gaussians)
 
 
-def _shape(gaussians: Gaussians, group: str) -> tuple[int, ...]:
-    """Of a group's information."""
-    n = len(gaussians)
-    if group == "sh":
-        return tuple(gaussians.sh.shape)
-    return (n,) if group in ("logit_opacities", "features") else (n, 3)
-
-
-def _column_shape(gaussians: Gaussians, group: str) -> tuple[int, ...]:
-    """Of a group's tangent."""
-    if group not in GROUPS or (group == "features" and gaussians.features is None):
-        raise ValueError(f"fisher: a parameter group must be one of {', '.join(GROUPS)} or camera, got {group!r}")
-    return tuple(gaussians.features.shape) if group == "features" else _shape(gaussians, group)
-
-
-def _by_columns(gaussians, camera, settings, wanted, weights) -> Information:
+def _by_columns(gaussians, camera, settings, wanted: dict, weights) -> Information:
     """From every column of the Jacobian."""
     result = {}
-    scale = torch.tensor(weights, dtype=torch.float64)
-    for name in wanted:
-        shape = _column_shape(gaussians, name)
+    width = 0 if gaussians.features is None else gaussians.features.shape[1]
+    scale = torch.tensor([*weights, *[1.0] * width], dtype=torch.float64)
+    for name, group in wanted.items():
+        shape, squares = group.tangent(gaussians), []
         rows = np.stack(np.unravel_index(np.arange(int(np.prod(shape))), shape), 1)
-        squares = []
         for start in range(0, len(rows), _BATCH):
             columns = jacobian_columns(gaussians, camera, {name: rows[start : start + _BATCH]}, settings).double()
-            if name == "features":
-                squares.append(columns[..., 3:].square().sum((1, 2, 3)))
-            else:
-                squares.append((columns[..., :3].square() * scale).sum((1, 2, 3)))
-        full = torch.cat(squares).reshape(shape).cpu()
-        result[name] = full.mean(1) if name == "features" else full
+            squares.append((columns.square() * scale)[..., slice(*group.outputs)].sum((1, 2, 3)))
+        result[name] = group.merge(torch.cat(squares).reshape(shape).cpu())
     return result

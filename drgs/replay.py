@@ -12,17 +12,15 @@ import drjit as dr  # isort: skip  (after the scene, which chooses libLLVM)
 
 from drgs import projection  # noqa: E402
 from drgs.composite import Composite  # noqa: E402
-from drgs.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras  # noqa: E402
+from drgs.groups import GROUPS, Information  # noqa: E402
+from drgs.jacobian import Blocks, Diagonal, Rows, Variance, extras  # noqa: E402
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
-__all__ = ["GEOMETRY", "Information", "Replay", "by_probes"]
-
-Information = dict[str, torch.Tensor]
-_ENTRIES = {"means": (0, 1, 2), "rotations": (3, 4, 5), "log_scales": (6, 7, 8), "logit_opacities": (9,)}
+__all__ = ["Replay", "by_probes"]
 
 
 class Replay:
@@ -122,33 +120,16 @@ class Replay:
             total += _torch(sink.buffer).reshape(total.shape)
         return total
 
-    def diagonal(self, wanted, weights, fisherrf: bool) -> Information:
-        """`diagonal` of one view."""
-        entries = [k for name in wanted for k in _ENTRIES.get(name, ())]
-        entries += [GEOMETRY] if {"sh", "features"} & set(wanted) else []
-        sums = self.sums(entries, weights, fisherrf)
-        result = {name: sums[:, k] for name, k in _ENTRIES.items() if name in wanted}
-        if "logit_opacities" in wanted:
-            result["logit_opacities"] = sums[:, 9]
-        if fisherrf:
-            self._activate_once(result)
-        if "sh" in wanted:
-            scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64)
-            squared = torch.stack([_torch(x) for x in self.basis], 1).square()
-            result["sh"] = sums[:, GEOMETRY, None, None] * squared[:, :, None] * (self._lit() * scale)[:, None, :]
-        if "features" in wanted:
-            result["features"] = sums[:, GEOMETRY]
+    def diagonal(self, groups: dict, weights, fisherrf: bool) -> Information:
+        """`fisher.diagonal` of one view."""
+        entries = sorted({k for group in groups.values() for k in group.entries})
+        sums, result = self.sums(entries, weights, fisherrf), {}
+        scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64)
+        for name, group in groups.items():
+            result[name] = group.collect(sums[:, group.entries], self, scale)
+            if fisherrf:
+                result[name] = result[name] / group.fisherrf(self.scene.inputs)
         return result
-
-    def _activate_once(self, result: Information) -> None:
-        """FisherRF squares the derivative by s and alpha, then multiplies by ds/dlog s and dalpha/dlogit once."""
-        g = self.scene.inputs
-        if "log_scales" in result:
-            result["log_scales"] = result["log_scales"] / g["log_scales"].cpu().double().exp()
-        if "logit_opacities" in result:
-            opacity = g["logit_opacities"].cpu().double().sigmoid()
-            slope = opacity * (1 - opacity)
-            result["logit_opacities"] = result["logit_opacities"] / slope.clamp_min(1e-300)
 
     def blocks(self, weights) -> torch.Tensor:
         """`blocks` of one view."""
@@ -169,13 +150,12 @@ class Replay:
         """`variance_map`."""
         t, camera = self.t, self.scene.camera
         table = torch.zeros(self.count, 16, dtype=torch.float64)
-        for name, entries in _ENTRIES.items():
-            if name in information:
-                table[:, list(entries)] = information[name].double().reshape(self.count, -1).cpu()
-        if "sh" in information:
-            squared = torch.stack([_torch(x) for x in self.basis], 1).square()
-            along = (squared[:, :, None] * information["sh"].double().cpu()).sum(1)
-            table[:, GEOMETRY : GEOMETRY + 3] = along * self._lit()
+        for name, values in information.items():
+            group = GROUPS[name]
+            spread = group.spread(values.double().cpu(), self)
+            # Squared weights w^2 are of one channel each.
+            first = group.entries[0]
+            table[:, first : first + spread.shape[1]] = spread
         if not torch.isfinite(table).all():
             raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
         buffer = to_drjit(t, table.float().reshape(-1).to(self.scene.home)).array
@@ -186,28 +166,33 @@ class Replay:
         dr.eval(image)
         return image.torch().cpu().reshape(camera.height, camera.width)
 
-    def _lit(self) -> torch.Tensor:
+    def squared_basis(self) -> torch.Tensor:
+        """(N, K) squares of the SH basis towards the Gaussians."""
+        return torch.stack([_torch(x) for x in self.basis], 1).square()
+
+    def unclamped(self) -> torch.Tensor:
+        """(N, 3) 1 where a color channel is above 0, else 0."""
         return torch.stack([_torch(x) for x in self.lit], 1)
 
 
-def by_probes(gaussians, camera, settings, shapes: dict, weights, probes: int, seed: int) -> Information:
-    """Mean of (J^T v)^2 over Rademacher images v; features, whose information is sum w^2, are exact."""
+def by_probes(gaussians, camera, settings, groups: dict, weights, probes: int, seed: int) -> Information:
+    """Mean of (J^T v)^2 over Rademacher images v of RGB; what only other channels tell about is exact."""
     if probes < 1:
         raise ValueError(f"fisher.diagonal: probes must be >= 1, got {probes}")
-    total = {name: torch.zeros(shape, dtype=torch.float64) for name, shape in shapes.items() if name != "features"}
+    other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
+    groups = {name: group for name, group in groups.items() if name not in other}
+    total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
     scene = Scene(gaussians.detach().replace(features=None), camera, settings, frozenset())
     t, generator = scene.t, torch.Generator().manual_seed(seed)
     inputs = {name: to_drjit(t, x) for name, x in scene.inputs.items()}
-    names = {"means": "means", "rotations": "quats", "log_scales": "log_scales"}
-    wanted = {names.get(name, name) for name in total}
-    dr.enable_grad([inputs[name] for name in wanted])
+    dr.enable_grad([inputs[group.input] for group in groups.values()])
     view, arguments = scene.prepare(inputs)
     operation = Composite()
     with dr.suspend_grad():
         operation.eval(view, *dr.detach(list(arguments[1:5])), True)
     attached = {"record": arguments[1], "sh": arguments[2]}
     root = torch.tensor(weights).sqrt()
-    for _ in range(probes if total else 0):
+    for _ in range(probes if groups else 0):
         sign = torch.randint(0, 2, (view.pixels, 3), generator=generator).float() * 2 - 1
         cotangent = {"rgb": (sign * root).reshape(-1), "alpha": torch.zeros(view.pixels)}
         g = {name: to_drjit(t, x.to(scene.home)).array for name, x in cotangent.items()}
@@ -219,25 +204,15 @@ def by_probes(gaussians, camera, settings, shapes: dict, weights, probes: int, s
         dr.enqueue(dr.ADMode.Backward, [x for x, _ in found])
         # The graph is used again by the next probe.
         dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
-        for name in total:
-            slope = dr.grad(inputs[names.get(name, name)]).torch().double().cpu()
-            if name == "rotations":
-                slope = _turned(scene.inputs["quats"].double().cpu(), slope)
-            total[name] += slope.square()
-        for name in wanted:
-            dr.set_grad(inputs[name], 0)
+        for name, group in groups.items():
+            slope = dr.grad(inputs[group.input]).torch().double().cpu()
+            total[name] += group.pull(slope, scene.inputs[group.input].double().cpu()).square()
+        for group in groups.values():
+            dr.set_grad(inputs[group.input], 0)
     result = {name: x / probes for name, x in total.items()}
-    if "features" in shapes:
-        result["features"] = Replay(gaussians, camera, settings, geometry=False).sums((GEOMETRY,), weights)[:, GEOMETRY]
+    if other:
+        result |= Replay(gaussians, camera, settings, geometry=False).diagonal(other, weights, False)
     return result
-
-
-def _turned(quats: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:
-    """(N, 3) derivative by a world-frame rotation, from the one by the quaternion."""
-    axes = torch.eye(3, dtype=torch.float64)
-    return torch.stack(
-        [(slope * 0.5 * quaternion_product(axis.expand(len(quats), 3), quats)).sum(1) for axis in axes], 1
-    )
 
 
 def _unit(k: int) -> list[float]:
