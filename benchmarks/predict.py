@@ -26,6 +26,7 @@ from drgs.select import Cache, select
 
 BEGIN, END = "<!-- predict: begin -->", "<!-- predict: end -->"
 VIEWS, STEPS, MORE = 6, 1000, 200
+COVERED = ", alpha > 0.5"
 SCORES = {
     "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
     "fisher, logdet, relative 1e-3": {
@@ -76,12 +77,14 @@ def drops(name: str, runs: Path) -> dict:
             ).scores
             for label, options in SCORES.items()
         }
-        done["ause"] = ause(g, [f.camera for f in train], held_out, settings)
         # What going on without a new view does is no merit of a view; the seeds say what chance does.
         control = [
             error(studies.continued(trainer, train, MORE, seed).gaussians(), held_out, settings) for seed in range(3)
         ]
         done |= {"names": [pool[i].name for i in left], "control": control, "after": []}
+        studies.write_rows(store, done)
+    if COVERED not in done.get("ause", {}):
+        done["ause"] = ause(g, [f.camera for f in train], held_out, settings)
         studies.write_rows(store, done)
     while len(done["after"]) < len(left):
         i = left[len(done["after"])]
@@ -95,11 +98,11 @@ def ause(g, train: list, held_out: list, settings) -> dict:
     """Area between the sparsification curves of the variance map and of the error itself; 0 is perfect.
 
     Root of the mean squared error of what is left when the fraction of pixels called most uncertain is taken out, both
-    curves divided by the error of all pixels; also of a constant map (random order) and of 1 - alpha.
+    curves divided by the error of all pixels; also of a random order and of 1 - alpha. Once more for the pixels that
+    the Gaussians cover: about others the information says nothing.
     """
-    H = fisher.diagonal(g, train, settings)
-    weights, maps = variances(H, Prior(1e-3, relative=True)), {"variance": [], "1 - alpha": [], "random": []}
-    wrong = []
+    weights = variances(fisher.diagonal(g, train, settings), Prior(1e-3, relative=True))
+    maps, wrong, covered = {"variance": [], "1 - alpha": [], "random": []}, [], []
     generator = torch.Generator().manual_seed(0)
     for frame in held_out:
         camera = frame.camera
@@ -107,12 +110,18 @@ def ause(g, train: list, held_out: list, settings) -> dict:
             out = drgs.render(g, camera, settings, outputs=())
         keep = torch.ones(camera.height, camera.width, dtype=torch.bool) if frame.mask is None else frame.mask > 0.5
         wrong.append((out.rgb.clamp(0, 1) - frame.image()).square().mean(2)[keep])
+        covered.append(out.alpha[keep] > 0.5)
         maps["variance"].append(fisher.variance_map(g, camera, weights, settings)[keep])
         maps["1 - alpha"].append(1 - out.alpha[keep])
         maps["random"].append(torch.rand(int(keep.sum()), generator=generator))
-    wrong = torch.cat(wrong).double()
-    best = curve(wrong, wrong)
-    return {name: float((curve(wrong, torch.cat(x)) - best).mean()) for name, x in maps.items()}
+    wrong, covered = torch.cat(wrong).double(), torch.cat(covered)
+    maps = {name: torch.cat(x) for name, x in maps.items()}
+    result = {"covered": float(covered.double().mean())}
+    for label, part in (("", torch.ones_like(covered)), (COVERED, covered)):
+        best = curve(wrong[part], wrong[part])
+        for name, x in maps.items():
+            result[name + label] = float((curve(wrong[part], x[part]) - best).mean())
+    return result | {COVERED: True}
 
 
 def curve(wrong: torch.Tensor, order: torch.Tensor, points: int = 100) -> torch.Tensor:
@@ -176,7 +185,10 @@ def report(result: dict, made: str) -> str:
         "| map | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),
     ]
-    for label in ("variance", "1 - alpha", "random"):
+    lines.append(
+        "| (pixels with alpha > 0.5) | " + " | ".join(f"{result[n]['ause']['covered']:.0%}" for n in names) + " |"
+    )
+    for label in [x + y for y in ("", COVERED) for x in ("variance", "1 - alpha", "random")]:
         lines.append(f"| {label} | " + " | ".join(f"{result[name]['ause'][label]:.3f}" for name in names) + " |")
     return "\n".join(lines)
 
