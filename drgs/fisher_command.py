@@ -19,7 +19,7 @@ from drgs import pictures
 from drgs.files import SCHEMA, save_state, write_json
 from drgs.gain import variances
 from drgs.progress import Bar
-from drgs.render_command import described, file_names, make_folder
+from drgs.render_command import described, make_folder
 from drgs.viewpoints import known_views, other_views, scene_of
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def run(args: Fisher) -> None:
             H = {name: x + H[name] if H else x for name, x in part.items()}
             bar.advance()
         rows = []
-        for camera, name in zip(views, file_names(views), strict=True):
+        for camera, name in zip(views, pictures.file_names([camera.name for camera in views]), strict=True):
             rows.append(_view(args, scene, camera, name, H, prior))
             bar.advance()
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": scene.settings}

@@ -14,7 +14,7 @@ import torch
 
 import drgs
 from drgs.files import SCHEMA, Run, load_ply, write_json
-from drgs.pictures import write_png
+from drgs.pictures import file_names, write_png
 
 if TYPE_CHECKING:
     from drgs.cli import Eval
@@ -167,7 +167,7 @@ def evaluate(
     views, reasons = [], {}
     if lpips is None:
         reasons["lpips"] = _NO_LPIPS
-    for frame in frames:
+    for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
         with torch.no_grad():
             image = drgs.render(g, frame.camera, settings).rgb.cpu().clamp(0, 1)
         target = frame.target()
@@ -188,7 +188,7 @@ def evaluate(
         views.append(row)
         if pictures is not None:
             error = (4 * (shown - target).abs()).clamp(0, 1)
-            write_png(pictures / f"{_file_name(frame.name)}.png", torch.cat([target, shown, error], dim=1).numpy())
+            write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
     mean = {}
     for name in METRICS:
         values = [row[name] for row in views if row[name] is not None]
@@ -264,8 +264,3 @@ def _ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     from drgs.losses import ssim_map
 
     return ssim_map(image.double(), target.double())
-
-
-def _file_name(name: str) -> str:
-    """A view's name as a file name: view names may hold folders."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)

@@ -17,7 +17,7 @@ import numpy as np
 
 from drgs.files import atomic_write
 
-__all__ = ["Video", "caption", "depth_picture", "to_bytes", "write_exr", "write_png"]
+__all__ = ["Video", "caption", "depth_picture", "file_names", "to_bytes", "write_exr", "write_png"]
 
 _INK = (235, 235, 235)
 _UNKNOWN = 0.25  # gray of depth where nothing is
@@ -28,6 +28,16 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
     """Float image in [0, 1] as uint8, clamped and rounded to nearest; NaN becomes 0."""
     clamped = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0.0, 1.0)
     return np.rint(clamped * 255).astype(np.uint8)
+
+
+def file_names(names: list[str]) -> list[str]:
+    """One file name for each view's name, which may hold folders, be empty or repeat."""
+    result: list[str] = []
+    for index, name in enumerate(names):
+        clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".")[:100]
+        clean = clean or f"view_{index:04d}"
+        result.append(clean if clean not in result else f"{clean}_{index:04d}")
+    return result
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "described",
-    "file_names",
     "is_camera_list",
     "load_scene",
     "make_folder",
@@ -112,7 +111,7 @@ def render_views(
     views = []
     movie = pictures.Video(out_dir / video, fps) if "webm" in formats else None
     with movie or contextlib.nullcontext():
-        for camera, name in zip(cameras, file_names(cameras), strict=True):
+        for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
             began = time.perf_counter()
             with torch.no_grad():
                 out = drgs.render(gaussians, camera, settings, outputs)
@@ -278,16 +277,6 @@ def make_folder(path: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise ValueError(f"{path}: -o must be a folder that can be written, got: {reason}; choose another") from None
-
-
-def file_names(cameras: list[Camera]) -> list[str]:
-    """One file name a camera: views' names may hold folders, be empty or repeat."""
-    names: list[str] = []
-    for index, camera in enumerate(cameras):
-        clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name).strip(".")[:100]
-        name = clean or f"view_{index:04d}"
-        names.append(name if name not in names else f"{name}_{index:04d}")
-    return names
 
 
 def described(camera: Camera) -> dict:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from drgs.files import SCHEMA, write_json
 from drgs.progress import Bar
-from drgs.render_command import described
+from drgs.render_command import described, make_folder
 from drgs.viewpoints import known_views, other_views, scene_of
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ def run(args: Select) -> None:
 
     if args.output.is_dir():
         raise ValueError(f"{args.output}: -o must be a file for the JSON, is a folder; name a file in it")
+    make_folder(args.output.parent)
     prior = Prior(value=args.prior, relative=args.relative_prior)
     scene = scene_of(args)
     known = known_views(args.train, scene)

@@ -173,6 +173,8 @@ def legal(s: RenderSettings) -> str | None:
         return "order='entry' is Mitsuba's order of entry points, use traversal='bvh' (got 'tiles')"
     if s.culling != "extent" and s.response != "ewa":
         return f"culling={s.culling!r} belongs to response='ewa', use culling='extent' (got {s.response!r})"
+    if s.fov_clamp != "none" and s.response != "ewa":
+        return f"fov_clamp={s.fov_clamp!r} belongs to response='ewa', use fov_clamp='none' (got {s.response!r})"
     if s.dilation > 0 and s.response != "ewa":
         return f"dilation belongs to response='ewa', use dilation=0 (got {s.response!r})"
     return None

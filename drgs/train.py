@@ -83,11 +83,11 @@ def fit(
     """
     config = config or FitConfig()
     drgs.runtime.backend()  # sets torch's threads too, at first use
-    if config.deterministic:
-        import drjit as dr
+    with _one_thread() if config.deterministic else contextlib.nullcontext():
+        return _fit(dataset, out_dir, config, active, resume, progress)
 
-        # Atomic additions of several threads come in any order, and float additions do not commute with that.
-        dr.set_thread_count(1)
+
+def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resume: bool, progress: bool) -> FitResult:
     train, test = dataset.split(config.test_every)
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
@@ -373,6 +373,19 @@ def _interrupt_between_steps():
         yield lambda: bool(pressed)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _one_thread():
+    """One Dr.Jit thread: additions of several come in any order, and float additions do not commute with that."""
+    import drjit as dr
+
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
 
 
 @contextlib.contextmanager
