@@ -82,7 +82,7 @@ def test_depth_maps_give_the_surface_with_its_colors(tmp_path, rng):
     """Points lie on the surface, where depth is known, and have the color they project to."""
     views = plane_views(tmp_path, rng, count=3, depth=True)
     points, colors, source = initial_points(views, max_points=3000)
-    assert source == f"back-projected from 3 depth maps, {len(points)} points"
+    assert source == f"back-projected from 3 depth maps, holes filled, {len(points)} points"
     assert 1500 < len(points) <= 3000
     known = np.mean([(view.depth() > 0).mean() for view in views])
     assert known < 1  # around the square there is no depth: the nearest one stands in
