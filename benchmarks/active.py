@@ -90,11 +90,13 @@ def report(rows: list[dict], scale: str, made: str) -> str:
     scenes = list(dict.fromkeys(r["scene"] for r in rows))
     labels = [label for label in POLICIES if any(r["policy"] == label for r in rows)]
     seeds = 1 + max(r["seed"] for r in rows)
+    ran = [sum(r["scene"] == s and r["policy"] == label for r in rows) for s in scenes for label in labels]
+    number = f"{min(ran)} to {max(ran)} seeds" if min(ran) < max(ran) else f"{seeds} seeds"
     lines = [
         f"Made by {made}",
         "",
         f"`--scale {scale}`: {size['max_gaussians']:,} Gaussians, at most {size['max_pixels']:,} pixels, "
-        f"{size['max_steps']:,} steps, 2 views and one more every {size['every']} steps until 12; {seeds} seeds.",
+        f"{size['max_steps']:,} steps, 2 views and one more every {size['every']} steps until 12; {number}.",
         "Every 8th view is held out. Nothing of a view is read before it is picked. Mean over the seeds, and every",
         "seed's PSNR:",
     ]
