@@ -25,7 +25,7 @@ import drjit as dr
 import numpy as np
 
 from drgs import runtime
-from drgs.tiles import _argsort
+from drgs.tiles import depth_order
 from drgs.walk import EMPTY, Part
 
 __all__ = ["Proxies", "proxy_scene"]
@@ -267,7 +267,7 @@ def parts_of(view, model, buffer, ray_of, share):
         # Behind the camera plane z is negative, which no order key may be: the rank orders as well.
         center = dr.zeros(t.Float, dr.width(view.projected.key))
         rank = dr.arange(t.UInt32, dr.width(center))
-        dr.scatter(center, t.Float(rank), _argsort(t, view.projected.key, rank))
+        dr.scatter(center, t.Float(rank), depth_order(t, view.projected.key, rank))
     return [Part(t, model, buffer, [ray], [i], [inside], stream_of, s.order != "entry", center)]
 
 

@@ -19,7 +19,7 @@ import drjit as dr
 from drgs import projection as layout
 from drgs.derivatives import if_any_hit
 from drgs.kernels import load_packed, pack, packed_size
-from drgs.projection import _cross, _dot
+from drgs.projection import cross, dot
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
 
@@ -28,7 +28,7 @@ _OPACITY, _COLOR, _SHAPE = 0, 1, 10  # entries of `extras`: d strength / dlogit,
 _EWA = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
 
 
-def extras(t, settings, inputs, projected, world: bool, moved: list | None, color: list | None):
+def extras(t, settings, inputs, projected, moved: list | None, color: list | None):
     """What hits need besides the record, packed (kernels.pack).
 
     Args:
@@ -52,7 +52,7 @@ def extras(t, settings, inputs, projected, world: bool, moved: list | None, colo
     else:
         rotation, scale, plane, axes = projected.frame
         axes = axes or [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-        columns += [F(_dot(f, x)) for x in plane for f in axes] if plane else [F(0)] * 6
+        columns += [F(dot(f, x)) for x in plane for f in axes] if plane else [F(0)] * 6
         local = list(zip(*axes, strict=True))  # rows: local axes; columns: f
         for weight in ([dr.rcp(s) for s in scale], scale):
             columns += [
@@ -95,11 +95,11 @@ class _Geometry:
             return [m[3 * r] * x[0] + m[3 * r + 1] * x[1] + m[3 * r + 2] * x[2] for r in range(3)]
 
         n, v, local = times(0, p), times(9, p), times(18, p)
-        means, turn, scales = n, _cross(v, n), [x * x for x in local]
+        means, turn, scales = n, cross(v, n), [x * x for x in local]
         result = [[along * x for x in part] for part in (means, turn, scales)]
         if integral:
             ne, ve, le = times(0, e), times(9, e), times(18, e)
-            turn = [a + b - u * c for a, b, c in zip(_cross(v, ne), _cross(ve, n), _cross(ve, ne), strict=True)]
+            turn = [a + b - u * c for a, b, c in zip(cross(v, ne), cross(ve, n), cross(ve, ne), strict=True)]
             scales = [2 * x * y - u * y * y for x, y in zip(local, le, strict=True)]
             result = [
                 [dr.fma(across, x, y) for x, y in zip(part, old, strict=True)]
@@ -109,37 +109,22 @@ class _Geometry:
 
     def _peak(self, r, extra, ray):
         """p, e, u and rho^2; on the screen p and e in the frame of the ray's direction at the anchor."""
-        L = layout
+        rho2, _, u = self.m.along(r, ray)
         if self.m.world:
-            rho2, _, _ = self.m._world(r, ray)
-            o, d = ray.lane[-6:-3], ray.lane[-3:]
-            to = [r[L.W_MEAN + k] - o[k] for k in range(3)]
-            t0 = _dot(to, d)
-            w = [dr.fma(t0, d[k], -to[k]) for k in range(3)]
-            m = r[L.W_ROWS : L.W_ROWS + 9]
-            a, dl = ([m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2] for k in range(3)] for v in (w, d))
-            squared = _dot(dl, dl)
-            inverse = dr.rcp(dr.select(squared > 0, squared, 1))
-            shift = _dot(a, dl) * inverse
-            p = [dr.fma(-shift, y, x) for x, y in zip(a, dl, strict=True)]
+            _, a, d, inverse = self.m.local(r, ray)
+            shift = dot(a, d) * inverse
             root = dr.sqrt(inverse)
-            return p, [x * root for x in dl], (t0 - shift) * dr.rcp(root), rho2
-        dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
-        rho2, _, u = self.m._screen(r, ray)
-        c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
-        c2 = dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, r[L.R23]))
-        d = [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
-        inverse = dr.rcp(_dot(d, d))
+            return [dr.fma(-shift, y, x) for x, y in zip(a, d, strict=True)], [x * root for x in d], u, rho2
+        c1, c2, d, inverse = self.m.screen(r, ray)
         q = [dr.fma(c1, extra[_SHAPE + i], c2 * extra[_SHAPE + 3 + i]) for i in range(3)]
         root = dr.sqrt(inverse)
-        return [x * inverse for x in _cross(q, d)], [x * root for x in d], u, rho2
+        return [x * inverse for x in cross(q, d)], [x * root for x in d], u, rho2
 
     def _screen(self, r, extra, ray):
         """Of `ewa`: through the triangular form of Sigma' and the projected mean."""
         L = layout
         dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
-        c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
-        c2 = dr.fma(r[L.R22], dy, r[L.R23])
+        c1, c2, _, _ = self.m.screen(r, ray)
         a = r[L.ALPHA] * dr.exp(-0.5 * dr.fma(c1, c1, c2 * c2))
         slopes = []
         for j in range(9):

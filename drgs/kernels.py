@@ -16,7 +16,7 @@ import dataclasses
 import drjit as dr
 
 from drgs import projection as layout
-from drgs.projection import RECORD
+from drgs.projection import RECORD, cross, dot
 
 __all__ = ["Model", "Primal", "Ray", "Source", "load_packed", "pack", "packed_size"]
 
@@ -61,25 +61,35 @@ class Model:
             return [*used, L.H1, L.H2, L.H3, L.NORM]
         return used + ([L.H1, L.H2, L.H3] if depth else [])
 
-    def _screen(self, r, ray):
-        """rho^2, t*, u of a pinhole ray through pixel (x, y)."""
+    def along(self, r, ray):
+        """rho^2, t* and, for `integral`, u of a ray."""
+        return self._along_world(r, ray) if self.world else self._along_screen(r, ray)
+
+    def screen(self, r, ray):
+        """Of a pinhole ray: the two parts of o' x d', d' in its own frame, and 1 / |d'|^2 (`ewa`: the first two)."""
         L = layout
         dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
         c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
         c2 = dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, r[L.R23]))
         if self.s.response == "ewa":
-            return dr.fma(c1, c1, c2 * c2), r[L.H1], None
+            return c1, c2, None, None
         d1 = dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1))
         d2 = dr.fma(r[L.E4], dx, r[L.E5] * dy)
         d3 = r[L.E6] * dy
-        inverse = dr.rcp(dr.fma(d1, d1, dr.fma(d2, d2, d3 * d3)))
-        rho2 = dr.fma(c1, c1, c2 * c2) * inverse
-        along = dr.fma(r[L.H1], d1, dr.fma(r[L.H2], d2, r[L.H3] * d3))
-        u = r[L.NORM] * along * dr.sqrt(inverse) if self.s.response == "integral" else None
-        return rho2, along * inverse * ray.length, u
+        return c1, c2, [d1, d2, d3], dr.rcp(dr.fma(d1, d1, dr.fma(d2, d2, d3 * d3)))
 
-    def _world(self, r, ray):
-        """The same along o + t d in the world: w = (o - mu) + t0 d first, then the local frame.
+    def _along_screen(self, r, ray):
+        L = layout
+        c1, c2, d, inverse = self.screen(r, ray)
+        squared = dr.fma(c1, c1, c2 * c2)
+        if self.s.response == "ewa":
+            return squared, r[L.H1], None
+        along = dr.fma(r[L.H1], d[0], dr.fma(r[L.H2], d[1], r[L.H3] * d[2]))
+        u = r[L.NORM] * along * dr.sqrt(inverse) if self.s.response == "integral" else None
+        return squared * inverse, along * inverse * ray.length, u
+
+    def local(self, r, ray):
+        """Of a ray o + t d in the world: t0, w = (o - mu) + t0 d and d in the local frame, and 1 / |d'|^2.
 
         t0, where the ray is nearest to the mean, is a constant of the derivative: it only moves the point about which
         the local frame is expanded, so that what is rounded is as small as the Gaussian's distance from the ray.
@@ -87,24 +97,24 @@ class Model:
         L = layout
         o, d = ray.lane[-6:-3], ray.lane[-3:]
         to = [r[L.W_MEAN + k] - o[k] for k in range(3)]
-        t0 = dr.detach(to[0] * d[0] + to[1] * d[1] + to[2] * d[2])
+        t0 = dr.detach(dot(to, d))
         w = [dr.fma(t0, d[k], -to[k]) for k in range(3)]
-        m = [r[L.W_ROWS + k] for k in range(9)]
-        (a0, a1, a2), (d0, d1, d2) = (
-            [m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2] for k in range(3)] for v in (w, d)
-        )
-        c = (a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0)
-        squared = d0 * d0 + d1 * d1 + d2 * d2
+        rows = [r[L.W_ROWS + 3 * k : L.W_ROWS + 3 * k + 3] for k in range(3)]
+        a, d = ([dot(row, v) for row in rows] for v in (w, d))
+        squared = dot(d, d)
         # Lanes without a candidate read zeros: 0 / 0 would spoil their (masked) derivatives.
-        inverse = dr.rcp(dr.select(squared > 0, squared, 1))
-        rho2 = (c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) * inverse
-        key = t0 - (a0 * d0 + a1 * d1 + a2 * d2) * inverse
+        return t0, a, d, dr.rcp(dr.select(squared > 0, squared, 1))
+
+    def _along_world(self, r, ray):
+        t0, a, d, inverse = self.local(r, ray)
+        c = cross(a, d)
+        key = t0 - dot(a, d) * inverse
         u = key * dr.rsqrt(inverse) if self.s.response == "integral" else None
-        return rho2, key, u
+        return dot(c, c) * inverse, key, u
 
     def hit(self, record, ray, active):
         """Opacity, t* (for `ewa` the Gaussian's depth) and validity of a hit; the first two carry derivatives."""
-        rho2, key, u = self._world(record, ray) if self.world else self._screen(record, ray)
+        rho2, key, u = self.along(record, ray)
         strength = record[layout.W_ALPHA if self.world else layout.ALPHA]
         extent2 = dr.detach(record[layout.W_EXT2 if self.world else layout.EXT2])
         ok = active & (dr.detach(rho2) <= extent2)

@@ -19,7 +19,7 @@ import drjit as dr
 
 from drgs.settings import RenderSettings
 
-__all__ = ["RECORD", "Projected", "project_screen", "project_world", "sh_basis", "sh_color"]
+__all__ = ["RECORD", "Projected", "cross", "dot", "project_screen", "project_world", "sh_basis", "sh_color"]
 
 # Layout of a screen record (floats). ALPHA holds the opacity, or softplus(logit) for the integral response.
 RECORD = 24
@@ -97,11 +97,13 @@ def sh_color(basis: list, coefficient) -> list:
     return rgb
 
 
-def _dot(a, b):
+def dot(a, b):
+    """Of two lists of three."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a, b):
+def cross(a, b):
+    """Of two lists of three."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
@@ -163,14 +165,14 @@ class _Activated:
         self.from_local = [[sum(v[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
 
     def distance(self):
-        return dr.sqrt(_dot(self.center, self.center))
+        return dr.sqrt(dot(self.center, self.center))
 
     def rgb(self, p, settings, coefficients: int):
         """Colors towards the mean; the derivative of the direction is kept."""
         Float, v = self.t.Float, self.view
         # The direction in world axes: R_wc times the camera-frame mean.
         d = [v[0][k] * self.center[0] + v[1][k] * self.center[1] + v[2][k] * self.center[2] for k in range(3)]
-        squared = _dot(d, d)
+        squared = dot(d, d)
         # A mean at the camera center has no direction; any finite one will do.
         scale = dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0)
         direction = [Float(x * scale) for x in d]
@@ -244,30 +246,30 @@ def _peak(g: _Activated, ax, ay, dx, dy, pinhole):
     yn = (ay - cy) / fy
     da = [(ax - cx - skew * yn) / fx, yn, type(yn)(1)]
     d = local(da, inverse)
-    norm = dr.sqrt(_dot(d, d))
+    norm = dr.sqrt(dot(d, d))
     unit = dr.rcp(norm)
-    A = _scaled(local(_cross(g.center, dx), cofactor), unit)
-    B = _scaled(local(_cross(g.center, dy), cofactor), unit)
-    C = _scaled(local(_cross(g.center, da), cofactor), unit)
+    A = _scaled(local(cross(g.center, dx), cofactor), unit)
+    B = _scaled(local(cross(g.center, dy), cofactor), unit)
+    C = _scaled(local(cross(g.center, da), cofactor), unit)
     # All three are perpendicular to W c: two components each say everything.
     u, v = _frame(local(g.center, inverse))
-    r = [_dot(u, A), _dot(u, B), _dot(u, C), _dot(v, A), _dot(v, B), _dot(v, C)]
+    r = [dot(u, A), dot(u, B), dot(u, C), dot(v, A), dot(v, B), dot(v, C)]
     # The same for (d'_a, d'_x, d'_y), divided by |d'_a|.
     f1 = _scaled(d, unit)
     Dx, Dy = _scaled(local(dx, inverse), unit), _scaled(local(dy, inverse), unit)
-    e2, e3 = _dot(f1, Dx), _dot(f1, Dy)
+    e2, e3 = dot(f1, Dx), dot(f1, Dy)
     rest = _less(Dx, f1, e2)
-    e4 = dr.sqrt(_dot(rest, rest))
+    e4 = dr.sqrt(dot(rest, rest))
     f2 = _scaled(rest, dr.rcp(e4))
-    f3 = _cross(f1, f2)
+    f3 = cross(f1, f2)
     h = _scaled(local(g.center, inverse), unit)
-    numbers = [*r, e2, e3, e4, _dot(f2, Dy), _dot(f3, Dy), _dot(f1, h), _dot(f2, h), _dot(f3, h), norm]
+    numbers = [*r, e2, e3, e4, dot(f2, Dy), dot(f3, Dy), dot(f1, h), dot(f2, h), dot(f3, h), norm]
     return numbers, (g.rotation, g.scale, (u, v), (f1, f2, f3))
 
 
 def _frame(n):
     """Orthonormal u, v perpendicular to n, smooth in n; around the z axis where n is 0 (the mean at the camera)."""
-    squared = _dot(n, n)
+    squared = dot(n, n)
     usable = dr.detach(squared) > 0
     scale = dr.select(usable, dr.rsqrt(dr.select(usable, squared, 1)), 0)
     x, y, z = _scaled(n, scale)
@@ -277,9 +279,9 @@ def _frame(n):
     first, second = (ax <= ay) & (ax <= az), ay <= az
     e = [dr.select(first, 1.0, 0.0), dr.select(~first & second, 1.0, 0.0), dr.select(~first & ~second, 1.0, 0.0)]
     n = [x, y, z]
-    u = _less(e, n, _dot(e, n))
-    u = _scaled(u, dr.rsqrt(_dot(u, u)))
-    return u, _cross(n, u)
+    u = _less(e, n, dot(e, n))
+    u = _scaled(u, dr.rsqrt(dot(u, u)))
+    return u, cross(n, u)
 
 
 def _listed_extent(g: _Activated, settings):
@@ -355,12 +357,12 @@ def _ewa(g: _Activated, pinhole, ax, ay, settings, width: int, height: int):
     f = g.from_local
     lx = [g.scale[k] * (f[0][k] * jx[0] + f[1][k] * jx[1] + f[2][k] * jx[2]) for k in range(3)]
     ly = [g.scale[k] * (f[1][k] * jy[1] + f[2][k] * jy[2]) for k in range(3)]
-    cxx = _dot(lx, lx) + settings.dilation
-    cyy = _dot(ly, ly) + settings.dilation
-    cxy = _dot(lx, ly)
+    cxx = dot(lx, lx) + settings.dilation
+    cyy = dot(ly, ly) + settings.dilation
+    cxy = dot(lx, ly)
     # |lx x ly|^2 + dilation (...) instead of cxx cyy - cxy^2: thin projections do not cancel.
-    n = _cross(lx, ly)
-    det = _dot(n, n) + settings.dilation * (_dot(lx, lx) + _dot(ly, ly) + settings.dilation)
+    n = cross(lx, ly)
+    det = dot(n, n) + settings.dilation * (dot(lx, lx) + dot(ly, ly) + settings.dilation)
     r22 = dr.rsqrt(cyy)
     r11 = dr.sqrt(cyy / det)
     r12 = -cxy * dr.rsqrt(cyy * det)

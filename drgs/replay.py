@@ -45,7 +45,7 @@ class Replay:
             return
         self.lit, self.basis, moved_color = self._colors(p)
         self.color = moved_color is not None
-        self.extras = extras(t, settings, p, view.projected, view.world, self._moved_records(), moved_color)
+        self.extras = extras(t, settings, p, view.projected, self._moved_records(), moved_color)
         dr.eval(self.extras, self.lit, self.basis)
 
     def _colors(self, p):

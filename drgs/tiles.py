@@ -13,7 +13,7 @@ import drjit as dr
 
 from drgs import projection as layout
 
-__all__ = ["TILE", "Lists", "build"]
+__all__ = ["TILE", "Lists", "build", "depth_order"]
 
 TILE = 8
 _FAR = 3.0e38
@@ -66,7 +66,7 @@ def build(t, projected, settings, width: int, height: int, record=None) -> Lists
     order = gaussian
     if settings.order != "ray":
         # Emitting in depth order leaves 32 bits for the rank, so ties fall by index and nothing is quantized.
-        order = _argsort(t, projected.key, gaussian)
+        order = depth_order(t, projected.key, gaussian)
         amount = dr.gather(t.UInt32, amount, order)
     total64 = dr.sum(t.UInt64(amount))[0]
     if total64 >= 2**32:
@@ -105,7 +105,7 @@ def build(t, projected, settings, width: int, height: int, record=None) -> Lists
     return Lists(index, start, end, ahead, columns, rows, pairs)
 
 
-def _argsort(t, key, gaussian):
+def depth_order(t, key, gaussian):
     """Gaussians by (key, index)."""
     # IEEE bits order like unsigned integers once negative floats are flipped.
     bits = dr.reinterpret_array(t.UInt32, key)
