@@ -27,21 +27,14 @@ from drgs.select import Cache, select
 BEGIN, END = "<!-- predict: begin -->", "<!-- predict: end -->"
 VIEWS, STEPS, MORE = 6, 1000, 200
 COVERED = ", alpha > 0.5"
+RELATIVE = {"policy": "fisher", "prior": Prior(1e-3, relative=True)}
 SCORES = {
     "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
-    "fisher, logdet, relative 1e-3": {
-        "policy": "fisher",
-        "criterion": "logdet",
-        "prior": Prior(1e-3, relative=True),
-    },
+    "fisher, logdet, relative 1e-3": {**RELATIVE, "criterion": "logdet"},
     "fisher, eig": {"policy": "fisher", "criterion": "eig"},
-    "fisher, eig, relative 1e-3": {"policy": "fisher", "criterion": "eig", "prior": Prior(1e-3, relative=True)},
+    "fisher, eig, relative 1e-3": {**RELATIVE, "criterion": "eig"},
     "fisher, trace_cov": {"policy": "fisher", "criterion": "trace_cov"},
-    "fisher, trace_cov, relative 1e-3": {
-        "policy": "fisher",
-        "criterion": "trace_cov",
-        "prior": Prior(1e-3, relative=True),
-    },
+    "fisher, trace_cov, relative 1e-3": {**RELATIVE, "criterion": "trace_cov"},
     "fisher, block_logdet": {"policy": "fisher", "criterion": "block_logdet"},
     "fisherrf": {"policy": "fisherrf"},
     "coverage": {"policy": "coverage"},

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from drgs.trainer import FitConfig
 
 __all__ = [
-    "METHODS",
     "SELECTION",
     "ActiveConfig",
     "ActiveViews",
@@ -45,7 +44,6 @@ _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
-METHODS = ("exact", "columns", "probes", "fisherrf")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,6 +77,7 @@ class ActiveConfig:
     pick_points: str = "auto"
 
     def __post_init__(self):
+        from drgs.fisher import METHODS
         from drgs.gain import CRITERIA
         from drgs.select import POLICIES
 

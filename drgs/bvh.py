@@ -250,8 +250,7 @@ class _Stream:
 def parts_of(view, model, buffer, ray_of, share):
     """All rays of a view as one part."""
     t, s = view.t, view.settings
-    if "proxies" not in view.extra:
-        view.extra["proxies"] = None
+    if view.lanes is None:
         i = dr.arange(t.UInt32, view.pixels)
         ray = ray_of(None, None, i, t.Bool(True))
         view.proxies, view.lanes = _build(view, ray), _coherent(t, ray.lane[-6:])

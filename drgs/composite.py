@@ -36,6 +36,7 @@ class View:
         world: Records are world records.
         certificate: Filled by the primal pass: rays, redone rays, entries listed.
         extra: Filled by the primal pass: outputs without a derivative.
+        lists: Tile lists, or `proxies` and the order of rays `lanes` on `bvh`: kept from the first call of `parts_of`.
     """
 
     def __init__(self, t, settings, pixels, projected, basis, width, want, parts_of, length, world):
@@ -43,6 +44,7 @@ class View:
         self.basis, self.width, self.want, self.parts_of = basis, width, want, parts_of
         self.length, self.world = length, world
         self.certificate, self.extra = {}, {}
+        self.lists = self.proxies = self.lanes = None
 
 
 class Composite(dr.CustomOp):

@@ -7,12 +7,11 @@ from collections.abc import Callable
 
 import torch
 
+from drgs.gain import Information
 from drgs.jacobian import GEOMETRY
 from drgs.scene import quaternion_product
 
 __all__ = ["GROUPS", "Group", "Information", "groups_of"]
-
-Information = dict[str, torch.Tensor]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -164,13 +164,11 @@ class Scene:
     def _tile_parts(self, view, model, buffer, ray_of, share):
         """Tile lists (once a view) and the pixels that walk them."""
         t, camera = self.t, self.camera
-        if "lists" not in view.extra:
-            lists = build(t, view.projected, self.settings, camera.width, camera.height, buffer)
-            view.certificate["pairs"] = lists.pairs
-            self.lists = lists
-            view.extra["lists"] = None
+        if view.lists is None:
+            view.lists = build(t, view.projected, self.settings, camera.width, camera.height, buffer)
+            view.certificate["pairs"] = view.lists.pairs
         size = camera.width, camera.height
-        return [tile_part(t, model, buffer, self.lists, self.settings, *size, ray_of, share)]
+        return [tile_part(t, model, buffer, view.lists, self.settings, *size, ray_of, share)]
 
     # -- torch side -------------------------------------------------------------------------------------------------
 
