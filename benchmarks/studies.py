@@ -27,7 +27,18 @@ from drgs.files import load_state, save_state  # noqa: E402
 from drgs.frames import load_frames  # noqa: E402
 from drgs.trainer import FitConfig, Trainer  # noqa: E402
 
-__all__ = ["SCALES", "SCENES", "base", "dataset", "interval", "rank_correlation", "read_rows", "stamp", "write_rows"]
+__all__ = [
+    "SCALES",
+    "SCENES",
+    "base",
+    "commit",
+    "dataset",
+    "interval",
+    "rank_correlation",
+    "read_rows",
+    "stamp",
+    "write_rows",
+]
 
 DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
 SCENES = ("office", "head", "still_life")
@@ -106,12 +117,17 @@ def interval(values, draws: int = 10_000) -> tuple[float, float, float]:
     return float(values.mean()), float(np.quantile(means, 0.025)), float(np.quantile(means, 0.975))
 
 
+def commit() -> str:
+    """Of this checkout."""
+    head = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    return head.stdout.strip()
+
+
 def stamp(script: str) -> str:
     """Where and when a study ran."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     return (
         f"`python benchmarks/{script}.py`, {runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
-        f"{runtime.backend().variant}, {datetime.date.today().isoformat()}, commit {commit.stdout.strip()}."
+        f"{runtime.backend().variant}, {datetime.date.today().isoformat()}, commit {commit()}."
     )
 
 
