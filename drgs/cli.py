@@ -24,7 +24,20 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
 
-__all__ = ["Demo", "Eval", "Fisher", "Fit", "Info", "Render", "Select", "Sfm", "main"]
+__all__ = [
+    "Crossval",
+    "Demo",
+    "Eval",
+    "Fisher",
+    "Fit",
+    "Info",
+    "Render",
+    "Select",
+    "Sfm",
+    "Stress",
+    "Tradeoff",
+    "main",
+]
 
 _Output = Annotated[Path, arg(aliases=["-o"])]
 
@@ -63,6 +76,16 @@ class _Settings(_Common):
         """
         from drgs.settings import RenderSettings
 
+        return RenderSettings.preset(self.preset, **self.replaced())
+
+    def replaced(self) -> dict:
+        """The fields that --set replaces.
+
+        Raises:
+            ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
+        """
+        from drgs.settings import RenderSettings
+
         hints = typing.get_type_hints(RenderSettings)
         values = {}
         for text in self.overrides:
@@ -71,7 +94,7 @@ class _Settings(_Common):
                 what = "KEY=VALUE" if not equals else "a render setting"
                 raise ValueError(f"--set: must be {what}, got {text!r}; known: {', '.join(hints)}")
             values[key] = _parse(key, hints[key], value)
-        return RenderSettings.preset(self.preset, **values)
+        return values
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -257,6 +280,68 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class _Seen(_Settings):
+    """Options of commands that look at a scene from a few cameras."""
+
+    scene: Positional[Path]
+    """A 3DGS point_cloud.ply or a run folder."""
+    cameras: str | None = None
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which views of a data set."""
+    limit: int = 2
+    """At most this many views, evenly spaced."""
+    max_pixels: int = 20_000
+    """Views are reduced to at most this many pixels."""
+    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
+    """World direction that is up on an orbit; auto: as a run's photographs, else minus-y."""
+    elevation: float | None = None
+    """Degrees of an orbit above its center; default as a run's photographs, else 20."""
+    fov: float = 45.0
+    """Horizontal field of view of an orbit in degrees."""
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Crossval(_Seen):
+    """Compare a rasterizer's image and gradients with ours and name what differs, group by group."""
+
+    rasterizer: str = "drgs:ewa"
+    """drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors)."""
+    preset: Literal["auto", "exact", "fast", "inria", "gsplat", "mitsuba"] = "auto"
+    """The model that it claims to compute; auto: the one whose image is nearest."""
+    ladder: bool = True
+    """Attribute what is left between that model and the exact one."""
+    strict: bool = False
+    """Known deviations fail, too."""
+    output: _Output = Path("out/crossval")
+    """Folder for report.html and crossval.json."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tradeoff(_Seen):
+    """Time every accuracy/speed setting on a scene, with its image, gradient and information error."""
+
+    max_error: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
+    """Budgets: one setting is recommended for each, the fastest whose errors are all below it."""
+    repeats: int = 5
+    """Interleaved rounds of timing."""
+    output: _Output = Path("out/tradeoff")
+    """Folder for tradeoff.json, tradeoff.md and the plot."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stress(_Common):
+    """Run the extremes of the renderer on this machine against the float64 oracle and print their errors."""
+
+    match: str = ""
+    """Only the cases with this text in their name."""
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """Folder for stress.json and stress.md; default none is written."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(_Common):
     """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS when weights are given."""
 
@@ -304,6 +389,9 @@ _RUN = {
     "eval": (Eval, "drgs.metrics", "run_eval"),
     "select": (Select, "drgs.select_command", "run"),
     "fisher": (Fisher, "drgs.fisher_command", "run"),
+    "crossval": (Crossval, "drgs.crossval_command", "run"),
+    "tradeoff": (Tradeoff, "drgs.tradeoff", "run"),
+    "stress": (Stress, "drgs.stress", "run"),
     "sfm": (Sfm, "drgs.sfm", "run_command"),
     "demo": (Demo, "drgs.demo", "run"),
 }

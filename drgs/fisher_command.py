@@ -20,7 +20,7 @@ from drgs.files import SCHEMA, save_state, write_json
 from drgs.gain import variances
 from drgs.progress import Bar
 from drgs.render_command import described, make_folder
-from drgs.viewpoints import known_views, other_views, scene_of
+from drgs.viewpoints import evenly, known_views, other_views, scene_of
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -56,7 +56,7 @@ def run(args: Fisher) -> None:
     views, source = known.cameras, known.source
     if args.cameras is not None:
         views, source = other_views("--cameras", args.cameras, args, scene, known, fresh=False)
-    views = _evenly(views, args.limit)
+    views = evenly(views, args.limit)
     make_folder(args.output)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
         H: Information = {}
@@ -162,13 +162,6 @@ def _view(args: Fisher, scene: Scene, camera: Camera, name: str, H: Information,
         pose = fisher.pose_information(g, camera, settings)
         row["pose"] = {"information": pose.tolist(), "eigenvalues": torch.linalg.eigvalsh(pose).tolist()}
     return row
-
-
-def _evenly(views: list, limit: int) -> list:
-    """At most `limit` of them, the first one among them."""
-    if len(views) <= limit:
-        return views
-    return [views[i * len(views) // limit] for i in range(limit)]
 
 
 def _summary(x: torch.Tensor) -> dict:

@@ -24,12 +24,13 @@ from drgs.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.cli import Render
+    from drgs.cli import Crossval, Render, Tradeoff
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
 __all__ = [
+    "cameras_of",
     "described",
     "is_camera_list",
     "load_scene",
@@ -52,7 +53,8 @@ def run(args: Render) -> None:
     if folder is not None and not any(text.startswith("background=") for text in args.overrides):
         # A run was fitted over its background; over another one its edges show a halo.
         settings = settings.replace(background=run_background(folder))
-    cameras, source = _cameras(args, gaussians, folder)
+    size = args.width or 640, args.height or round((args.width or 640) * 0.75)
+    cameras, source = cameras_of(args, args.cameras, gaussians, folder, args.frames, size)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
@@ -198,22 +200,35 @@ def run_background(folder: Run) -> tuple[float, ...]:
         raise ValueError(f"{folder.path}/config.json: must record the fit's settings, does not; fit again") from None
 
 
-def _cameras(args: Render, gaussians: Gaussians, folder: Run | None) -> tuple[list[Camera], str]:
-    """The cameras before resizing, and where they come from in words."""
-    if args.cameras == "orbit":
+def cameras_of(
+    args: Render | Crossval | Tradeoff,
+    text: str,
+    gaussians: Gaussians,
+    folder: Run | None,
+    frames: int,
+    size: tuple[int, int],
+) -> tuple[list[Camera], str]:
+    """The cameras of a data set, a run, a cameras.json or an orbit, and where they come from in words.
+
+    Args:
+        args: Whose `split`, `fov`, `elevation` and `up` apply.
+        text: What `--cameras` says.
+        gaussians, folder: What an orbit goes around, like the photographs of the run if there is one.
+        frames, size: Number of views of an orbit and their (width, height).
+    """
+    if text == "orbit":
         if args.split != "all":
-            raise ValueError(f"render: --split {args.split} must have --cameras DATA, an orbit has no split")
-        size = args.width or 640, args.height or round((args.width or 640) * 0.75)
+            raise ValueError(f"--split {args.split} must have --cameras DATA, an orbit has no split")
         lens = {"width": size[0], "height": size[1], "fov": args.fov, "elevation": args.elevation}
         captured = _captured(folder) if folder is not None and args.up == "auto" else []
-        cameras = capture_orbit(captured, args.frames, **lens) if captured else []
+        cameras = capture_orbit(captured, frames, **lens) if captured else []
         if cameras:
             return cameras, "orbit like the photographs"
         up = "minus-y" if args.up == "auto" else args.up
         if args.up == "auto":
             _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
-        return scene_orbit(gaussians, args.frames, up=UP[up], **lens), f"orbit, up {up}"
-    path = Path(args.cameras)
+        return scene_orbit(gaussians, frames, up=UP[up], **lens), f"orbit, up {up}"
+    path = Path(text)
     if is_camera_list(path):
         if args.split != "all":
             raise ValueError(f"{path}: --split {args.split} must have a data set, a cameras.json has no split")
@@ -313,6 +328,6 @@ def _summary(report: dict, folder: Path) -> str:
     return text
 
 
-def _say(args: Render, text: str) -> None:
+def _say(args: Render | Crossval | Tradeoff, text: str) -> None:
     if not args.quiet:
         print(text, flush=True)

@@ -16,15 +16,15 @@ from drgs.active import at_most, fitted_views, resized_alike
 from drgs.cameras import Camera, load_cameras_json, orbit
 from drgs.files import Run
 from drgs.orbits import UP, capture_orbit, scene_orbit
-from drgs.render_command import is_camera_list, load_scene, run_background
+from drgs.render_command import cameras_of, is_camera_list, load_scene, run_background
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.cli import Fisher, Select
+    from drgs.cli import Crossval, Fisher, Select, Tradeoff
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["Known", "Scene", "dome", "known_views", "other_views", "scene_of"]
+__all__ = ["Known", "Scene", "dome", "evenly", "known_views", "other_views", "scene_of", "seen_views"]
 
 _PIXELS = 130_000  # of a view where there is no fit that says
 _MAX_COUNT = 10_000
@@ -184,6 +184,47 @@ def dome(circle: list[Camera], count: int) -> list[Camera]:
     return [
         dataclasses.replace(circle[0], w2c=camera.w2c, name=f"dome_{index:04d}") for index, camera in enumerate(made)
     ]
+
+
+def evenly(views: list, limit: int) -> list:
+    """At most `limit` of them, the first one among them."""
+    if len(views) <= limit:
+        return views
+    return [views[i * len(views) // limit] for i in range(limit)]
+
+
+def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera], str]:
+    """What a command looks at and from where.
+
+    Returns:
+        The Gaussians; the settings that hold whatever the preset is (what --set says, over the run's background);
+        pinhole cameras, reduced; and where they come from in words.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If an option is out of range or a file damaged.
+    """
+    for option, value, low, high in (
+        ("--limit", args.limit, 1, _MAX_COUNT),
+        ("--max-pixels", args.max_pixels, 1, 10**9),
+        ("--fov", args.fov, 1, 170),
+        ("--elevation", args.elevation, -89, 89),
+    ):
+        if value is not None and not low <= value <= high:
+            raise ValueError(f"{option} must be in [{low}, {high}], got {value}; correct it")
+    gaussians, run = load_scene(args.scene)
+    fields = args.replaced()
+    if run is not None:
+        fields = {"background": run_background(run)} | fields
+    text = args.cameras or ("orbit" if run is None else str(run.path))
+    width = max(1, int(math.sqrt(args.max_pixels * 4 / 3)))
+    size = width, max(1, args.max_pixels // width)
+    cameras, source = cameras_of(args, text, gaussians, run, args.limit, size)
+    return (
+        gaussians,
+        fields,
+        [at_most(c.undistorted(), args.max_pixels) for c in evenly(cameras, args.limit)],
+        source,
+    )
 
 
 def _orbit(args: Select | Fisher, scene: Scene, known: Known, count: int, elevation: float | None) -> list[Camera]:
