@@ -177,7 +177,7 @@ class _Activated:
         scale = dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0)
         direction = [Float(x * scale) for x in d]
         basis = sh_basis(direction, coefficients)
-        return sh_color(basis, lambda k, c: self.column("sh", k * 3 + c, 3 * coefficients))
+        return sh_color(basis, lambda k, c: Float(self.column("sh", k * 3 + c, 3 * coefficients)))
 
 
 def project_screen(t, p, w2c, pinhole, settings: RenderSettings, width: int, height: int, coefficients: int):

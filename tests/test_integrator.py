@@ -519,3 +519,18 @@ def test_rays_that_cannot_be_traced(rng, origins, directions, options, message):
     settings = RenderSettings.preset("exact", traversal="bvh", **options)
     with pytest.raises(ValueError, match=message):
         render_rays(gaussians(rng, 3, 1), torch.tensor(origins), torch.tensor(directions), settings)
+
+
+@pytest.mark.parametrize("traversal", ["tiles", "bvh"])
+def test_float64_parameters_have_gradients(rng, traversal):
+    """Parameters in float64 get the gradients of the same ones in float32, the SH among them."""
+    g, cam = gaussians(rng, 12, 4), camera(rng, (9, 7))
+    settings = RenderSettings.preset("exact", traversal=traversal)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        values = {name: x.detach().to(dtype).requires_grad_() for name, x in g.parameters().items()}
+        render(g.replace(**values), cam, settings).rgb.square().sum().backward()
+        found.append({name: x.grad.double() for name, x in values.items()})
+    for name, x in found[0].items():
+        assert x.norm() > 0
+        assert (x - found[1][name]).norm() <= 1e-5 * x.norm(), name
