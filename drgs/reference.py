@@ -11,16 +11,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import SimpleNamespace as _Scene
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from drgs.oracle import activate, cull_near, float64, intrinsics, sh_basis, sh_colors, take, view_rays, within
+from drgs.volume import render_volume
+
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["EPS_ALPHA", "Output", "render", "sh_basis"]
+__all__ = ["EPS_ALPHA", "Output", "render", "render_volume", "sh_basis"]
 
 EPS_ALPHA = 1e-10
 """Expected depth is divided by max(alpha, EPS_ALPHA)."""
@@ -61,6 +64,7 @@ def render(
     settings: RenderSettings,
     rays: tuple[torch.Tensor, torch.Tensor] | None = None,
     tolerance: float = 1e-5,
+    window: tuple[int, int, int, int] | None = None,
 ) -> Output:
     """Renders by brute force in float64.
 
@@ -78,6 +82,9 @@ def render(
             neighbors in the order have keys closer than `tolerance` times the distance (exact ties
             are safe, the index decides), or a hit or T is within a relative `tolerance` of a
             cut-off, clamp, tile border or of T = 0.5.
+        window: (x, y, width, height) in pixels: only these of the camera's image. Unlike a camera with a shifted
+            principal point it keeps the tiles and the field-of-view clamp of the whole image. Gaussians that none of
+            its rays can meet are left out first, which changes nothing but the time.
 
     Returns:
         `Output` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
@@ -90,31 +97,21 @@ def render(
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
-    scene = _activate(g, s)
-    rotation = center = None
-    offset = _float64(getattr(g, "origin", (0, 0, 0)))
+    scene, view = activate(g, s), view_rays(g, cam, rays, window)
+    rotation, center, directions = view.rotation, view.center, view.directions
     if cam is not None:
-        w2c = _float64(cam.w2c)
-        rotation, center = w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3] - offset
-        scene = _cull_near(scene, rotation, center, s, tolerance)
-    if rays is None:
-        pixels, directions = _camera_rays(cam, rotation)
-        origins, shape = center.expand_as(directions), (cam.height, cam.width)
-    else:
-        pair = torch.broadcast_tensors(*map(_float64, rays))
-        shape = pair[0].shape[:-1]
-        origins, directions = pair[0].reshape(-1, 3) - offset, pair[1].reshape(-1, 3)
-        pixels = torch.zeros(len(directions), 2, dtype=torch.float64)
-    directions = directions / directions.norm(dim=-1, keepdim=True)
+        scene = cull_near(scene, rotation, center, s, tolerance)
     if s.response == "ewa":
         scene.screen = _project(scene, cam, rotation, center, s, tolerance)
+    if window is not None:
+        scene = _in_window(scene, s, view, window, tolerance)
     if s.sh_direction == "gaussian" and center is not None:
-        scene.colors = _colors(scene.sh, scene.means - center)
+        scene.colors = sh_colors(scene.sh, scene.means - center)
 
     step = max(1, _PAIRS // max(len(scene.index), 1))
     parts = []
     for i in range(0, max(len(directions), 1), step):
-        part = (x[i : i + step] for x in (origins, directions, pixels))
+        part = (x[i : i + step] for x in (view.origins, directions, view.pixels))
         args = (scene, s, rotation, center, *part, tolerance)
         # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
         if torch.is_grad_enabled() and len(directions) > step:
@@ -125,118 +122,18 @@ def render(
     fields = dict.fromkeys(parts[0])
     for name in (name for name in fields if parts[0][name] is not None):
         joined = torch.cat([part[name] for part in parts])
-        fields[name] = joined.reshape(*shape, *joined.shape[1:])
+        fields[name] = joined.reshape(*view.shape, *joined.shape[1:])
     seen = torch.zeros(len(g.means), dtype=torch.float64).index_add(0, scene.index, seen)
     return Output(visibility=seen, **fields)
 
 
-def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
-    """(..., K) real spherical harmonics of (..., 3) unit directions, K = 1, 4, 9 or 16.
-
-    3DGS order and sign: by degree, then m = -l..l; odd m carry the sign (-1)^m.
-    """
-    x, y, z = dirs.unbind(-1)
-    basis = [torch.full_like(x, math.sqrt(1 / (4 * math.pi)))]
-    if K > 1:
-        c = math.sqrt(3 / (4 * math.pi))
-        basis += [-c * y, c * z, -c * x]
-    if K > 4:
-        c = math.sqrt(15 / (4 * math.pi))
-        zonal = c / math.sqrt(12) * (2 * z * z - x * x - y * y)
-        basis += [c * x * y, -c * y * z, zonal, -c * x * z, c / 2 * (x * x - y * y)]
-    if K > 9:
-        c3, c2, c1, c0 = (math.sqrt(v / math.pi) for v in (35 / 32, 105 / 4, 21 / 32, 7 / 16))
-        outer = 4 * z * z - x * x - y * y
-        basis += [-c3 * y * (3 * x * x - y * y), c2 * x * y * z, -c1 * y * outer]
-        basis += [c0 * z * (2 * z * z - 3 * x * x - 3 * y * y), -c1 * x * outer]
-        basis += [c2 / 2 * z * (x * x - y * y), -c3 * x * (x * x - 3 * y * y)]
-    return torch.stack(basis, dim=-1)
-
-
-def _float64(x) -> torch.Tensor:
-    """A tensor keeps its graph, anything else is copied."""
-    if isinstance(x, torch.Tensor):
-        return x.to("cpu", torch.float64)
-    return torch.tensor(x, dtype=torch.float64)
-
-
-def _activate(g, s: RenderSettings) -> _Scene:
-    """Activated parameters in float64, relative to the Gaussians' origin."""
-    raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
-    means, quats, log_scales, logits, sh = map(_float64, raw)
-    n = len(means)
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    rotation = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
-    extent = torch.full((n,), s.extent or 0.0, dtype=torch.float64)
-    if s.extent is None:
-        # The N tails beyond these radii add up to at most N * alpha exp(-extent^2 / 2) = 1e-5.
-        extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
-    return _Scene(
-        means=means,
-        axes=rotation * log_scales.exp()[:, None, :],  # columns are the semi-axes
-        whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
-        logits=logits,
-        sh=sh,
-        features=None if g.features is None else _float64(g.features),
-        extent=extent,
-        index=torch.arange(n),
-        colors=None,  # (N, 3), or None where the color depends on the ray
-        near_margin=None,  # (N,), set by `_cull_near`
-        screen=None,  # `_project`, for `ewa`
-    )
-
-
-def _intrinsics(cam) -> tuple[float, float, float, float]:
-    return float(cam.K[0][0]), float(cam.K[1][1]), float(cam.K[0][2]), float(cam.K[1][2])
-
-
-def _camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixel centers (H*W, 2) and world directions (H*W, 3)."""
-    v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
-    u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
-    if getattr(cam, "model", "pinhole") == "pinhole":
-        fx, fy, cx, cy = _intrinsics(cam)
-        local = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], dim=-1)
-    else:
-        # The lens acts in the camera frame: only the rotation out of it carries the pose gradient.
-        local = _float64(cam.pixel_directions()).reshape(-1, 3) @ rotation.detach().T
-    return torch.stack([u, v], dim=-1), local @ rotation
-
-
-def _cull_near(scene: _Scene, rotation, center, s: RenderSettings, tolerance: float) -> _Scene:
-    """Drops means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
-    z = ((scene.means - center) @ rotation[2]).detach()
-    if s.near > 0:
-        keep = z > s.near * (1 - tolerance)
-        scene.near_margin = z / s.near - 1
-    elif s.response == "ewa":
-        keep = z > 0
-    else:
-        return scene
-    return _Scene(**{k: v if v is None else v[keep] for k, v in vars(scene).items()})
-
-
-def _colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
-    """max(0.5 + SH, 0) of coefficients (N, K, 3) for directions (..., N, 3) of any length."""
-    length = towards.norm(dim=-1, keepdim=True)
-    if sh.shape[1] == 1:  # no direction, so no gradient to it either
-        towards, length = torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 1)
-    basis = sh_basis(towards / torch.where(length > 0, length, 1.0), sh.shape[1])
-    return (0.5 + (basis[..., None] * sh).sum(-2)).clamp(min=0)
-
-
-def _project(scene: _Scene, cam, rotation, center, s: RenderSettings, tolerance: float) -> tuple:
+def _project(scene: SimpleNamespace, cam, rotation, center, s: RenderSettings, tolerance: float) -> tuple:
     """Projected means (N, 2), rows of J W R S (N, 2, 3), diagonal of Sigma' (N, 2), tile bounds.
 
     Tile bounds: three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by
     the tolerance, exact, grown by it. None without tile culling.
     """
-    fx, fy, cx, cy = _intrinsics(cam)
+    fx, fy, cx, cy = intrinsics(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
     mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
     slopes = []
@@ -272,7 +169,25 @@ def _project(scene: _Scene, cam, rotation, center, s: RenderSettings, tolerance:
     return mean2d, rows, diagonal, bounds
 
 
-def _responses(scene: _Scene, s: RenderSettings, rotation, center, o, d, pixels) -> tuple:
+def _in_window(scene: SimpleNamespace, s: RenderSettings, view, window, tolerance: float) -> SimpleNamespace:
+    """Without the Gaussians that are cut off on every ray of the window, near misses kept."""
+    if s.response != "ewa":
+        return take(scene, within(scene, scene.extent * (1 + 2 * tolerance), view.origins, view.directions))
+    mean2d, rows, diagonal, bounds = scene.screen
+    low = torch.tensor(window[:2], dtype=torch.float64) + 0.5
+    high = low + torch.tensor(window[2:], dtype=torch.float64) - 1
+    if bounds is None:
+        reach = (scene.extent[:, None] * diagonal.detach().sqrt()) * (1 + 2 * tolerance)
+        keep = ((mean2d.detach() + reach >= low) & (mean2d.detach() - reach <= high)).all(1)
+    else:
+        first, last = bounds[-1]
+        keep = ((last > torch.floor(low / _TILE)) & (first <= torch.floor(high / _TILE))).all(1)
+        bounds = [(first[keep], last[keep]) for first, last in bounds]
+    screen, scene.screen = (mean2d[keep], rows[keep], diagonal[keep], bounds), None
+    return SimpleNamespace(**{**vars(take(scene, keep)), "screen": screen})
+
+
+def _responses(scene: SimpleNamespace, s: RenderSettings, rotation, center, o, d, pixels) -> tuple:
     """What is known of (P, N) pairs before ordering.
 
     Returns: a, 1 - a, t; and without gradient: order key, exists (bool), margin (relative distance
@@ -360,8 +275,8 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
     colors = scene.colors
     if colors is None:
         towards = d[:, None, :] if s.sh_direction == "ray" else scene.means - o[:, None, :]
-        colors = _colors(scene.sh, towards)
-    background = torch.where(alive, rest, 1.0).prod(dim=1)[:, None] * _float64(s.background)
+        colors = sh_colors(scene.sh, towards)
+    background = torch.where(alive, rest, 1.0).prod(dim=1)[:, None] * float64(s.background)
     alpha = w.sum(dim=1)  # equals 1 - T_end, without its cancellation
     with torch.no_grad():
         # T's relative error grows with that of each 1 - a in front.

@@ -1,0 +1,195 @@
+"""What both float64 oracles share: activated Gaussians, rays of a camera, colors.
+
+Torch in float64; autograd gives the gradients of whatever is built on it.
+"""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from drgs.settings import RenderSettings
+
+__all__ = [
+    "activate",
+    "cull_near",
+    "float64",
+    "intrinsics",
+    "sh_basis",
+    "sh_colors",
+    "take",
+    "view_rays",
+    "within",
+]
+
+
+def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
+    """(..., K) real spherical harmonics of (..., 3) unit directions, K = 1, 4, 9 or 16.
+
+    3DGS order and sign: by degree, then m = -l..l; odd m carry the sign (-1)^m.
+    """
+    x, y, z = dirs.unbind(-1)
+    basis = [torch.full_like(x, math.sqrt(1 / (4 * math.pi)))]
+    if K > 1:
+        c = math.sqrt(3 / (4 * math.pi))
+        basis += [-c * y, c * z, -c * x]
+    if K > 4:
+        c = math.sqrt(15 / (4 * math.pi))
+        zonal = c / math.sqrt(12) * (2 * z * z - x * x - y * y)
+        basis += [c * x * y, -c * y * z, zonal, -c * x * z, c / 2 * (x * x - y * y)]
+    if K > 9:
+        c3, c2, c1, c0 = (math.sqrt(v / math.pi) for v in (35 / 32, 105 / 4, 21 / 32, 7 / 16))
+        outer = 4 * z * z - x * x - y * y
+        basis += [-c3 * y * (3 * x * x - y * y), c2 * x * y * z, -c1 * y * outer]
+        basis += [c0 * z * (2 * z * z - 3 * x * x - 3 * y * y), -c1 * x * outer]
+        basis += [c2 / 2 * z * (x * x - y * y), -c3 * x * (x * x - 3 * y * y)]
+    return torch.stack(basis, dim=-1)
+
+
+def float64(x) -> torch.Tensor:
+    """A tensor keeps its graph, anything else is copied."""
+    if isinstance(x, torch.Tensor):
+        return x.to("cpu", torch.float64)
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def activate(g, s: RenderSettings) -> SimpleNamespace:
+    """Activated parameters in float64, relative to the Gaussians' origin; `view_rays` says where that is."""
+    raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
+    means, quats, log_scales, logits, sh = map(float64, raw)
+    n = len(means)
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    rotation = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    extent = torch.full((n,), s.extent or 0.0, dtype=torch.float64)
+    if s.extent is None:
+        # The N tails beyond these radii add up to at most N * alpha exp(-extent^2 / 2) = 1e-5.
+        extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
+    return SimpleNamespace(
+        means=means,
+        axes=rotation * log_scales.exp()[:, None, :],  # columns are the semi-axes
+        whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
+        logits=logits,
+        sh=sh,
+        features=None if g.features is None else float64(g.features),
+        extent=extent,
+        index=torch.arange(n),
+        colors=None,  # (N, 3), or None where the color depends on the ray
+        near_margin=None,  # (N,), set by `cull_near`
+        screen=None,  # `_project`, for `ewa`
+    )
+
+
+def intrinsics(cam) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels."""
+    return float(cam.K[0][0]), float(cam.K[1][1]), float(cam.K[0][2]), float(cam.K[1][2])
+
+
+def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pixel centers (H*W, 2) and world directions (H*W, 3)."""
+    v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
+    u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
+    if getattr(cam, "model", "pinhole") == "pinhole":
+        fx, fy, cx, cy = intrinsics(cam)
+        local = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], dim=-1)
+    else:
+        # The lens acts in the camera frame: only the rotation out of it carries the pose gradient.
+        local = float64(cam.pixel_directions()).reshape(-1, 3) @ rotation.detach().T
+    return torch.stack([u, v], dim=-1), local @ rotation
+
+
+def cull_near(scene: SimpleNamespace, rotation, center, s: RenderSettings, tolerance: float) -> SimpleNamespace:
+    """Drops means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
+    z = ((scene.means - center) @ rotation[2]).detach()
+    if s.near > 0:
+        keep = z > s.near * (1 - tolerance)
+        scene.near_margin = z / s.near - 1
+    elif s.response == "ewa":
+        keep = z > 0
+    else:
+        return scene
+    return take(scene, keep)
+
+
+def sh_colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
+    """max(0.5 + SH, 0) of coefficients (N, K, 3) for directions (..., N, 3) of any length."""
+    length = towards.norm(dim=-1, keepdim=True)
+    if sh.shape[1] == 1:  # no direction, so no gradient to it either
+        towards, length = torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 1)
+    basis = sh_basis(towards / torch.where(length > 0, length, 1.0), sh.shape[1])
+    return (0.5 + (basis[..., None] * sh).sum(-2)).clamp(min=0)
+
+
+def view_rays(g, cam, rays, window=None) -> SimpleNamespace:
+    """The rays to render, in the frame that the Gaussians' origin is 0 of.
+
+    Args:
+        g: For its origin.
+        cam, rays: As of `reference.render`.
+        window: (x, y, width, height) in pixels: only these pixels of the camera's image.
+    Returns:
+        rotation (3, 3) and center (3,) of the camera or None, origins and directions (P, 3), unit length, pixels
+        (P, 2), and the shape of the image.
+    """
+    offset = float64(getattr(g, "origin", (0, 0, 0)))
+    rotation = center = None
+    if cam is not None:
+        w2c = float64(cam.w2c)
+        rotation, center = w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3] - offset
+    if rays is None:
+        pixels, directions = camera_rays(cam, rotation)
+        shape = (cam.height, cam.width)
+        if window is not None:
+            x, y, width, height = window
+            inside = torch.arange(cam.height * cam.width).reshape(shape)[y : y + height, x : x + width]
+            if min(x, y) < 0 or tuple(inside.shape) != (height, width) or not inside.numel():
+                raise ValueError(
+                    f"window: must lie in the image of {cam.width}x{cam.height} pixels, got x, y, width, height = "
+                    f"{tuple(window)}; correct it"
+                )
+            shape, inside = (height, width), inside.reshape(-1)
+            pixels, directions = pixels[inside], directions[inside]
+        origins = center.expand_as(directions)
+    else:
+        if window is not None:
+            raise ValueError("window: must come with a camera's own rays, got rays; choose among them instead")
+        pair = torch.broadcast_tensors(*map(float64, rays))
+        shape = pair[0].shape[:-1]
+        origins, directions = pair[0].reshape(-1, 3) - offset, pair[1].reshape(-1, 3)
+        pixels = torch.zeros(len(directions), 2, dtype=torch.float64)
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    return SimpleNamespace(
+        rotation=rotation, center=center, origins=origins, directions=directions, pixels=pixels, shape=tuple(shape)
+    )
+
+
+def within(scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor):
+    """(N,) bool, False only where no ray, extended to both sides, comes within `reach` (N,) sigma of a mean.
+
+    Compares each bounding sphere with the cone around the rays; rays without a common origin keep all.
+    """
+    n, o, d = len(scene.means), origins.detach(), directions.detach()
+    if not len(d) or not bool((o == o[:1]).all()):
+        return torch.ones(n, dtype=torch.bool)
+    axis = d.mean(0)
+    axis = axis / axis.norm().clamp(min=1e-300)
+    # The chord keeps the digits of small angles that a cosine loses.
+    half = 2 * torch.asin(((d - axis).norm(dim=1).max() / 2).clamp(max=1))
+    away = scene.means.detach() - o[0]
+    angle = torch.atan2(torch.linalg.cross(away, axis.expand_as(away)).norm(dim=1), (away @ axis).abs())
+    radius = reach * scene.axes.detach().norm(dim=1).amax(1)
+    spread = torch.asin((radius / away.norm(dim=1).clamp(min=1e-300)).clamp(max=1))
+    return (angle - spread <= half + 1e-9) | (half > 1.5)
+
+
+def take(scene: SimpleNamespace, keep: torch.Tensor) -> SimpleNamespace:
+    """The Gaussians at `keep`, a mask or an index."""
+    return SimpleNamespace(**{k: x[keep] if isinstance(x, torch.Tensor) else x for k, x in vars(scene).items()})
