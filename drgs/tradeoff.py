@@ -1,0 +1,410 @@
+"""`drgs tradeoff`: what every accuracy/speed setting costs and gives, on a user's own scene and views.
+
+Truth is preset `exact`, with the user's --set and background; its own error is measured against the float64 oracle on a
+sample of pixels and added to every other one before a budget is compared with it. Errors of a setting:
+
+    image        absolute, of all values of all views: RMS, 99.9th percentile, largest; PSNR for peak 1
+    gradient     of <u, image>, u = +-1 at random (then the expected squared error of J^T u is that of the Jacobian in
+                 the Frobenius norm): relative L2 over all views, by parameter group and of all together
+    information  diagonal of J^T J: relative L1 over all views, and the median of the relative errors of the entries
+                 above 1e-6 of the largest, by group
+
+A budget binds, of the image, the larger of RMS and 99.9th percentile (not the largest: where two Gaussians tie, either
+order is right, and single pixels jump); of gradient and information, the worst group (all together is the group with
+the largest unit); of information, the larger of L1 and median.
+
+Times are medians over rounds in which all settings take turns on one view, everything included; ratios are to `exact`
+in the same round. What would take minutes (Mitsuba's traversal without cut-offs, the oracle) is measured on a sample of
+rays, once, and its time scaled to the image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs import runtime
+from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.progress import Bar
+from drgs.render_command import described, make_folder
+from drgs.tradeoff_measure import measure
+from drgs.viewpoints import seen_views
+
+if TYPE_CHECKING:
+    from drgs.cli import Tradeoff
+
+__all__ = ["USES", "VARIANTS", "Variant", "recommend", "run"]
+
+USES = {
+    "image": ("forward", ("image",)),
+    "gradients": ("forward_backward", ("gradient",)),
+    "information": ("fisher", ("information",)),
+    "everything": ("forward_backward", ("image", "gradient", "information")),
+}
+"""Use -> the time that counts, and the errors that must be within the budget."""
+
+_ALIKE = 0.05  # times this close are equal: rounds differ by more
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One row: settings, and how much of the image they are used for.
+
+    Attributes:
+        kind: `approximation` (of exact's model), `model` (another response or view direction: a difference, not an
+            error), `resolution`, or `precision`.
+        preset, fields: Of the settings.
+        share: Of width and height; the image is enlarged bilinearly, information scaled by the number of pixels.
+        by: `view`; `rays`, a sample of the rays; `oracle`, the same in float64.
+    """
+
+    kind: str
+    preset: str = "exact"
+    fields: dict = dataclasses.field(default_factory=dict)
+    share: float = 1.0
+    by: str = "view"
+
+    @property
+    def name(self) -> str:
+        """For people, short."""
+        if self.by == "oracle":
+            return "float64 oracle"
+        text = " ".join(f"{key}={_short(value)}" for key, value in self.fields.items())
+        text = text if self.preset == "exact" and text else f"{self.preset} {text}".strip()
+        return text + {1.0: "", 0.5: ", half resolution", 0.25: ", quarter resolution"}[self.share]
+
+    def flags(self, overrides: tuple[str, ...] = ()) -> str:
+        """Options of the other commands for these settings, after the user's own."""
+        kept = [text for text in overrides if text.partition("=")[0] not in self.fields]
+        texts = [*(f"{key}={str(value).lower()}" for key, value in self.fields.items()), *kept]
+        return " ".join([f"--preset {self.preset}", *(f"--set {text}" for text in texts)])
+
+
+def _rows(kind: str, preset: str, key: str, *values) -> list[Variant]:
+    return [Variant(kind, preset, {key: value}) for value in values]
+
+
+_EWA = {"response": "ewa", "order": "center"}
+VARIANTS = (
+    Variant("precision"),
+    Variant("precision", by="oracle"),
+    # One switch away from exact.
+    *_rows("model", "exact", "response", "integral"),
+    Variant("model", fields=_EWA),
+    Variant("model", fields=_EWA | {"dilation": 0.3}),
+    *_rows("model", "exact", "sh_direction", "ray"),
+    *_rows("approximation", "exact", "order", "center"),
+    Variant("approximation", fields={"order": "center", "depth_key": "z"}),
+    Variant("approximation", fields={"traversal": "bvh"}, by="rays"),
+    Variant("approximation", fields={"traversal": "bvh", "order": "entry"}, by="rays"),
+    *_rows("approximation", "exact", "extent", 4.0, 3.33, 3.0, 2.5, 2.0),
+    *_rows("approximation", "exact", "alpha_min", 1e-4, 1e-3, 1 / 255),
+    *_rows("approximation", "exact", "alpha_max", 0.9999, 0.999, 0.99),
+    Variant("approximation", fields={"alpha_max": 0.99, "alpha_max_gradient": "pass"}),
+    *_rows("approximation", "exact", "transmittance_min", 1e-6, 1e-4, 1e-3, 1e-2),
+    # Several at a time.
+    Variant("approximation", fields={"alpha_min": 1e-4, "transmittance_min": 1e-6}),
+    Variant("approximation", fields={"alpha_min": 1e-3, "transmittance_min": 1e-4}),
+    Variant("approximation", fields={"order": "center", "alpha_min": 1e-4, "transmittance_min": 1e-6}),
+    Variant("approximation", "fast"),
+    *_rows("approximation", "fast", "order", "ray"),
+    *_rows("approximation", "fast", "depth_key", "z"),
+    *_rows("approximation", "fast", "extent", None, 4.0, 3.33, 2.5, 2.0),
+    *_rows("approximation", "fast", "alpha_min", 1 / 255),
+    *_rows("approximation", "fast", "alpha_max", 1.0),
+    *_rows("approximation", "fast", "transmittance_min", 1e-4, 1e-3),
+    *_rows("model", "fast", "response", "integral"),
+    Variant("approximation", "mitsuba"),
+    Variant("model", "inria"),
+    Variant("model", "gsplat"),
+    *(Variant("resolution", preset, share=share) for preset in ("exact", "fast") for share in (0.5, 0.25)),
+)
+
+
+def run(args: Tradeoff) -> None:
+    """`drgs tradeoff SCENE`."""
+    if args.preset != "exact":
+        raise ValueError(f"--preset must be exact, which the others are compared with, got {args.preset}; drop it")
+    if not args.max_error or not all(0 < x < math.inf for x in args.max_error):
+        got = " ".join(f"{x:g}" for x in args.max_error) or "none"
+        raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
+    if not 1 <= args.repeats <= 1000:
+        raise ValueError(f"--repeats must be in [1, 1000], got {args.repeats}; correct it")
+    gaussians, fields, cameras, source = seen_views(args)
+    make_folder(args.output)
+    with Bar("tradeoff", (args.repeats + 1) * sum(x.by == "view" for x in VARIANTS), not args.quiet) as bar:
+        measured = measure(gaussians, cameras, VARIANTS, fields, args.repeats, args.seed, bar.advance)
+    for row, variant in zip(measured["rows"], VARIANTS, strict=True):
+        row["flags"] = None if variant.by == "oracle" else variant.flags(args.overrides)
+    report = {
+        "schema": SCHEMA,
+        "command": "tradeoff",
+        "scene": str(args.scene),
+        "gaussians": len(gaussians),
+        "source": source,
+        "views": [described(camera) for camera in cameras],
+        "fields": fields,
+        "seed": args.seed,
+        "budgets": list(args.max_error),
+        **measured,
+        "recommended": [pick for use in USES for pick in recommend(measured, use, args.max_error)],
+        "date": datetime.date.today().isoformat(),
+        "env": runtime.info(),
+    }
+    drawn = _plot(report, args.output / "tradeoff.png")
+    with atomic_write(args.output / "tradeoff.md") as file:
+        file.write(_page(report, drawn).encode())
+    write_json(args.output / "tradeoff.json", report)
+    if not args.quiet:
+        _print(report)
+        files = "tradeoff.json, tradeoff.md" + (", tradeoff.png" if drawn else "")
+        print(f"{files}: {args.output}", flush=True)
+    if not drawn:
+        print("no plot: matplotlib is not installed; pip install 'drgs[report]'", flush=True)
+
+
+def recommend(measured: dict, use: str, budgets) -> list[dict]:
+    """The fastest setting within each budget, the most exact one of those equally fast, or why there is none.
+
+    Args:
+        measured: Of `tradeoff_measure.measure`. Rows of a reduced resolution and rows that were measured on a sample of
+            the rays are no candidates.
+        use: One of `USES`.
+        budgets: > 0.
+    """
+    clock, kinds = USES[use]
+    rows = [r for r in measured["rows"] if r["skipped"] is None and r["share"] == 1 and r["by"] == "view"]
+    rows = [r for r in rows if all(r["errors"][k] is not None for k in kinds) and r["ratio"][clock] is not None]
+    largest = {r["name"]: max(r["errors"][k] for k in kinds) for r in rows}
+    picks = []
+    for budget in budgets:
+        pick = {"use": use, "budget": budget, "clock": clock, "name": None, "reason": None}
+        within = [r for r in rows if largest[r["name"]] <= budget]
+        if within:
+            least = min(r["ratio"][clock] for r in within)
+            alike = [r for r in within if r["ratio"][clock] <= least * (1 + _ALIKE)]
+            best = min(alike, key=lambda r: (largest[r["name"]], r["ratio"][clock]))
+            pick |= {"name": best["name"], "kind": best["kind"], "flags": best.get("flags")}
+            pick |= {"error": largest[best["name"]], "ratio": best["ratio"][clock]}
+        elif largest:
+            least = min(largest, key=largest.get)
+            pick["reason"] = f"no setting is within it, the least error is {largest[least]:.1e} ({least})"
+        else:
+            pick["reason"] = f"there is no setting whose {' and '.join(kinds)} error could be measured"
+        picks.append(pick)
+    return picks
+
+
+def _short(value) -> str:
+    if value == 1 / 255:
+        return "1/255"
+    if not isinstance(value, float):
+        return str(value).lower()
+    return f"{value:g}" if value >= 0.01 else f"{value:.0e}".replace("e-0", "e-")
+
+
+# ----------------------------------------------------------------------------------------- outputs
+
+
+def _print(report: dict) -> None:
+    """Tables for a terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=120)
+    title = f"time and error relative to exact: {report['gaussians']} Gaussians, {len(report['views'])} views"
+    table = Table(title=f"{title} ({report['source']})", box=None, padding=(0, 1))
+    table.add_column("setting", overflow="fold")
+    table.add_column("kind", no_wrap=True)
+    for name in ("fwd", "+bwd", "info", "image", "gradient", "inform."):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in report["rows"]:
+        if row["skipped"] is None:
+            errors = row["errors"] if row["by"] != "oracle" else {**row["errors"], **report["own"]}
+            table.add_row(
+                row["name"],
+                row["kind"],
+                *(_time(row, key) for key in ("forward", "forward_backward", "fisher")),
+                *(_number(errors[key], ".1e") for key in ("image", "gradient", "information")),
+            )
+    console.print(table)
+    for line in _notes(report):
+        console.print(line, markup=False, soft_wrap=True)
+    console.print("\nFastest within a budget:")
+    for pick in report["recommended"]:
+        console.print("  " + _advice(pick), markup=False, soft_wrap=True)
+
+
+def _page(report: dict, drawn: bool) -> str:
+    """tradeoff.md."""
+    env, cameras = report["env"], report["views"]
+    threads = env["threads"]["drjit"]
+    lines = [
+        f"{report['gaussians']:,} Gaussians, {len(cameras)} views of {cameras[0]['width']}x{cameras[0]['height']} "
+        f"({report['source']}); {env['cpu']}, {threads} threads, {env['backend']['variant']}, {report['date']}, "
+        f"commit {env['commit']}; {report['rounds']} rounds.",
+        "",
+        "| setting | kind | forward | + backward | Fisher | first call s | image RMS | 99.9 % | max | PSNR dB "
+        "| gradient, all | worst group | Fisher L1 | median | worst group |",
+        "|---|---|" + "---:|" * 9 + "---|---:|---:|---|",
+    ]
+    for row in report["rows"]:
+        if row["skipped"] is not None:
+            continue
+        image, slope, information = (row[key] or {} for key in ("image", "gradient", "information"))
+        cells = [
+            *(_time(row, key) for key in ("forward", "forward_backward", "fisher")),
+            _number(row["first_call"], ".1f"),
+            *(_number(image.get(key), ".1e") for key in ("rms", "p999", "max")),
+            _number(image.get("psnr"), ".1f"),
+            _number(slope.get("all"), ".1e"),
+            f"{_number(slope.get('worst'), '.1e')} {slope.get('group') or ''}".strip(),
+            *(_number(information.get(key), ".1e") for key in ("l1", "median")),
+            information.get("group") or "-",
+        ]
+        lines.append(f"| {row['name']} | {row['kind']} | " + " | ".join(cells) + " |")
+    lines += ["", *(f"- {line}" for line in _notes(report)), ""]
+    lines += ["| use | budget | fastest setting within it | time | error |", "|---|---|---|---|---|"]
+    for pick in report["recommended"]:
+        found = (
+            f"`{pick['flags']}` | {pick['ratio']:.2f} | {pick['error']:.1e}"
+            if pick["name"]
+            else f"{pick['reason']} | | "
+        )
+        lines.append(f"| {pick['use']} | {pick['budget']:g} | {found} |")
+    if drawn:
+        lines += ["", "![error against time](tradeoff.png)"]
+    return "\n".join(lines) + "\n"
+
+
+def _notes(report: dict) -> list[str]:
+    """What the numbers do not say."""
+    exact, own = report["rows"][0], report["own"]
+    seconds = exact["seconds"]
+    took = [_milliseconds(seconds[key]) for key in ("forward", "forward_backward", "fisher")]
+    lines = [f"exact: {took[0]} forward, {took[1]} forward + backward, {took[2]} the Fisher diagonal of a view"]
+    if own["image"] is not None:
+        oracle = next(row for row in report["rows"] if row["by"] == "oracle")
+        lines.append(
+            f"exact itself differs from float64 by up to {own['image']:.1e} (image), {_number(own['gradient'], '.1e')} "
+            f"(gradient, {oracle['gradient']['group']}), outside of {oracle['notes']['ties']} pixels with ties, on "
+            f"{oracle['notes']['sample']}"
+        )
+    else:
+        lines.append("exact itself was not compared with float64; budgets hold relative to it")
+    for row in report["rows"]:
+        if row["skipped"] is not None:
+            lines.append(f"skipped {row['name']}: {row['skipped']}")
+        elif row["by"] == "view" and "information" in row["notes"]:
+            lines.append(f"{row['name']}, no Fisher diagonal: {row['notes']['information']}")
+        elif row["by"] == "rays":
+            lines.append(f"~ {row['name']}: {row['notes']['sample']}")
+    return lines
+
+
+def _advice(pick: dict) -> str:
+    where = f"{pick['use']}, {pick['budget']:g}: "
+    if pick["name"] is None:
+        return where + pick["reason"]
+    return f"{where}{pick['ratio']:.2f}x the time, error {pick['error']:.1e}:  {pick['flags']}"
+
+
+def _time(row: dict, key: str) -> str:
+    ratio = row["ratio"][key]
+    if ratio is None:
+        return "-"
+    text = f"{ratio:.2f}" if ratio < 10 else f"{ratio:.0f}"
+    return text if row["by"] == "view" else f"~{text}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{1e3 * seconds:.0f} ms"
+
+
+_PANELS = (
+    ("image", "forward", "image error (larger of RMS and 99.9 %)"),
+    ("gradient", "forward_backward", "gradient error (worst group)"),
+    ("information", "fisher", "information error (worst group)"),
+)
+_COLORS = {"approximation": "#1f77b4", "model": "#d62728", "resolution": "#2ca02c", "precision": "#7f7f7f"}
+
+
+def _plot(report: dict, path: Path) -> bool:
+    """Error against time for each use; False where there is no matplotlib."""
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(3, 1, figsize=(10, 16), dpi=80)
+    for axis, (kind, clock, label) in zip(panels, _PANELS, strict=True):
+        rows = [r for r in report["rows"] if r["skipped"] is None and r["by"] == "view"]
+        points = [(r["ratio"][clock], r["errors"][kind], r) for r in rows if r["ratio"][clock] and r["errors"][kind]]
+        for name, color in _COLORS.items():
+            part = [(x, y) for x, y, r in points if r["kind"] == name]
+            axis.plot(*zip(*part, strict=True), "o", ms=5, color=color, label=name) if part else None
+        points.sort(key=lambda p: p[:2])
+        front = [p for i, p in enumerate(points) if all(p[1] < q[1] for q in points[:i])]
+        axis.plot([p[0] for p in front], [p[1] for p in front], "-", lw=1, color="black", label="front", zorder=0)
+        axis.set(xscale="log", yscale="log", ylabel=label, xlabel=f"time, {clock.replace('_', ' + ')} / exact")
+        axis.margins(x=0.25, y=0.12)
+        for budget in report["budgets"]:
+            axis.axhline(budget, lw=0.6, ls=":", color="gray", zorder=0)
+        axis.legend(fontsize=7, loc="upper right")
+        # The front first: what finds no free place is left without a label.
+        rest = [p for p in points if p not in front]
+        _labels(figure, axis, [*front, *rest], points)
+    figure.suptitle(f"{report['scene']}: {report['gaussians']:,} Gaussians", fontsize=10)
+    figure.tight_layout(rect=(0, 0, 1, 0.985))
+    figure.savefig(path)
+    plt.close(figure)
+    return True
+
+
+def _labels(figure, axis, points: list, dots: list) -> None:
+    """Names beside points, without overlaps; a point whose surroundings are full goes without."""
+    from matplotlib.transforms import Bbox
+
+    figure.tight_layout(rect=(0, 0, 1, 0.985))  # places do not move any more
+    renderer, inside = figure.canvas.get_renderer(), axis.get_window_extent()
+    places = [axis.transData.transform(p[:2]) for p in dots]
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
+    taken.append(axis.get_legend().get_window_extent(renderer))
+    for x, y, row in points:
+        for reach in (6, 16, 30, 46):
+            for angle in (0, 180, 90, 270, 45, 315, 135, 225):
+                dx, dy = reach * math.cos(math.radians(angle)), reach * math.sin(math.radians(angle))
+                text = axis.annotate(
+                    row["name"],
+                    (x, y),
+                    xytext=(dx, dy),
+                    textcoords="offset points",
+                    fontsize=7.5,
+                    color=_COLORS[row["kind"]],
+                    ha="left" if dx > 1 else "right" if dx < -1 else "center",
+                    va="bottom" if dy > 1 else "top" if dy < -1 else "center",
+                    arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "gray"} if reach > 6 else None,
+                )
+                box = text.get_window_extent(renderer)
+                if (
+                    inside.contains(box.x0, box.y0)
+                    and inside.contains(box.x1, box.y1)
+                    and not box.count_overlaps(taken)
+                ):
+                    taken.append(box)
+                    break
+                text.remove()
+            else:
+                continue
+            break
