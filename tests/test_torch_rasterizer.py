@@ -66,15 +66,16 @@ def test_image_and_gradient_are_drgs(seed):
     assert good.float().mean() > 0.9
     u = cotangent(seed, scene) * good[..., None]
     expected = torch.autograd.grad(oracle.rgb, list(leaves.values()), u)
+    exact = oracle.rgb.detach()
     out = drgs.render(drgs.Gaussians(**leaves), camera, settings)
     ours = torch.autograd.grad(out.rgb, list(leaves.values()), u.float())
     image, found = tr.gradients(tr.rasterization, scene, u)
-    assert float((image - oracle.rgb)[good].abs().max()) < 1e-9
-    assert float((image - out.rgb)[good].abs().max()) < 1e-5
+    assert float((image - exact)[good].abs().max()) < 1e-9
+    assert float((image - out.rgb.detach())[good].abs().max()) < 1e-5
     for name, x, y in zip(tr.GROUPS, expected, ours, strict=True):
         # The oracle's gradients come back in the parameters' float32.
-        assert relative(found[name], x) < 2e-6, name
-        assert relative(y, found[name]) < 1e-4, name
+        assert relative(found[name], x) < 5e-7, name
+        assert relative(y, found[name]) < 1e-5, name
 
 
 def test_float32_stays_float32():
@@ -187,15 +188,34 @@ def _uncut(fields, count):
     return lambda *raw: tr.draw(function, {**scene, **dict(zip(tr.GROUPS, raw, strict=True))})[0], leaves
 
 
+def slope_errors(draw, leaves) -> dict[str, float]:
+    """Group -> |<gradient, v> - central difference along v| / (|gradient| |v|), for random v, worst of three."""
+    make = torch.Generator().manual_seed(1)
+    image = draw(*leaves)
+    assert image.detach().std() > 1e-2
+    u = torch.randn(image.shape, generator=make, dtype=torch.float64)
+    gradient = torch.autograd.grad(image, leaves, u, allow_unused=True, materialize_grads=True)
+    errors = {}
+    with torch.no_grad():
+        for i, name in enumerate(tr.GROUPS):
+            for _ in range(3):
+                v = torch.randn(leaves[i].shape, generator=make, dtype=torch.float64)
+                sides = [draw(*leaves[:i], leaves[i] + h * v, *leaves[i + 1 :]) for h in (1e-5, -1e-5)]
+                slope = float(((sides[0] - sides[1]) * u).sum()) / 2e-5
+                error = abs(float((gradient[i] * v).sum()) - slope) / max(float(gradient[i].norm() * v.norm()), 1e-12)
+                errors[name] = max(error, errors.get(name, 0.0))
+    return errors
+
+
 @pytest.mark.parametrize("name", [None, *KINDS["convention"]])
 def test_gradient_agrees_with_its_own_finite_differences(name):
-    draw, leaves = _uncut(tr.DEFECTS[name].fields if name else {}, 4)
-    assert draw(*leaves).std() > 1e-2
-    assert torch.autograd.gradcheck(draw, leaves, atol=1e-6, rtol=1e-4, fast_mode=True)
+    errors = slope_errors(*_uncut(tr.DEFECTS[name].fields if name else {}, 4))
+    assert max(errors.values()) < 1e-7, errors
 
 
 @pytest.mark.parametrize("name", [x for x in KINDS["gradient"] if x not in ("clamp_passes_gradient", "nan_culled")])
 def test_gradient_defect_disagrees_with_its_finite_differences(name):
-    """So that the check above can fail. Without a clamp and culled Gaussians the two left out are no defects."""
-    draw, leaves = _uncut(tr.DEFECTS[name].fields, 4)
-    assert not torch.autograd.gradcheck(draw, leaves, atol=1e-6, rtol=1e-4, fast_mode=True, raise_exception=False)
+    """In its groups and in no other. Without a clamp and without culled Gaussians the two left out are no defects."""
+    errors = slope_errors(*_uncut(tr.DEFECTS[name].fields, 4))
+    for group, error in errors.items():
+        assert error > 1e-3 if group in tr.DEFECTS[name].groups else error < 1e-7, (group, errors)
