@@ -314,7 +314,9 @@ class Crossval(_Seen):
     ladder: bool = True
     """Attribute what is left between that model and the exact one."""
     strict: bool = False
-    """Known deviations fail, too."""
+    """Conventions that differ and known deviations fail, too."""
+    export: Path | None = None
+    """Only write the scene, the cameras and cotangents to this .npz, for a rasterizer on another machine."""
     output: _Output = Path("out/crossval")
     """Folder for report.html and crossval.json."""
 

@@ -29,11 +29,7 @@ if TYPE_CHECKING:
     from drgs.gain import Prior
     from drgs.viewpoints import Scene
 
-__all__ = ["map_picture", "map_weights", "run"]
-
-_INK = (235, 235, 235)
-_NOTHING = 64  # gray of pixels that no parameter moves
-_DECADES = 3.0  # at most so many are told apart by color
+__all__ = ["map_weights", "run"]
 
 
 def run(args: Fisher) -> None:
@@ -107,37 +103,6 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     return variance, share
 
 
-def map_picture(values: np.ndarray) -> np.ndarray:
-    """(H, W + bar, 3) uint8: bright is large, on a logarithmic scale, with a labeled color bar; gray where it is 0.
-
-    The scale ends at the largest value and covers what lies between it and the 1st percentile, at most three decades.
-
-    Args:
-        values: (H, W), finite, >= 0.
-    """
-    import cv2
-
-    known = values > 0
-    top = np.log10(values[known].max()) if known.any() else 0.0
-    low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
-    low = min(max(low, top - _DECADES), top - 1e-3)
-
-    def colors(exponents: np.ndarray) -> np.ndarray:
-        return cv2.applyColorMap(pictures.to_bytes((exponents - low) / (top - low)), cv2.COLORMAP_INFERNO)[..., ::-1]
-
-    picture = colors(np.log10(np.where(known, values, 10.0**low)))
-    picture[~known] = _NOTHING
-    height = len(values)
-    bar = np.zeros((height, 76, 3), np.uint8)
-    bar[:, 4:16] = colors(np.linspace(top, low, height)[:, None].repeat(12, 1))
-    inset = min(12, max(height - 2, 0))
-    for row, exponent in ((inset, top), (height // 2 + 4, (low + top) / 2), (height - 4, low)):
-        if exponent in (low, top) or height >= 48:
-            text = f"{10.0**exponent:.2g}"
-            cv2.putText(bar, text, (20, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
-    return np.concatenate([picture, bar], axis=1)
-
-
 def _view(args: Fisher, scene: Scene, camera: Camera, name: str, H: Information, prior: Prior) -> dict:
     """Maps of one view, and what it says."""
     from drgs import fisher
@@ -151,7 +116,7 @@ def _view(args: Fisher, scene: Scene, camera: Camera, name: str, H: Information,
     parts = map_weights(*({k: x for k, x in y.items() if k != "features"} for y in (H, Hc)), prior)
     for kind, weights in zip(("variance", "share"), parts, strict=True):
         values = fisher.variance_map(g, camera, weights, settings).numpy()
-        pictures.write_png(args.output / f"{name}.{kind}.png", map_picture(values))
+        pictures.write_png(args.output / f"{name}.{kind}.png", pictures.map_picture(values))
         row["files"].append(f"{name}.{kind}.png")
         row[kind] = {
             "sum": float(values.sum(dtype=np.float64)),

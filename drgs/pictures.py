@@ -17,10 +17,22 @@ import numpy as np
 
 from drgs.files import atomic_write
 
-__all__ = ["Video", "caption", "depth_picture", "file_names", "to_bytes", "write_exr", "write_png"]
+__all__ = [
+    "Video",
+    "caption",
+    "depth_picture",
+    "file_names",
+    "map_picture",
+    "png_bytes",
+    "to_bytes",
+    "write_exr",
+    "write_png",
+]
 
 _INK = (235, 235, 235)
 _UNKNOWN = 0.25  # gray of depth where nothing is
+_NOTHING = 64  # gray of pixels whose value is 0
+_DECADES = 3.0  # at most so many are told apart by color
 _OPAQUE = 0.5  # depth is shown where at least this much of the light stops
 
 
@@ -42,12 +54,17 @@ def file_names(names: list[str]) -> list[str]:
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write an (H, W, 3) RGB image, uint8 or float in [0, 1], as 8-bit PNG."""
+    with atomic_write(path) as file:
+        file.write(png_bytes(image))
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """What `write_png` writes."""
     import cv2
 
     pixels = image if image.dtype == np.uint8 else to_bytes(image)
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
-    with atomic_write(path) as file:
-        file.write(encoded.tobytes())
+    return encoded.tobytes()
 
 
 def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) -> None:
@@ -99,6 +116,37 @@ def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     for row, value in ((inset, low), (height // 2 + 4, (low + high) / 2), (height - 4, high)):
         if value in (low, high) or height >= 48:
             cv2.putText(bar, f"{value:.4g}", (20, row), font, 0.4, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([picture, bar], axis=1)
+
+
+def map_picture(values: np.ndarray) -> np.ndarray:
+    """(H, W + bar, 3) uint8: bright is large, on a logarithmic scale, with a labeled color bar; gray where it is 0.
+
+    The scale ends at the largest value and covers what lies between it and the 1st percentile, at most three decades.
+
+    Args:
+        values: (H, W), finite, >= 0.
+    """
+    import cv2
+
+    known = values > 0
+    top = np.log10(values[known].max()) if known.any() else 0.0
+    low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
+    low = min(max(low, top - _DECADES), top - 1e-3)
+
+    def colors(exponents: np.ndarray) -> np.ndarray:
+        return cv2.applyColorMap(to_bytes((exponents - low) / (top - low)), cv2.COLORMAP_INFERNO)[..., ::-1]
+
+    picture = colors(np.log10(np.where(known, values, 10.0**low)))
+    picture[~known] = _NOTHING
+    height = len(values)
+    bar = np.zeros((height, 76, 3), np.uint8)
+    bar[:, 4:16] = colors(np.linspace(top, low, height)[:, None].repeat(12, 1))
+    inset = min(12, max(height - 2, 0))
+    for row, exponent in ((inset, top), (height // 2 + 4, (low + top) / 2), (height - 4, low)):
+        if exponent in (low, top) or height >= 48:
+            text = f"{10.0**exponent:.2g}"
+            cv2.putText(bar, text, (20, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
     return np.concatenate([picture, bar], axis=1)
 
 

@@ -14,8 +14,9 @@ from drgs import cli, fisher
 from drgs.cameras import Camera, load_cameras_json, look_at, orbit, save_cameras_json
 from drgs.data import load
 from drgs.files import load_ply, load_state, save_ply
-from drgs.fisher_command import map_picture, map_weights
+from drgs.fisher_command import map_weights
 from drgs.gain import Prior
+from drgs.pictures import map_picture
 from drgs.train import fit
 
 

@@ -1,0 +1,370 @@
+"""What a rasterizer may do differently, as variations of a model that we can render, and the search for those it does.
+
+A `Model` is a preset and what is unusual about it: the order of quaternions, where pixels are, what is done to
+opacities, and so on. Each variation is a change of our renderer's input, settings or output, differentiable as the
+rest, so that gradients can be compared at the conventions that were found.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+from drgs import reference
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.integrator import render
+from drgs.settings import RenderSettings
+
+__all__ = ["Finding", "Found", "Model", "find"]
+
+_SH0 = math.sqrt(1 / (4 * math.pi))
+_SETTLED = 1e-5  # RMS of an image that equals the model's
+_SHARE = 0.3  # of the remaining difference that a variation must explain to be named
+_ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
+_COMPENSATION_FLOOR = 2.5e-5  # of the ratio of determinants; 0.005 squared, as both rasterizers have it
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A preset and what is unusual about it.
+
+    Attributes:
+        settings: Response, order, cut-offs, background.
+        quaternions: `wxyz`, or `xyzw`: how the four numbers are read.
+        rotation: `as given`, or `transposed`.
+        scales: `linear`, or `exponential`: exp is applied to what already is a standard deviation.
+        opacities: `linear`, or `sigmoid`: the logistic function is applied to what already is an opacity.
+        compensation: Opacities times sqrt(det / det after dilation), as in anti-aliased modes.
+        direction: Where SH are evaluated: `to the mean`, `to the camera` (the opposite), or `camera frame` (to the
+            mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
+        direction_gradient: Whether the mean gets a gradient through that direction.
+        sh_degree: Bands above it are left out.
+        sh_sign: Coefficients whose sign is turned: `none`, `odd m` (a basis without the factor (-1)^m), or a band.
+        channels: Order of the color channels of the image, or of the Gaussians' colors alone (`bgr, not behind`).
+        transfer: `none`, or `sRGB to linear`: applied to the finished image.
+        pixel_center: Of column 0 and row 0.
+        flip: `none`, `vertical`, `horizontal`.
+        pose: `w2c`, or `c2w`: how the camera matrix is read.
+    """
+
+    settings: RenderSettings
+    quaternions: str = "wxyz"
+    rotation: str = "as given"
+    scales: str = "linear"
+    opacities: str = "linear"
+    compensation: bool = False
+    direction: str = "to the mean"
+    direction_gradient: bool = True
+    sh_degree: int = 3
+    sh_sign: str = "none"
+    channels: str = "rgb"
+    transfer: str = "none"
+    pixel_center: tuple[float, float] = (0.5, 0.5)
+    flip: str = "none"
+    pose: str = "w2c"
+
+    def draw(self, raw: dict, camera: Camera, oracle: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+        """Image (H, W, 3) and alpha (H, W), differentiable by torch with respect to the raw parameters.
+
+        Args:
+            raw: Raw parameters by group, float64.
+            camera: Pinhole.
+            oracle: By the float64 oracle instead of the renderer.
+        """
+        camera = self._camera(camera)
+        g = Gaussians(**self._parameters(raw, camera))
+        if oracle:
+            out = reference.render(g, camera, self.settings)
+        else:
+            out = render(g, camera, self.settings, outputs=())
+        image, alpha = out.rgb.double(), out.alpha.double()
+        if self.channels in _ORDERS:
+            image = image[..., ["rgb".index(c) for c in self.channels]]
+        if self.transfer != "none":
+            image = torch.where(image <= 0.04045, image / 12.92, ((image.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+        if self.flip != "none":
+            axis = ("vertical", "horizontal").index(self.flip)
+            image, alpha = image.flip(axis), alpha.flip(axis)
+        return image, alpha
+
+    def gradient(self, raw: dict, camera: Camera, cotangent: torch.Tensor, oracle: bool = False) -> dict:
+        """float64 gradient of <cotangent, image> by group."""
+        leaves = {name: x.detach().clone().requires_grad_() for name, x in raw.items()}
+        image, _ = self.draw(leaves, camera, oracle)
+        if not image.requires_grad:
+            return {name: torch.zeros_like(x) for name, x in raw.items()}
+        found = torch.autograd.grad((image * cotangent).sum(), list(leaves.values()), allow_unused=True)
+        return {
+            name: torch.zeros_like(x) if d is None else d.double()
+            for (name, x), d in zip(leaves.items(), found, strict=True)
+        }
+
+    def replace(self, **fields) -> Model:
+        """A copy with fields, or fields of the settings, replaced."""
+        own = {k: v for k, v in fields.items() if k in {f.name for f in dataclasses.fields(self)}}
+        rest = {k: v for k, v in fields.items() if k not in own}
+        settings = own.pop("settings", self.settings)
+        return dataclasses.replace(self, settings=settings.replace(**rest), **own)
+
+    def _camera(self, camera: Camera) -> Camera:
+        K = np.array(camera.K, float)
+        K[:2, 2] += 0.5 - np.asarray(self.pixel_center)
+        w2c = camera.w2c
+        w2c = w2c.detach().double().numpy() if isinstance(w2c, torch.Tensor) else np.array(w2c, float)
+        return dataclasses.replace(camera, K=K, w2c=np.linalg.inv(w2c) if self.pose == "c2w" else w2c)
+
+    def _parameters(self, raw: dict, camera: Camera) -> dict:
+        raw = dict(raw)
+        if self.quaternions == "xyzw":
+            raw["quats"] = raw["quats"][:, [3, 0, 1, 2]]
+        if self.rotation == "transposed":
+            raw["quats"] = raw["quats"] * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
+        if self.scales == "exponential":
+            raw["log_scales"] = raw["log_scales"].exp()
+        if self.opacities == "sigmoid":
+            raw["logit_opacities"] = raw["logit_opacities"].sigmoid()
+        if self.compensation and self.settings.dilation > 0:
+            alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings)
+            raw["logit_opacities"] = torch.logit(alpha.clamp(1e-12, 1 - 1e-12))
+        raw["sh"] = self._sh(raw, camera)
+        if self.channels not in _ORDERS:
+            raw["sh"] = raw["sh"][..., ["rgb".index(c) for c in self.channels[:3]]]
+        return raw
+
+    def _sh(self, raw: dict, camera: Camera) -> torch.Tensor:
+        """Coefficients that give the colors of this model: as they are, or of degree 0 where the direction is odd."""
+        sh = raw["sh"]
+        orders = [(degree, m) for degree in range(4) for m in range(-degree, degree + 1)][: sh.shape[1]]
+        factor = torch.tensor([float(degree <= self.sh_degree) for degree, _ in orders], dtype=torch.float64)
+        turned = [m % 2 == 1 if self.sh_sign == "odd m" else self.sh_sign == f"band {degree}" for degree, m in orders]
+        factor = torch.where(torch.tensor(turned), -factor, factor)
+        if not bool((factor == 1).all()):
+            sh = sh * factor[:, None]
+        if (self.direction == "to the mean" and self.direction_gradient) or sh.shape[1] == 1:
+            return sh
+        center = torch.tensor(camera.center)
+        means = raw["means"] if self.direction_gradient else raw["means"].detach()
+        towards = means - center
+        towards = towards / towards.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+        if self.direction == "to the camera":
+            towards = -towards
+        elif self.direction == "camera frame":
+            towards = towards @ torch.tensor(camera.w2c[:3, :3]).T
+        color = 0.5 + (reference.sh_basis(towards, sh.shape[1])[..., None] * sh).sum(1)
+        return ((color - 0.5) / _SH0)[:, None]  # the renderer clamps at 0 as ever
+
+
+def _compensation(raw: dict, camera: Camera, s: RenderSettings) -> torch.Tensor:
+    """(N,) sqrt(det Sigma' / det(Sigma' + dilation I)) of the projected covariances, as Mip-Splatting has it."""
+    w2c = torch.tensor(camera.w2c)
+    fx, fy, cx, cy = (float(camera.K[i][j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x, y, z = (raw["means"] @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
+    z = torch.where(z > 1e-6, z, 1e-6)
+    slopes = []
+    for slope, f, c, size in ((x / z, fx, cx, camera.width), (y / z, fy, cy, camera.height)):
+        tan = size / (2 * f)
+        if s.fov_clamp == "inria":
+            slope = slope.clamp(-1.3 * tan, 1.3 * tan)
+        elif s.fov_clamp == "gsplat":
+            slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
+        slopes.append(slope)
+    jacobian = torch.stack([fx / z, 0 * z, -fx * slopes[0] / z, 0 * z, fy / z, -fy * slopes[1] / z], -1)
+    axes = _rotation(raw["quats"]) * raw["log_scales"].exp()[:, None]
+    a, b = (jacobian.reshape(-1, 2, 3) @ w2c[:3, :3] @ axes).unbind(1)
+    det = torch.linalg.cross(a, b).square().sum(-1)
+    trace = (a * a + b * b).sum(-1)
+    ratio = det / (det + s.dilation * (trace + s.dilation))
+    return ratio.clamp_min(_COMPENSATION_FLOOR).sqrt()
+
+
+def _rotation(quats: torch.Tensor) -> torch.Tensor:
+    """(N, 3, 3) of quaternions wxyz of any length."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+# ---------------------------------------------------------------------------------------- search
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """A convention that differs.
+
+    Attributes:
+        name: What it is about, e.g. `quaternion order`.
+        expected, found: The preset's and the rasterizer's.
+        without, with_it: RMS of the image's difference if everything but this, or everything, is taken into account.
+        groups: Raw parameters whose gradient it changes most directly.
+    """
+
+    name: str
+    expected: str
+    found: str
+    without: float
+    with_it: float
+    groups: tuple[str, ...]
+
+
+_SHAPE = ("quats", "log_scales")
+_ALL = ("means", *_SHAPE, "logit_opacities", "sh")
+_POINTS = tuple((x, y) for x in (0.5, 0.0, 1.0) for y in (0.5, 0.0, 1.0))
+# Field of the model or of its settings -> (name, groups, values to be tried).
+_VARIATIONS: dict[str, tuple[str, tuple, tuple]] = {
+    "quaternions": ("quaternion order", ("quats",), ("wxyz", "xyzw")),
+    "rotation": ("rotation", ("quats",), ("as given", "transposed")),
+    "scales": ("activation of scales", ("log_scales",), ("linear", "exponential")),
+    "opacities": ("activation of opacities", ("logit_opacities",), ("linear", "sigmoid")),
+    "pixel_center": ("pixel center", _ALL, _POINTS),
+    "flip": ("image axes", _ALL, ("none", "vertical", "horizontal")),
+    "pose": ("camera matrix", _ALL, ("w2c", "c2w")),
+    "channels": ("channel order", ("sh",), (*_ORDERS, *(f"{order}, not behind" for order in _ORDERS[1:]))),
+    "transfer": ("transfer function", ("sh",), ("none", "sRGB to linear")),
+    "direction": ("SH direction", ("means", "sh"), ("to the mean", "to the camera", "camera frame")),
+    "sh_direction": ("SH direction", ("means", "sh"), ("gaussian", "ray")),
+    "sh_degree": ("SH bands", ("sh",), (0, 1, 2, 3)),
+    "sh_sign": ("SH sign", ("sh",), ("none", "odd m", "band 1", "band 2", "band 3")),
+    "background": ("background", ("logit_opacities",), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))),
+    "compensation": ("dilation compensation", ("logit_opacities", *_SHAPE), (False, True)),
+    "depth_key": ("depth sort key", _ALL, ("z", "distance")),
+    "fov_clamp": ("field-of-view clamp", _SHAPE, ("none", "inria", "gsplat")),
+    "culling": ("culling", _ALL, ("extent", "inria", "gsplat")),
+    "near": ("near plane", _ALL, (0.0, 0.01, 0.1, 0.2)),
+    "stop": ("stop rule", _ALL, ("after", "before", "before_eq")),
+    "dilation": ("dilation", _SHAPE, (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)),
+    "alpha_min": ("alpha_min", _ALL, (0.0, 1e-4, 1e-3, 1 / 255, 1e-2, 0.05)),
+    "alpha_max": ("alpha_max", ("logit_opacities",), (0.9, 0.95, 0.99, 0.999, 0.9999, 1.0)),
+    "transmittance_min": ("transmittance_min", _ALL, (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.05, 0.1)),
+}
+_FITTED = ("dilation", "alpha_min", "alpha_max", "transmittance_min")  # refined around the best value
+
+
+def find(image: torch.Tensor, raw: dict, camera: Camera, starts: list[Model], oracle: bool = False) -> Found:
+    """The model whose image is nearest to a given one, and what is unusual about it.
+
+    Variations are added one at a time, each time the one that explains most of what is left, as long as that is at
+    least 30 %; what a later one makes needless is dropped.
+
+    Args:
+        image: (H, W, 3) of the rasterizer.
+        raw: Raw parameters, float64.
+        camera: Its pinhole camera.
+        starts: Models that may be meant: the claimed one, or one a preset. What differs is counted from the one that
+            needs least.
+        oracle: Search with the float64 oracle.
+    """
+    known: dict[Model, float] = {}
+
+    def distance(model: Model) -> float:
+        if model not in known:
+            with torch.no_grad():
+                known[model] = float((model.draw(raw, camera, oracle)[0] - image).square().mean().sqrt())
+        return known[model]
+
+    start = min(starts, key=distance)
+    model = _descend(distance, start, start)
+    odd = [field for field in _different(model, start) if not hasattr(model, field) and field != "background"]
+    for other in starts if odd or distance(model) > _SETTLED else ():
+        # Beside a gross difference the nearest preset need not be the right one.
+        moved = dataclasses.replace(model, settings=other.settings.replace(background=model.settings.background))
+        if other != start and distance(moved) < 2 * distance(start):
+            moved = _descend(distance, moved, other)
+            few, many = (len(_different(*pair)) for pair in ((moved, other), (model, start)))
+            near, far = max(distance(moved), _SETTLED), max(distance(model), _SETTLED)
+            if near < 0.8 * far or (near <= 1.1 * far and few < many):
+                model, start = moved, other
+    findings = []
+    for field in _different(model, start):
+        name, groups, _ = _VARIATIONS[field]
+        usual = _get(start, field)
+        without = distance(model.replace(**{field: usual}))
+        findings.append(Finding(name, _text(usual), _text(_get(model, field)), without, distance(model), groups))
+    return Found(start, model, distance(start), distance(model), findings)
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What `find` found.
+
+    Attributes:
+        start, model: The preset, and the model with what is unusual.
+        before, after: RMS of the image's difference to each of them.
+        findings: What differs between the two.
+    """
+
+    start: Model
+    model: Model
+    before: float
+    after: float
+    findings: list[Finding]
+
+
+def _descend(distance: Callable[[Model], float], model: Model, start: Model) -> Model:
+    """Add variations while they explain much, then drop those that `start` does without as well."""
+    while distance(model) > _SETTLED:
+        tried = list(_variations(model))
+        best = min(distance(new) for new, _ in tried)
+        # Of those that explain as much, the first one listed: what differs then is rounding.
+        new, field = next(pair for pair in tried if distance(pair[0]) <= max(1.001 * best, _SETTLED))
+        if distance(new) > (1 - _SHARE) * distance(model):
+            break
+        model = _refined(distance, new, field) if field in _FITTED else new
+    for field in _different(model, start):
+        without = model.replace(**{field: _get(start, field)})
+        if distance(without) <= 1.05 * max(distance(model), _SETTLED):
+            model = without
+    return model
+
+
+def _variations(model: Model) -> Iterator[tuple[Model, str]]:
+    """Everything that is one step away and legal."""
+    for field, (_, _, values) in _VARIATIONS.items():
+        for value in values:
+            if value == _get(model, field):
+                continue
+            try:
+                yield model.replace(**{field: value}), field
+            except NotImplementedError:  # not with this response or order
+                continue
+
+
+def _refined(distance, model: Model, field: str) -> Model:
+    """The number that fits best, by golden section on a logarithmic scale around the one that was tried."""
+    value = _get(model, field)
+    flip = field == "alpha_max"  # what matters there is the distance from 1
+    if distance(model) <= _SETTLED or value == float(flip):
+        return model
+    center, ratio = math.log(1 - value if flip else value), (math.sqrt(5) - 1) / 2
+    low, high = center - 1.0, min(center + 1.0, -1e-3)
+
+    def at(x: float) -> Model:
+        return model.replace(**{field: 1 - math.exp(x) if flip else math.exp(x)})
+
+    for _ in range(12):
+        a, b = high - ratio * (high - low), low + ratio * (high - low)
+        if distance(at(a)) < distance(at(b)):
+            high = b
+        else:
+            low = a
+    new = at((low + high) / 2)
+    # The round number is kept unless another one is clearly nearer.
+    return new if distance(new) < 0.5 * distance(model) else model
+
+
+def _get(model: Model, field: str):
+    return getattr(model if hasattr(model, field) else model.settings, field)
+
+
+def _different(model: Model, start: Model) -> list[str]:
+    return [field for field in _VARIATIONS if _get(model, field) != _get(start, field)]
+
+
+def _text(value) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,79 @@
+"""`drgs crossval`: a rasterizer against the model that it claims to compute, as tables, JSON and an HTML report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from drgs import rasterizers, runtime
+from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.progress import Bar
+from drgs.render_command import make_folder
+from drgs.viewpoints import seen_views
+
+if TYPE_CHECKING:
+    from drgs.cli import Crossval
+    from drgs.crossval import Result
+
+__all__ = ["run"]
+
+_STAGES = 6
+
+
+def run(args: Crossval) -> int:
+    """`drgs crossval SCENE`: 1 if a gradient is wrong, or, with --strict, if anything is not as the preset has it."""
+    from drgs.crossval import crossval
+    from drgs.report import html
+
+    g, fields, cameras, source = seen_views(args)
+    background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
+    if args.export is not None:
+        rasterizers.export(args.export, g, cameras, background, args.seed)
+        if not args.quiet:
+            print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
+        return 0
+    rasterizer = rasterizers.load(args.rasterizer, g, cameras, background)
+    make_folder(args.output)
+    with Bar("crossval", _STAGES, not args.quiet) as bar:
+
+        def advance(stage: str) -> None:
+            bar.update(advance.done, _STAGES, stage)
+            advance.done += 1
+
+        advance.done = 0
+        result = crossval(rasterizer, g, cameras, args.preset, fields, seed=args.seed, advance=advance)
+        report = {"schema": SCHEMA, "command": "crossval", "scene": str(args.scene), "source": source} | result.report
+        table = ""
+        if args.ladder:
+            from drgs import ladder
+
+            advance("ladder")
+            report["ladder"] = ladder.ladder(result.gaussians, result.cameras, result.model.settings, seed=args.seed)
+            table = ladder.table(report["ladder"])
+    report["env"] = runtime.info()
+    with atomic_write(args.output / "report.html") as file:
+        file.write(html(report, result.images, table).encode())
+    write_json(args.output / "crossval.json", report)
+    if not args.quiet:
+        _print(result, args)
+    bad = result.verdict == "gradient bug" or (args.strict and result.verdict != "agreement")
+    return int(bad)
+
+
+def _print(result: Result, args: Crossval) -> None:
+    """What was found, on stdout."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console, report = Console(highlight=False), result.report
+    table = Table(title=f"{report['rasterizer']} against preset {report['preset']} ({report['reference']})")
+    for name in ("group", "verdict", "relative", "cosine", "bias", "why"):
+        table.add_column(name, justify="right" if name in ("relative", "cosine", "bias") else "left", overflow="fold")
+    for name, row in report["groups"].items():
+        numbers = f"{row['relative']:.1e}", f"{row['cosine']:.6f}", f"{row['bias']:+.1e}"
+        table.add_row(name, row["verdict"], *numbers, row["why"])
+    console.print(table)
+    for c in report["conventions"]:
+        console.print(f"convention: {c['name']} is {c['found']}, expected {c['expected']}", markup=False)
+    rms, share = (max(view[k] for view in report["image"]["views"]) for k in ("rms", "share"))
+    console.print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
+    console.print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json", markup=False)

@@ -1,0 +1,417 @@
+"""Broken rasterizers are found out, each by its name and its groups, and a correct one is not accused."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch_rasterizer
+from torch_rasterizer import DEFECTS
+
+import drgs
+from drgs import cli, rasterizers
+from drgs.cameras import Camera, save_cameras_json
+from drgs.crossval import crossval
+from drgs.differences import central
+from drgs.ellipsoids import Gaussians
+from drgs.files import load_ply, save_ply
+from drgs.orbits import UP, scene_orbit
+from drgs.rasterizers import GROUPS, function, raw_of
+from drgs.testing import assert_matches, random_scene
+
+BACKGROUND = (0.3, 0.6, 0.2)
+# Documented choices: they are named, and no bug.
+CHOSEN = {
+    "view_direction_detached": "view direction of SH detached",
+    "clamp_passes_gradient": "clamped alpha passes its gradient",
+}
+# What a report must say of those that draw another image.
+CONVENTIONS = {
+    "quaternion_order": "quaternion order",
+    "rotation_transposed": "rotation",
+    "sort_by_distance": "depth sort key",
+    "pixel_center": "pixel center",
+    "channels_swapped": "channel order",
+    "compensated_opacity": "dilation compensation",
+    "no_dilation": "dilation",
+    "background_ignored": "background",
+    "opacity_logits": "activation of opacities",
+    "sh_phase": "SH sign",
+    "sh_direction_reversed": "SH direction",
+    "early_stop": "transmittance_min",
+}
+
+
+def _made(seed):
+    """A random scene of the broken rasterizers' own making."""
+    s = torch_rasterizer.random_scene(seed)
+    g = Gaussians(**{name: s[name].float() for name in GROUPS})
+    camera = Camera(K=s["K"].numpy(), w2c=s["viewmat"].numpy(), width=s["width"], height=s["height"])
+    return g, [camera], tuple(float(x) for x in s["background"])
+
+
+def _check(name, g, cameras, background, preset):
+    """A defect is found, as what it is and where it is; nothing else is."""
+    defect = DEFECTS[name]
+    result = crossval(function(defect.make(), name), g, cameras, preset, {"background": background})
+    report, text = result.report, "\n".join(result.lines())
+    wrong = {group for group, row in report["groups"].items() if row["verdict"] == "gradient bug"}
+    if defect.kind == "gradient" and name in CHOSEN:
+        assert result.verdict == "known deviation", text
+        known = {group for group, row in report["groups"].items() if row["verdict"] == "known deviation"}
+        assert known, text
+        assert known <= set(defect.groups), text
+        assert CHOSEN[name] in text
+        assert not report["conventions"], text
+    elif defect.kind == "gradient":
+        assert result.verdict == "gradient bug", text
+        assert wrong == set(defect.groups), text
+        assert not report["conventions"], text
+    else:
+        assert result.verdict == "other convention", text
+        assert [c["name"] for c in report["conventions"]] == [CONVENTIONS[name]], text
+        assert all(row["verdict"] == "agreement" for row in report["groups"].values()), text
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", DEFECTS)
+def test_every_defect_is_named(name, seed):
+    """What is broken is named with the right groups and kind, on three random scenes."""
+    _check(name, *_made(seed), "gsplat")
+
+
+@pytest.mark.parametrize("preset", ["gsplat", "auto"])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_false_alarm(seed, preset):
+    """A correct rasterizer agrees, and is recognized."""
+    g, cameras, background = _made(seed)
+    result = crossval(
+        function(torch_rasterizer.rasterization, "correct"), g, cameras, preset, {"background": background}
+    )
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert result.report["preset"] == "gsplat"
+    assert not result.report["conventions"]
+    assert result.report["image"]["after"] < 1e-5
+
+
+@pytest.mark.parametrize("name", ["early_stop", "quaternion_order", "opacity_detached", "pixel_center"])
+def test_preset_is_found_beside_a_defect(name):
+    """What a rasterizer claims to be need not be said."""
+    g, cameras, background = _made(5)
+    result = crossval(function(DEFECTS[name].make(), name), g, cameras, "auto", {"background": background})
+    assert result.report["preset"] == "gsplat"
+    assert [c["name"] for c in result.report["conventions"]] == ([CONVENTIONS[name]] if name in CONVENTIONS else [])
+    assert (result.verdict == "gradient bug") == (name == "opacity_detached")
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("name", ["correct", *DEFECTS])
+def test_a_real_scene(data_dir, name):
+    """The same on the Gaussians of a real scan that matter most to a small view of it."""
+    path = data_dir / "splats" / "wolf" / "wolf.ply"
+    if not path.exists():
+        pytest.skip(f"no wolf: {path}")
+    g = load_ply(path)
+    camera = scene_orbit(g, 8, up=UP["minus-y"], width=48, height=40, fov=70, elevation=10.0)[0]
+    weight = drgs.render(g, camera, outputs=("visibility",)).visibility
+    index = torch.topk(weight, 250).indices
+    g = Gaussians(**{field: getattr(g, field)[index] for field in GROUPS})
+    if name == "correct":
+        made = function(torch_rasterizer.rasterization, name)
+        result = crossval(made, g, [camera], "gsplat", {"background": BACKGROUND})
+        assert result.verdict == "agreement", "\n".join(result.lines())
+        return
+    shown = torch.equal  # a defect that this scene does not show cannot be found
+    raw = raw_of(g)
+    right, wrong = (
+        function(f, name).image(raw, camera, BACKGROUND)[0]
+        for f in (torch_rasterizer.rasterization, DEFECTS[name].make())
+    )
+    if DEFECTS[name].kind != "gradient" and shown(right, wrong):
+        pytest.skip("this view does not show it")
+    _check(name, g, [camera], BACKGROUND, "gsplat")
+
+
+def test_two_faults_at_once():
+    """A convention and a wrong gradient are told apart."""
+    broken = torch_rasterizer.rasterizer(
+        dataclasses.replace(
+            torch_rasterizer.CORRECT,
+            **DEFECTS["quaternion_order"].fields,
+            **DEFECTS["opacity_detached"].fields,
+        )
+    )
+    g, cameras, background = _made(0)
+    result = crossval(function(broken, "both"), g, cameras, "gsplat", {"background": background})
+    assert result.verdict == "gradient bug"
+    assert [c["name"] for c in result.report["conventions"]] == ["quaternion order"]
+    assert [n for n, row in result.report["groups"].items() if row["verdict"] == "gradient bug"] == ["logit_opacities"]
+
+
+def test_cutoffs_are_fitted():
+    """Numbers that are on no list are found."""
+    odd = torch_rasterizer.rasterizer(
+        dataclasses.replace(torch_rasterizer.CORRECT, dilation=0.17 / 0.3)
+    )  # of the usual
+    g, cameras, background = _made(1)
+    result = crossval(function(odd, "odd"), g, cameras, "gsplat", {"background": background})
+    (finding,) = result.report["conventions"]
+    assert finding["name"] == "dilation"
+    assert abs(result.model.settings.dilation - 0.17) < 2e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_central_differences(dtype):
+    """They converge to the derivative, cut-offs and all, and say how well."""
+    g, (camera,), background = _made(3)
+    raw = raw_of(g)
+
+    def only(**arguments):
+        means = arguments["means"]
+        if means.dtype == torch.float64 and dtype == torch.float32:
+            raise TypeError("float32 only")
+        return torch_rasterizer.rasterization(**arguments)
+
+    made = function(only, "only")
+    assert made.dtype == dtype
+    u = rasterizers.cotangents([camera], 0)[0]
+    wanted = made.gradient(raw, camera, background, u)
+    entries = {name: torch.topk(wanted[name].abs().reshape(-1), 5).indices.tolist() for name in GROUPS}
+    own = central(made, raw, camera, background, u, entries)
+    there = made.gradient(raw, camera, background, u * own.kept[..., None])
+    assert own.kept.double().mean() > 0.8
+    for name in GROUPS:
+        assert len(own.entries[name]) >= 3
+        error = (there[name].reshape(-1)[own.entries[name]] - own.values[name]).abs()
+        size = own.values[name].abs().max()
+        assert (error <= own.uncertainty[name] + 1e-5 * size).double().mean() >= 0.8
+        assert error.max() <= (1e-5 if dtype == torch.float64 else 5e-3) * size, name
+
+
+@pytest.mark.parametrize("preset", ["exact", "fast", "inria", "gsplat"])
+def test_our_own_presets_agree_with_the_oracle(preset):
+    """`drgs:PRESET` is held against float64."""
+    g, cameras = random_scene(1)
+    result = crossval(rasterizers.load(f"drgs:{preset}"), g, cameras, "auto", {"background": BACKGROUND})
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert result.report["reference"] == "float64 oracle"
+    assert result.report["preset"] == preset
+
+
+def test_assert_matches():
+    """The helper for other people's tests passes what is right, and says what is wrong."""
+    results = assert_matches(torch_rasterizer.rasterization, preset="gsplat", seeds=(0, 1))
+    assert [r.verdict for r in results] == ["agreement"] * 2
+    assert_matches("torch_rasterizer:defect_view_direction_detached", preset="gsplat", seeds=(0,))
+    with pytest.raises(AssertionError, match="known deviation"):
+        assert_matches(torch_rasterizer.defect_view_direction_detached, preset="gsplat", seeds=(0,), allow=())
+    with pytest.raises(AssertionError, match="logit_opacities: gradient bug"):
+        assert_matches(torch_rasterizer.defect_opacity_detached, preset="gsplat", seeds=(0,))
+    with pytest.raises(ValueError, match="must be among"):
+        assert_matches(torch_rasterizer.rasterization, allow=("anything",))
+    with pytest.raises(ValueError, match="both be given"):
+        assert_matches(torch_rasterizer.rasterization, random_scene()[0])
+
+
+# ------------------------------------------------------------------------------------ command and files
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with `scene.ply` and `cameras.json` of one view."""
+    folder = tmp_path_factory.mktemp("crossval")
+    g, cameras = random_scene(0, count=40, width=32, height=24)
+    save_ply(g, folder / "scene.ply")
+    save_cameras_json(folder / "cameras.json", cameras)
+    return folder
+
+
+def _run(folder, *options, output="out"):
+    command = ["crossval", str(folder / "scene.ply"), "--cameras", str(folder / "cameras.json"), "--quiet"]
+    return cli.main([*command, "--set", "background=0.3,0.6,0.2", "-o", str(folder / output), *options])
+
+
+def test_command(folder):
+    """Exit codes, JSON and one HTML file that loads nothing."""
+    assert _run(folder, "--rasterizer", "torch_rasterizer:rasterization") == 0
+    report = json.loads((folder / "out" / "crossval.json").read_text())
+    assert report["verdict"] == "agreement"
+    assert report["ladder"]
+    page = (folder / "out" / "report.html").read_text()
+    assert "agreement" in page
+    assert "data:image/png;base64," in page
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "<script" not in page
+    wrong = ("--no-ladder", "--rasterizer", "torch_rasterizer:defect_opacity_detached")
+    assert _run(folder, *wrong, output="wrong") == 1
+    page = (folder / "wrong" / "report.html").read_text()
+    assert "gradient bug" in page
+    assert "its own central differences" in page
+    known = ("--no-ladder", "--rasterizer", "torch_rasterizer:defect_view_direction_detached")
+    assert _run(folder, *known, output="known") == 0
+    assert _run(folder, *known, "--strict", output="known") == 1
+    odd = ("--no-ladder", "--rasterizer", "torch_rasterizer:defect_pixel_center")
+    assert _run(folder, *odd, output="odd") == 0
+    assert _run(folder, *odd, "--strict", output="odd") == 1
+
+
+def _dump(folder, call, name):
+    """What the script for another machine writes, with a rasterizer of ours in place of gsplat."""
+    with np.load(folder / "scene.npz") as file:
+        s = dict(file)
+    raw = {k: torch.tensor(s[k], dtype=torch.float64).requires_grad_() for k in GROUPS}
+    image, alpha, _ = call(
+        raw["means"],
+        raw["quats"],
+        raw["log_scales"].exp(),
+        raw["logit_opacities"].sigmoid(),
+        raw["sh"],
+        torch.tensor(s["viewmat"]).double(),
+        torch.tensor(s["K"]).double(),
+        int(s["width"]),
+        int(s["height"]),
+        sh_degree=2,
+        backgrounds=torch.tensor(s["background"])[None].double(),
+    )
+    (image * torch.tensor(s["cotangent"])).sum().backward()
+    s |= {"image": image.detach().float().numpy(), "alpha": alpha[..., 0].detach().float().numpy()}
+    s |= {f"grad_{k}": np.zeros(x.shape, np.float32) if x.grad is None else x.grad.numpy() for k, x in raw.items()}
+    np.savez(folder / name, **s)
+    return s
+
+
+def test_dumps(folder):
+    """A file from another machine is compared; a file of something else is refused with one line."""
+    assert _run(folder, "--export", str(folder / "scene.npz")) == 0
+    arrays = _dump(folder, torch_rasterizer.rasterization, "good.npz")
+    assert _run(folder, "--no-ladder", "--rasterizer", str(folder / "good.npz")) == 0
+    assert json.loads((folder / "out" / "crossval.json").read_text())["verdict"] == "agreement"
+    _dump(folder, torch_rasterizer.defect_opacity_detached, "bad.npz")
+    assert _run(folder, "--no-ladder", "--rasterizer", str(folder / "bad.npz")) == 1
+    report = json.loads((folder / "out" / "crossval.json").read_text())
+    assert report["groups"]["logit_opacities"]["verdict"] == "gradient bug"
+    assert report["groups"]["means"]["verdict"] == "agreement"
+    from safetensors.numpy import save_file
+
+    save_file({k: np.atleast_1d(np.ascontiguousarray(x)) for k, x in arrays.items()}, folder / "good.safetensors")
+    assert _run(folder, "--no-ladder", "--rasterizer", str(folder / "good.safetensors")) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": lambda x: x + 1}, "of the same scene, cameras and background, its means differs"),
+        ({"viewmat": lambda x: x + 0.1}, "its viewmat differs"),
+        ({"quats": lambda x: x[:-1]}, "quats must have shape"),
+        ({"image": lambda x: x[:, :-1]}, "image must have shape"),
+        ({"grad_sh": lambda x: x[:, :1]}, "grad_sh must have shape"),
+        ({"cotangent": None}, "cotangent is missing"),
+        ({"image": lambda x: np.where(np.arange(3) == 1, np.nan, x)}, "image must be finite, is nan at"),
+    ],
+)
+def test_bad_dumps(folder, tmp_path, capsys, change, message):
+    """Dumps of other scenes, of wrong shapes, without an array or with NaN: one line, exit code 2, nothing written."""
+    assert _run(folder, "--export", str(folder / "scene.npz")) == 0
+    arrays = _dump(folder, torch_rasterizer.rasterization, "good.npz")
+    for name, f in change.items():
+        if f is None:
+            del arrays[name]
+        else:
+            arrays[name] = f(arrays[name])
+    np.savez(tmp_path / "dump.npz", **arrays)
+    capsys.readouterr()
+    assert _run(folder, "--rasterizer", str(tmp_path / "dump.npz"), output="nothing") == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (folder / "nothing").exists()
+
+
+def test_nan_gradient_in_a_dump_is_a_finding(folder):
+    """A gradient that is not finite is what one looks for."""
+    assert _run(folder, "--export", str(folder / "scene.npz")) == 0
+    arrays = _dump(folder, torch_rasterizer.rasterization, "good.npz")
+    arrays["grad_means"] = arrays["grad_means"].copy()
+    arrays["grad_means"][3, 1] = np.nan
+    np.savez(folder / "nan.npz", **arrays)
+    assert _run(folder, "--no-ladder", "--rasterizer", str(folder / "nan.npz")) == 1
+    row = json.loads((folder / "out" / "crossval.json").read_text())["groups"]["means"]
+    assert row["why"] == "not finite, first at [3, 1]"
+
+
+_BAD = """
+import torch
+def raises(**arguments):
+    raise RuntimeError("two\\nlines")
+def number(**arguments):
+    return 3
+def arrays(width, height, **arguments):
+    import numpy
+    return numpy.zeros((1, height, width, 3)), numpy.zeros((1, height, width, 1)), {}
+def shape(width, height, **arguments):
+    return torch.zeros(1, width, height, 3), torch.zeros(1, width, height, 1), {}
+def constant(width, height, means, **arguments):
+    return torch.zeros(1, height, width, 3, dtype=means.dtype), torch.zeros(1, height, width, 1, dtype=means.dtype), {}
+def nan(width, height, means, **arguments):
+    image, alpha, info = constant(width, height, means)
+    return image / 0 + means.sum(), alpha, info
+not_a_function = 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("bad_rasterizers:raises", "raised RuntimeError: two"),
+        ("bad_rasterizers:number", "must return (image, alpha, info), got int"),
+        ("bad_rasterizers:arrays", "its image must be a torch tensor, got ndarray"),
+        ("bad_rasterizers:shape", "its image must have shape (1, 24, 32, 3)"),
+        ("bad_rasterizers:constant", "must be differentiable by torch"),
+        ("bad_rasterizers:nan", "its image must be finite"),
+        ("bad_rasterizers:not_a_function", "must have a function not_a_function, has none"),
+        ("bad_rasterizers:missing", "must have a function missing, has none"),
+        ("no_such_module:f", "must be importable, got ModuleNotFoundError"),
+        ("drgs:nothing", "must be drgs:ewa or drgs: and one of exact"),
+        ("nonsense", "must be drgs:PRESET, gsplat, package.module:function, or a file"),
+        ("missing.npz", "must be a file, there is none"),
+        ("scene.txt.npz", "must be a .npz file of arrays"),
+    ],
+)
+def test_bad_rasterizers(folder, tmp_path, monkeypatch, capsys, name, message):
+    """What cannot be compared is refused with one line and exit code 2."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "bad_rasterizers.py").write_text(_BAD)
+    (tmp_path / "scene.txt.npz").write_text("no archive")
+    sys.modules.pop("bad_rasterizers", None)
+    assert _run(folder, "--rasterizer", name) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_gsplat_is_asked_for_politely(folder, capsys):
+    """Without gsplat, or without a card, one line says what to do."""
+    if torch.cuda.is_available():
+        pytest.skip("a CUDA card: gsplat may run")
+    assert _run(folder, "--rasterizer", "gsplat") == 2
+    assert "gsplat" in capsys.readouterr().err
+
+
+def test_a_function_beside_the_user(folder, tmp_path):
+    """A module in the working directory is found by the installed command."""
+    (tmp_path / "mine.py").write_text(Path(torch_rasterizer.__file__).read_text())
+    command = ["crossval", str(folder / "scene.ply"), "--cameras", str(folder / "cameras.json"), "--no-ladder"]
+    options = ["--rasterizer", "mine:rasterization", "-o", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-m", "drgs", *command, *options], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "agreement" in done.stdout
