@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["measure"]
 
-_SECONDS = 120.0  # rounds end once they have taken this long
+_SECONDS = 120.0  # rounds end once they have taken this long; where others share the machine, of the processor
 _AT_LEAST = 3  # but not before so many
-_RAYS = 300  # of a sample on Mitsuba's traversal
+_RAYS = 200  # of a sample on Mitsuba's traversal
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
 _NOTHING = 1e-6  # alpha of a view that shows nothing
 _UNSEEN = 1e-6  # of the largest: entries of the diagonal, and groups, that are left out of relative errors
@@ -56,21 +56,21 @@ def measure(
         errors, seconds, ratio, first_call), `own` (errors of the truth against the oracle), `pixels` (of one view on
         average), `rounds`. Where there is no number there is None, and the reason in `skipped` or `notes`.
     Raises:
-        ValueError: If there are no Gaussians, or no view shows any.
+        ValueError: If no view shows a Gaussian, or the truth cannot be computed.
     """
-    if not len(gaussians):
-        raise ValueError("tradeoff: the scene must hold at least one Gaussian, got none; give another one")
     device = "cuda" if runtime.backend().name == "cuda" else "cpu"
     gaussians = gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
     stage = _Stage(gaussians, cameras, seed)
     rows = _rows_of(variants, fields or {})
     turns = [_Turn(row, stage) for row in rows if row["skipped"] is None and row["by"] == "view"]
     truth, others = turns[0], turns[1:]
-    order, began, done = random.Random(seed), time.perf_counter(), 0
+    order, done = random.Random(seed), 0
+    began = time.perf_counter(), time.process_time()
     # The first pass compiles. Every view has a turn, so that errors are of all of them.
     for number in range(max(repeats, len(cameras) - 1) + 1):
         timed = 1 <= number <= repeats
-        if number >= len(cameras) and done >= _AT_LEAST and time.perf_counter() - began > _SECONDS:
+        spent = min(time.perf_counter() - began[0], time.process_time() - began[1])
+        if number >= len(cameras) and done >= _AT_LEAST and spent > _SECONDS:
             break
         truth.take(number, timed)
         if number == 0:
@@ -94,6 +94,7 @@ class _Stage:
 
     Attributes:
         shown: Whether a view has shown anything.
+        sampled: The view of which rays are sampled.
     """
 
     def __init__(self, gaussians, cameras, seed):
@@ -106,7 +107,7 @@ class _Stage:
         self.cotangents = [
             (torch.randint(0, 2, size, generator=generator) * 2 - 1).float().to(device) for size in sizes
         ]
-        self.truth, self.shown = {}, False
+        self.truth, self.shown, self.sampled = {}, False, 0
 
     def image(self, g, camera, settings, share):
         """(H, W, 3), whatever the share of its resolution that is rendered."""
@@ -119,15 +120,19 @@ class _Stage:
         return torch.nn.functional.interpolate(image, size=size, mode="bilinear")[0].permute(1, 2, 0)
 
     def check(self, settings) -> None:
-        """ValueError if no view shows anything."""
-        for camera in self.cameras:
+        """Find a view that shows something.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        for index, camera in enumerate(self.cameras):
             if not self.shown:
                 self.image(self.gaussians, camera, settings, 1)
-        if not self.shown:
-            raise ValueError(
-                f"tradeoff: one of the {len(self.cameras)} cameras must show a Gaussian, all are empty; "
-                "choose others by --cameras"
-            )
+            if self.shown:
+                self.sampled = index
+                return
+        count = len(self.cameras)
+        raise ValueError(f"tradeoff: one of {count} cameras must show a Gaussian, all are empty; choose others")
 
     def pull(self, image, cotangent) -> dict:
         """J^T u by group."""
@@ -252,8 +257,8 @@ def _rows_of(variants, fields: dict) -> list[dict]:
 
 
 def _sampled(rows, stage: _Stage, truth: _Turn, seed: int) -> dict:
-    """Rows that are measured on a sample of the first view's rays; errors of the truth against the oracle."""
-    camera, count = stage.cameras[0], len(stage.gaussians)
+    """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
+    camera, count = stage.cameras[stage.sampled], len(stage.gaussians)
     pixels = camera.width * camera.height
     places = torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
     own = {"image": None, "gradient": None, "information": None}
@@ -273,8 +278,9 @@ def _sampled(rows, stage: _Stage, truth: _Turn, seed: int) -> dict:
 
 
 def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
-    """One row on some pixels of the first view: errors against the truth's image, time scaled to all of them."""
-    camera, oracle = stage.cameras[0], row["by"] == "oracle"
+    """One row on some pixels of a view: errors against the truth's image, time scaled to all of them."""
+    camera, oracle = stage.cameras[stage.sampled], row["by"] == "oracle"
+    whole = stage.cotangents[stage.sampled]
     pixels = camera.width * camera.height
     forward, both = _tracer(stage, RenderSettings(**row["settings"]), chosen, oracle)
     fixed, start = [0.0, 0.0], 0.0
@@ -286,10 +292,10 @@ def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
     out, first = _clock(forward)
     good = ~out.ambiguous if oracle else torch.ones(len(chosen), dtype=torch.bool)
     slopes, second = _clock(lambda: both(good))
-    off = (out.rgb.cpu().double() - stage.truth[0][0].reshape(-1, 3)[chosen].double()).abs()
+    off = (out.rgb.cpu().double() - stage.truth[stage.sampled][0].reshape(-1, 3)[chosen].double()).abs()
     row["image"] = _image_errors(off[good].numpy().reshape(-1))
-    u = torch.zeros_like(stage.cotangents[0])
-    u.reshape(-1, 3)[chosen[good]] = stage.cotangents[0].reshape(-1, 3)[chosen[good]]
+    u = torch.zeros_like(whole)
+    u.reshape(-1, 3)[chosen[good]] = whole.reshape(-1, 3)[chosen[good]]
     right = stage.pull(stage.image(stage.moving, camera, truth.settings, 1), u)
     # Relative to whichever is the better of the two.
     row["gradient"] = _gradient_errors(
@@ -302,7 +308,7 @@ def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
     row["ratio"] = {k: x / exact[k] if x and exact[k] else None for k, x in row["seconds"].items()}
     row["first_call"] = max(start - sum(fixed), 0.0)
     row["notes"] |= {
-        "sample": f"{len(chosen)} of {pixels} rays of the first view; times scaled to all of them",
+        "sample": f"{len(chosen)} of {pixels} rays of one view; times scaled to all of them",
         "information": "not measured on single rays",
     }
     if oracle:
@@ -313,10 +319,10 @@ def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
 
 
 def _tracer(stage: _Stage, settings, chosen, oracle: bool):
-    """Functions that trace these pixels' rays of the first view: the image, and the gradients of some of them."""
+    """Functions that trace these pixels' rays: the image, and the gradients of some of them."""
     from drgs.integrator import render_rays
 
-    camera = stage.cameras[0]
+    camera = stage.cameras[stage.sampled]
     directions = torch.from_numpy(camera.pixel_directions().reshape(-1, 3))[chosen]
     origins = torch.from_numpy(camera.center.copy()).expand(directions.shape)
 
@@ -331,7 +337,7 @@ def _tracer(stage: _Stage, settings, chosen, oracle: bool):
 
     def both(good=None):
         image = trace(stage.moving).rgb
-        u = stage.cotangents[0].reshape(-1, 3)[chosen].to(image)
+        u = stage.cotangents[stage.sampled].reshape(-1, 3)[chosen].to(image)
         return stage.pull(image, u if good is None else u * good.to(u)[:, None])
 
     return forward, both

@@ -1,0 +1,294 @@
+"""`drgs tradeoff` on a tiny scene: every row, errors that grow with the cut-offs, advice that its numbers support."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import gaussians
+
+from drgs import cli, fisher, reference, tradeoff
+from drgs.cameras import load_cameras_json, orbit, save_cameras_json
+from drgs.files import load_ply, save_ply
+from drgs.integrator import render
+from drgs.settings import RenderSettings
+
+BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """`scene.ply`, opaque enough that rays stop early; `cameras.json`; `away.json`, which sees nothing of it."""
+    folder = tmp_path_factory.mktemp("tradeoff")
+    g = gaussians(np.random.default_rng(5), 40, scale=0.4).detach()
+    save_ply(g.replace(logit_opacities=g.logit_opacities + 3), folder / "scene.ply")
+    save_ply(g.take(slice(0, 0)), folder / "empty.ply")
+    views = orbit((0, 0, 0), 4.0, 2, width=20, height=16, fov=40)
+    save_cameras_json(folder / "cameras.json", views)
+    save_cameras_json(folder / "away.json", orbit((1e3, 0, 0), 1.0, 2, width=20, height=16))
+    return folder
+
+
+def command(place, output, *options, scene="scene.ply", cameras="cameras.json"):
+    """Exit code."""
+    parts = ["tradeoff", place / scene, "--cameras", place / cameras, "-o", output, "--quiet", *options]
+    return cli.main([str(part) for part in parts])
+
+
+@pytest.fixture(scope="module")
+def report(place):
+    """Of all rows."""
+    assert command(place, place / "out", "--repeats", 1, "--max-error", *BUDGETS) == 0
+    return json.loads((place / "out" / "tradeoff.json").read_text())
+
+
+def rows(report) -> dict:
+    return {row["name"]: row for row in report["rows"]}
+
+
+def few(monkeypatch, *names):
+    """Measure only these rows."""
+    kept = tuple(v for v in tradeoff.VARIANTS if v.name in ("exact", *names))
+    assert len(kept) == 1 + len(names)
+    monkeypatch.setattr(tradeoff, "VARIANTS", kept)
+
+
+def test_rows_are_complete(report):
+    """A row a setting; every number there, or a reason why not."""
+    names = [variant.name for variant in tradeoff.VARIANTS]
+    assert [row["name"] for row in report["rows"]] == names
+    assert len(set(names)) == len(names)
+    for row in report["rows"]:
+        assert row["kind"] in ("approximation", "model", "resolution", "precision")
+        assert row["skipped"] is None, row["name"]
+        assert row["image"]["max"] >= row["image"]["p999"] >= 0
+        assert row["gradient"]["worst"] >= 0
+        assert row["seconds"]["forward"] > 0
+        assert row["ratio"]["forward_backward"] > 0
+        assert (row["information"] is None) == ("information" in row["notes"])
+    without = {row["name"] for row in report["rows"] if row["by"] == "view" and row["information"] is None}
+    assert without == {"sh_direction=ray"}
+    assert all(row["information"] is None for row in report["rows"] if row["by"] != "view")
+
+
+def test_settings_of_the_design_are_all_there():
+    """Every value that the settings' table names is switched on somewhere, at least by a preset."""
+    made = [RenderSettings.preset(v.preset, **v.fields) for v in tradeoff.VARIANTS]
+    values = lambda name: {getattr(settings, name) for settings in made}  # noqa: E731
+    assert values("response") == {"peak", "integral", "ewa"}
+    assert values("order") == {"center", "ray", "entry"}
+    assert values("traversal") == {"tiles", "bvh"}
+    assert values("depth_key") == {"distance", "z"}
+    assert values("extent") >= {None, 4, 3.33, 3, 2.5, 2}
+    assert values("alpha_min") >= {0, 1e-4, 1e-3, 1 / 255}
+    assert values("transmittance_min") >= {1e-10, 1e-6, 1e-4, 1e-3, 1e-2}
+    assert values("alpha_max") >= {1, 0.9999, 0.999, 0.99}
+    assert values("alpha_max_gradient") == {"zero", "pass"}
+    assert values("dilation") == {0, 0.3}
+    assert values("near") == {0, 0.01, 0.2}
+    assert values("sh_direction") == {"gaussian", "ray"}
+    for name in ("stop", "fov_clamp", "culling"):
+        assert len(values(name)) == 3
+    assert {v.share for v in tradeoff.VARIANTS} == {1, 0.5, 0.25}
+
+
+def test_exact_is_the_unit(report):
+    """exact: error 0, ratio 1; against the oracle as good as is claimed; other rows carry that error on top."""
+    exact, oracle = report["rows"][0], rows(report)["float64 oracle"]
+    assert exact["image"]["max"] == exact["gradient"]["worst"] == exact["information"]["l1"] == 0
+    assert set(exact["ratio"].values()) == {1.0}
+    assert 0 < report["own"]["image"] <= 1e-5
+    assert 0 < report["own"]["gradient"] <= 1e-4
+    assert report["own"]["image"] == oracle["image"]["max"]
+    assert exact["errors"] == report["own"]
+    row = rows(report)["extent=3"]
+    worst = max(row["image"]["rms"], row["image"]["p999"])
+    assert row["errors"]["image"] == pytest.approx(worst + report["own"]["image"])
+
+
+def test_errors_are_what_they_say(report, place):
+    """One row computed again, from the public functions."""
+    g, cameras = load_ply(place / "scene.ply"), load_cameras_json(place / "cameras.json")
+    row, off, H = rows(report)["extent=2.5"], [], []
+    for settings in (RenderSettings.preset("exact", extent=2.5), RenderSettings.preset("exact")):
+        off.append(torch.stack([render(g, camera, settings, outputs=()).rgb for camera in cameras]).double())
+        H.append([fisher.diagonal(g, camera, settings)["means"] for camera in cameras])
+    difference = (off[0] - off[1]).abs()
+    assert row["image"]["rms"] == pytest.approx(float(difference.square().mean().sqrt()), rel=1e-5)
+    assert row["image"]["max"] == pytest.approx(float(difference.max()), rel=1e-5)
+    assert row["image"]["psnr"] == pytest.approx(-20 * np.log10(row["image"]["rms"]))
+    l1 = sum((a - b).abs().sum() for a, b in zip(*H, strict=True)) / sum(b.sum() for b in H[1])
+    assert row["information"]["groups"]["means"]["l1"] == pytest.approx(float(l1), rel=1e-4)
+
+
+def test_gradient_error_is_the_jacobians(place, monkeypatch):
+    """Over many cotangents, the mean squared relative error is that of the Jacobian in the Frobenius norm."""
+    g = load_ply(place / "scene.ply").take(slice(0, 5))
+    camera = load_cameras_json(place / "cameras.json")[0].resized(5, 4)
+    index = {"log_scales": [(i, k) for i in range(5) for k in range(3)]}
+    fast, exact = (
+        fisher.jacobian_columns(g, camera, index, RenderSettings.preset(*p)).double() for p in (["fast"], ["exact"])
+    )
+    variants = tuple(v for v in tradeoff.VARIANTS if v.name in ("exact", "fast"))
+    found = [
+        tradeoff.measure(g, [camera], variants, repeats=0, seed=seed)["rows"][1]["gradient"]["groups"]["log_scales"]
+        for seed in range(40)
+    ]
+    want = float((fast - exact).norm() / exact.norm())
+    assert np.median(found) == pytest.approx(want, rel=0.3)
+
+
+@pytest.mark.parametrize("key", ["extent", "transmittance_min", "alpha_min"])
+def test_errors_grow_with_the_cut_off(report, key):
+    """Wider cut-offs: larger errors of image, gradient and information."""
+    single = [v for v in tradeoff.VARIANTS if v.preset == "exact" and set(v.fields) == {key} and v.share == 1]
+    single.sort(key=lambda v: -v.fields[key] if key == "extent" else v.fields[key])
+    assert len(single) >= 3
+    found = [rows(report)[v.name] for v in single]
+    for numbers in (
+        [row["image"]["rms"] for row in found],
+        [row["gradient"]["all"] for row in found],
+        [row["information"]["l1"] for row in found],
+    ):
+        assert numbers == sorted(numbers)
+        assert numbers[-1] > 10 * numbers[0]
+        assert numbers[-1] > 1e-4
+
+
+def test_lower_resolution(report):
+    """Half the pixels a side: a coarser image, and information of the same size."""
+    half, quarter = (rows(report)[f"exact, {name} resolution"] for name in ("half", "quarter"))
+    assert 0 < half["image"]["rms"] < quarter["image"]["rms"]
+    assert half["information"]["l1"] < 1.5
+
+
+@pytest.mark.parametrize("use", tradeoff.USES)
+def test_advice_follows_from_the_numbers(report, use):
+    """Within the budget; nothing within it is faster by more than times differ, or as fast and more exact."""
+    clock, kinds = tradeoff.USES[use]
+    picks = [pick for pick in report["recommended"] if pick["use"] == use]
+    assert [pick["budget"] for pick in picks] == list(BUDGETS)
+    valid = [r for r in report["rows"] if r["share"] == 1 and r["by"] == "view"]
+    worst = {
+        r["name"]: max(r["errors"][k] for k in kinds) for r in valid if None not in [r["errors"][k] for k in kinds]
+    }
+    for pick in picks:
+        within = [r for r in valid if worst.get(r["name"], np.inf) <= pick["budget"]]
+        if not within:
+            assert pick["name"] is None
+            assert f"{min(worst.values()):.1e}" in pick["reason"]
+            continue
+        fastest = min(r["ratio"][clock] for r in within)
+        alike = [r for r in within if r["ratio"][clock] <= 1.05 * fastest]
+        assert pick["name"] in [r["name"] for r in alike]
+        assert pick["error"] == worst[pick["name"]] == min(worst[r["name"]] for r in alike)
+        assert pick["error"] <= pick["budget"]
+    assert picks[0]["name"] is None  # below float32
+    assert picks[-1]["name"] is not None
+
+
+def test_flags_can_be_used(report):
+    """What is recommended parses into the settings that were measured."""
+    for pick in report["recommended"]:
+        if pick["name"]:
+            args = cli._parse_arguments(["render", "x.ply", *pick["flags"].split()])
+            assert vars(args.settings()) == vars(RenderSettings(**rows(report)[pick["name"]]["settings"]))
+
+
+def test_files(report, place):
+    """A page with every row, a picture, and nothing else."""
+    assert sorted(x.name for x in (place / "out").iterdir()) == ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
+    page = (place / "out" / "tradeoff.md").read_text()
+    assert all(f"| {name} |" in page for name in rows(report))
+    assert report["command"] == "tradeoff"
+    assert report["env"]["backend"]["variant"] == "llvm_ad_rgb" or report["env"]["cuda"]["available"]
+
+
+def test_what_cannot_be_is_skipped(place, monkeypatch, capsys):
+    """Illegal combinations with the user's --set, and rows that are the same, say why; the rest is measured."""
+    names = ("inria", "response=ewa order=center", "traversal=bvh", "extent=3", "extent=4", "fast extent=4")
+    few(monkeypatch, *names)
+    options = ("--set", "order=ray", "--set", "near=0.1", "--set", "extent=3", "--repeats", 1)
+    assert command(place, place / "skips", *options) == 0
+    report = json.loads((place / "skips" / "tradeoff.json").read_text())
+    why = {name: row["skipped"] for name, row in rows(report).items()}
+    assert "one depth per Gaussian" in why["inria"]
+    assert "near" in why["traversal=bvh"]
+    assert "the same as exact" in why["extent=3"]
+    assert why["exact"] is why["extent=4"] is why["fast extent=4"] is why["response=ewa order=center"] is None
+    assert report["fields"] == {"order": "ray", "near": 0.1, "extent": 3}
+    assert rows(report)["fast extent=4"]["settings"]["near"] == 0.1
+    assert "--set near=0.1" in rows(report)["fast extent=4"]["flags"]
+    assert "extent=3" not in rows(report)["fast extent=4"]["flags"]
+    assert report["own"]["image"] is None
+    assert "one depth per Gaussian" in (place / "skips" / "tradeoff.md").read_text()
+
+
+def test_a_step_that_raises_is_skipped(place, monkeypatch):
+    """A setting that fails does not take the others with it."""
+    few(monkeypatch, "fast", "order=center")
+    real = render
+
+    def fails(g, camera, settings, outputs=()):
+        if settings.alpha_max < 1:
+            raise RuntimeError("no\nluck")
+        return real(g, camera, settings, outputs)
+
+    monkeypatch.setattr("drgs.render", fails)
+    assert command(place, place / "fails", "--repeats", 1) == 0
+    found = rows(json.loads((place / "fails" / "tradeoff.json").read_text()))
+    assert found["fast"]["skipped"] == "no luck"
+    assert found["order=center"]["skipped"] is None
+
+
+def test_own_error_sees_a_wrong_truth(place, monkeypatch):
+    """If exact were wrong, its error against the oracle would say so, and no small budget would be met."""
+    few(monkeypatch, "float64 oracle")
+    real = reference.render
+
+    def brighter(g, *args, **options):
+        return real(g.replace(sh=g.sh * 1.01), *args, **options)
+
+    monkeypatch.setattr("drgs.reference.render", brighter)
+    assert command(place, place / "wrong", "--repeats", 1) == 0
+    report = json.loads((place / "wrong" / "tradeoff.json").read_text())
+    assert report["own"]["image"] > 1e-3
+    assert all(pick["name"] is None for pick in report["recommended"] if pick["budget"] == 1e-4)
+
+
+def test_tables_and_no_matplotlib(place, monkeypatch, capsys):
+    """The tables on stdout; without matplotlib one line instead of the plot, exit code 0."""
+    few(monkeypatch, "fast", "float64 oracle")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    parts = ("tradeoff", place / "scene.ply", "--cameras", place / "cameras.json", "-o", place / "plain")
+    assert cli.main([*map(str, parts), "--repeats", "1", "--max-error", "1e-9"]) == 0
+    text = capsys.readouterr().out
+    assert "no plot: matplotlib is not installed" in text
+    assert "no setting is within it, the least error is" in text
+    assert not (place / "plain" / "tradeoff.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"options": ("--max-error", "0")}, "--max-error must be finite numbers > 0, got 0"),
+        ({"options": ("--max-error", "1e-3", "-1")}, "--max-error must be finite numbers > 0, got 0.001 -1"),
+        ({"options": ("--max-error", "nan")}, "--max-error must be finite numbers > 0, got nan"),
+        ({"options": ("--repeats", "0")}, "--repeats must be in [1, 1000], got 0"),
+        ({"options": ("--preset", "fast")}, "--preset must be exact"),
+        ({"options": ("--set", "dilation=1")}, "dilation belongs to response='ewa'"),
+        ({"scene": "empty.ply"}, "must hold at least one Gaussian"),
+        ({"cameras": "away.json"}, "one of 2 cameras must show a Gaussian, all are empty"),
+        ({"scene": "none.ply"}, "none.ply"),
+    ],
+)
+def test_bad_input(place, capsys, options, expected):
+    """One line, exit code 2, no files."""
+    assert command(place, place / "bad", *options.pop("options", ()), **options) == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert expected in text
+    assert not list((place / "bad").glob("*"))
