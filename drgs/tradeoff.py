@@ -14,8 +14,8 @@ order is right, and single pixels jump); of gradient and information, the worst 
 the largest unit); of information, the larger of L1 and median.
 
 Times are medians over rounds in which all settings take turns on one view, everything included; ratios are to `exact`
-in the same round. What would take minutes (Mitsuba's traversal without cut-offs, the oracle) is measured on a sample of
-rays, once, and its time scaled to the image.
+in the same round. With one thread it is the processor's time, else the clock's. What would take minutes (Mitsuba's
+traversal without cut-offs, the oracle) is measured on a sample of rays, once, and its time scaled to the image.
 """
 
 from __future__ import annotations
@@ -249,7 +249,8 @@ def _page(report: dict, drawn: bool) -> str:
     lines = [
         f"{report['gaussians']:,} Gaussians, {len(cameras)} views of {cameras[0]['width']}x{cameras[0]['height']} "
         f"({report['source']}); {env['cpu']}, {threads} threads, {env['backend']['variant']}, {report['date']}, "
-        f"commit {env['commit']}; {report['rounds']} rounds.",
+        f"commit {env['commit']}; times are relative to exact ({report['clock']} time, {report['rounds']} rounds).",
+        "Rows of kind `model` compute something else than exact does: theirs are differences, not errors.",
         "",
         "| setting | kind | forward | + backward | Fisher | first call s | image RMS | 99.9 % | max | PSNR dB "
         "| gradient, all | worst group | Fisher L1 | median | worst group |",

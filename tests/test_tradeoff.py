@@ -15,6 +15,7 @@ from drgs.cameras import load_cameras_json, orbit, save_cameras_json
 from drgs.files import load_ply, save_ply
 from drgs.integrator import render
 from drgs.settings import RenderSettings
+from drgs.tradeoff_measure import measure
 
 BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
 
@@ -134,7 +135,7 @@ def test_gradient_error_is_the_jacobians(place, monkeypatch):
     )
     variants = tuple(v for v in tradeoff.VARIANTS if v.name in ("exact", "fast"))
     found = [
-        tradeoff.measure(g, [camera], variants, repeats=0, seed=seed)["rows"][1]["gradient"]["groups"]["log_scales"]
+        measure(g, [camera], variants, repeats=0, seed=seed)["rows"][1]["gradient"]["groups"]["log_scales"]
         for seed in range(40)
     ]
     want = float((fast - exact).norm() / exact.norm())
