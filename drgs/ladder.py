@@ -188,7 +188,8 @@ def ladder(
         pictures: Of an earlier call with the same scene, cameras, crop and seed.
     Returns:
         A JSON-serializable dict. `image`: the ladder over all pixels in float32, with lists `forward` and `reverse` of
-        rungs (rung, switched, rms, max, share, of_total, of_exact, gradient by group with the last three) and `total`.
+        rungs (rung, switched, rms, max, norm, share, of_total, of_exact; gradient by group, with the last four) and
+        `total`.
         `crops`: `windows` and the same with `float32`, and under `far` the two rungs beyond `exact`. A row `rest` of
         the crops' forward order holds the rounding that float32 does at `exact` but not at the start: only both ends
         are in float64. `asides`: steps that belong to no ladder (see there).
@@ -299,10 +300,11 @@ def _step(step: _State, total: _State, exact: _State) -> dict:
 
 
 def _relative(step: torch.Tensor, total: torch.Tensor, exact: torch.Tensor) -> dict:
-    """<step, total> / |total|^2, |step| / |total|, |step| / |exact|; None where the divisor is 0."""
+    """|step|, <step, total> / |total|^2, |step| / |total|, |step| / |exact|; None where the divisor is 0."""
     step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))
     whole, truth, size = float(total.norm()), float(exact.norm()), float(step.norm())
     return {
+        "norm": size,
         "share": float(step @ total) / whole**2 if whole > 0 else None,
         "of_total": size / whole if whole > 0 else None,
         "of_exact": size / truth if truth > 0 else None,

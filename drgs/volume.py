@@ -27,6 +27,7 @@ __all__ = ["Volume", "render_volume"]
 
 _EPS_ALPHA = 1e-10
 _CUT = 1e-12  # optical depth on a ray below which a Gaussian is left out of it
+_INSIDE = 1e-16  # optical depth inside an interval that is taken for 0
 _FAR = 8.5  # sigma; beyond lies 1e-17 of a Gaussian
 _COARSE = 4.0  # sigma; intervals start no longer than this
 _SHORT = 1e-12  # relative to t: thinner Gaussians have no room between neighboring float64 numbers
@@ -208,7 +209,9 @@ def _chunk(scene: SimpleNamespace, reach, s: RenderSettings, o, d, tolerance: fl
         nodes = tried + torch.bincount(ray, minlength=len(o)) * (2 * len(_NODES) - 1)
     shape = (len(o), made.values.shape[-1])
     total, moment = torch.zeros(shape, dtype=torch.float64), torch.zeros(len(o), dtype=torch.float64)
-    for part, active in _batches(fixed, ray, a, h):
+    with torch.no_grad():
+        batches = list(_batches(fixed, ray, a, h))
+    for part, active in batches:
         args = (made, ray[part], a[part], h[part], active)
         sums, t = checkpoint(_integrate, *args, use_reentrant=False) if differentiate else _integrate(*args)
         total = total.index_add(0, ray[part], sums[0])
@@ -271,7 +274,7 @@ def _plan(line: _Line, tolerance: float) -> tuple:
             final = h <= 1e-15 * high
             look = torch.nonzero(~nothing & (~coarse | final))[:, 0]
             bad = ~nothing & coarse & ~final
-            for batch, active in _batches(line, r[look], low[look], h[look], before[look], inside[look]):
+            for batch, active in _batches(line, r[look], low[look], h[look], inside[look]):
                 at = look[batch]
                 (kronrod, gauss), _ = _integrate(line, r[at], low[at], h[at], active, before[at].sum(1))
                 off = (kronrod - gauss)[:, :4].abs().amax(1)
@@ -295,28 +298,27 @@ def _depths(line: _Line, ray, a, h) -> tuple[torch.Tensor, torch.Tensor]:
     return tau * (at - line.start[ray]), tau * (_phi((offset + h[:, None]) * slope) - at)
 
 
-def _batches(line: _Line, ray, a, h, before=None, inside=None):
+def _batches(line: _Line, ray, a, h, inside=None):
     """Yields (index into the intervals, (Q, A) the Gaussians that change T within them, -1 where fewer)."""
     step = max(1, _PAIRS // max(line.tau.shape[1], 1))
     for i in range(0, len(ray), step):
-        with torch.no_grad():
-            part = slice(i, i + step)
-            if inside is None:
-                _, depths = _depths(line, ray[part], a[part], h[part])
-            else:
-                depths = inside[part]
-            counts, order = (depths > 1e-16).sum(1).sort()
-            first = 0
-            # Intervals with few Gaussians apart from those with many: the product of both sizes is the cost.
-            while first < len(order):
-                size = max(1, _PAIRS // (2 * len(_NODES) * max(int(counts[first]), 8)))
-                most = int(counts[min(first + size, len(order)) - 1])
-                size = max(1, _PAIRS // (2 * len(_NODES) * max(most, 8)))
-                chosen = order[first : first + size]
-                most = max(int(counts[first : first + size].max()), 1)
-                largest = depths[chosen].topk(min(most, depths.shape[1]), dim=1)
-                yield i + chosen, torch.where(largest.values > 1e-16, largest.indices, -1)
-                first += len(chosen)
+        part = slice(i, i + step)
+        depths = _depths(line, ray[part], a[part], h[part])[1] if inside is None else inside[part]
+        counts, order = (depths > _INSIDE).sum(1).sort()
+        first = 0
+        # Intervals with few Gaussians apart from those with many: the product of both sizes is the cost.
+        while first < len(order):
+            most = int(counts[min(first + _size(counts[first]), len(order)) - 1])
+            chosen = order[first : first + _size(most)]
+            most = max(int(counts[first : first + len(chosen)].max()), 1)
+            largest = depths[chosen].topk(most, dim=1)
+            yield i + chosen, torch.where(largest.values > _INSIDE, largest.indices, -1)
+            first += len(chosen)
+
+
+def _size(count) -> int:
+    """Intervals at once where each has so many Gaussians."""
+    return max(1, _PAIRS // (4 * len(_NODES) * max(int(count), 8)))
 
 
 def _integrate(line: _Line, ray, a, h, active, before=None) -> tuple[torch.Tensor, torch.Tensor]:
