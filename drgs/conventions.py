@@ -26,7 +26,7 @@ _SH0 = math.sqrt(1 / (4 * math.pi))
 _SETTLED = 1e-5  # RMS of an image that equals the model's
 _SHARE = 0.3  # of the remaining difference that a variation must explain to be named
 _ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
-_COMPENSATION_FLOOR = 2.5e-5  # of the ratio of determinants; 0.005 squared, as both rasterizers have it
+_COMPENSATION_FLOOR = 0.005**2  # of the ratio of determinants
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,8 @@ class Model:
         rotation: `as given`, or `transposed`.
         scales: `linear`, or `exponential`: exp is applied to what already is a standard deviation.
         opacities: `linear`, or `sigmoid`: the logistic function is applied to what already is an opacity.
-        compensation: Opacities times sqrt(det / det after dilation), as in anti-aliased modes.
+        compensation: `none`, or opacities times sqrt(det / det after dilation) as in anti-aliased modes: `full`, or `at
+            least 0.005`.
         direction: Where SH are evaluated: `to the mean`, `to the camera` (the opposite), or `camera frame` (to the
             mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
         direction_gradient: Whether the mean gets a gradient through that direction.
@@ -57,7 +58,7 @@ class Model:
     rotation: str = "as given"
     scales: str = "linear"
     opacities: str = "linear"
-    compensation: bool = False
+    compensation: str = "none"
     direction: str = "to the mean"
     direction_gradient: bool = True
     sh_degree: int = 3
@@ -128,8 +129,9 @@ class Model:
             raw["log_scales"] = raw["log_scales"].exp()
         if self.opacities == "sigmoid":
             raw["logit_opacities"] = raw["logit_opacities"].sigmoid()
-        if self.compensation and self.settings.dilation > 0:
-            alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings)
+        if self.compensation != "none" and self.settings.dilation > 0:
+            floor = 1e-12 if self.compensation == "full" else _COMPENSATION_FLOOR
+            alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings, floor)
             raw["logit_opacities"] = torch.logit(alpha.clamp(1e-12, 1 - 1e-12))
         raw["sh"] = self._sh(raw, camera)
         if self.channels not in _ORDERS:
@@ -159,7 +161,7 @@ class Model:
         return ((color - 0.5) / _SH0)[:, None]  # the renderer clamps at 0 as ever
 
 
-def _compensation(raw: dict, camera: Camera, s: RenderSettings) -> torch.Tensor:
+def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) -> torch.Tensor:
     """(N,) sqrt(det Sigma' / det(Sigma' + dilation I)) of the projected covariances, as Mip-Splatting has it."""
     w2c = torch.tensor(camera.w2c)
     fx, fy, cx, cy = (float(camera.K[i][j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -179,7 +181,7 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings) -> torch.Tensor:
     det = torch.linalg.cross(a, b).square().sum(-1)
     trace = (a * a + b * b).sum(-1)
     ratio = det / (det + s.dilation * (trace + s.dilation))
-    return ratio.clamp_min(_COMPENSATION_FLOOR).sqrt()
+    return ratio.clamp_min(floor).sqrt()
 
 
 def _rotation(quats: torch.Tensor) -> torch.Tensor:
@@ -232,7 +234,7 @@ _VARIATIONS: dict[str, tuple[str, tuple, tuple]] = {
     "sh_degree": ("SH bands", ("sh",), (0, 1, 2, 3)),
     "sh_sign": ("SH sign", ("sh",), ("none", "odd m", "band 1", "band 2", "band 3")),
     "background": ("background", ("logit_opacities",), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))),
-    "compensation": ("dilation compensation", ("logit_opacities", *_SHAPE), (False, True)),
+    "compensation": ("dilation compensation", ("logit_opacities", *_SHAPE), ("none", "full", "at least 0.005")),
     "depth_key": ("depth sort key", _ALL, ("z", "distance")),
     "fov_clamp": ("field-of-view clamp", _SHAPE, ("none", "inria", "gsplat")),
     "culling": ("culling", _ALL, ("extent", "inria", "gsplat")),

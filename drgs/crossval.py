@@ -174,7 +174,9 @@ def crossval(
     open_ones = [name for name, row in groups.items() if row["verdict"] is None]
     if open_ones and isinstance(rasterizer, Rasterizer):
         say("central differences")
-        _decide(groups, open_ones, rasterizer, raw, cameras[first], background, u[first], ours, entries, agrees)
+        _decide(
+            groups, open_ones, rasterizer, model if agrees else None, raw, cameras[first], background, u[first], entries
+        )
     for row in groups.values():
         if row["verdict"] is None:
             row["verdict"] = "gradient bug" if agrees else "undecided"
@@ -335,16 +337,19 @@ def _known(groups, theirs, model: Model, raw, cameras, u, oracle, tolerance) -> 
         groups[name] |= {"verdict": "known deviation", "why": "; ".join(f"{c.name} ({c.where})" for c in best[1])}
 
 
-def _decide(groups, names, rasterizer, raw, camera, background, u, ours, entries: int, agrees: bool) -> None:
-    """Ask the rasterizer's own central differences."""
+def _decide(groups, names, rasterizer, model: Model | None, raw, camera, background, u, entries: int) -> None:
+    """Ask the rasterizer's own central differences; `model` is given if the image is its."""
     found = rasterizer.gradient(raw, camera, background, u)
     found = {name: torch.zeros_like(raw[name]) if x is None else x for name, x in found.items()}
-    chosen = {name: _entries(found[name], ours[name], entries) for name in names}
+    wanted = found if model is None else model.gradient(raw, camera, u)
+    chosen = {name: _entries(found[name], wanted[name], entries) for name in names}
     own = central(rasterizer, raw, camera, background, u, chosen)
     kept = rasterizer.gradient(raw, camera, background, u * own.kept[..., None])
+    wanted = None if model is None else model.gradient(raw, camera, u * own.kept[..., None])
     for name in names:
         there = torch.zeros_like(raw[name]) if kept[name] is None else kept[name]
-        groups[name]["differences"] = row = _own_row(there.reshape(-1), own, name)
+        row = _own_row(there, None if wanted is None else wanted[name], own, name)
+        groups[name]["differences"] = row
         row["pixels_left_out"] = int((~own.kept).sum())
         if len(own.entries[name]) < _ENOUGH:
             groups[name] |= {"verdict": "undecided", "why": f"{row['left_out']} of its differences did not converge"}
@@ -352,7 +357,7 @@ def _decide(groups, names, rasterizer, raw, camera, background, u, ours, entries
             groups[name] |= {"verdict": "gradient bug", "why": row["what"]}
         else:
             why = "agrees with its own central differences"
-            why += ", which differ from the model's gradient" if agrees else "; its image is of another model"
+            why += "; its image is of another model" if model is None else ", which differ from the model's gradient"
             groups[name] |= {"verdict": "model difference", "why": why}
 
 
@@ -363,16 +368,19 @@ def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
     return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]
 
 
-def _own_row(gradient: torch.Tensor, own: Differences, name: str) -> dict:
-    """A gradient against central differences at their entries."""
+def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differences, name: str) -> dict:
+    """A gradient, and the model's if it has the same image, against central differences at their entries."""
     values, bars = own.values[name], own.uncertainty[name]
-    there = gradient[own.entries[name]]
+    there = gradient.reshape(-1)[own.entries[name]]
     error, size = float((there - values).norm()), float(values.norm())
     noise = float(bars.norm())
     ratios = there[values.abs() > 3 * bars] / values[values.abs() > 3 * bars]
     ratio = float(ratios.median()) if len(ratios) else float("nan")
     spread = float((ratios - ratio).abs().median()) if len(ratios) else float("nan")
     bug = error > _OWN * size + 3 * noise
+    if wanted is not None:  # a small error, too, if the differences clearly side with the model
+        other = float((wanted.reshape(-1)[own.entries[name]] - values).norm())
+        bug |= error > 3 * max(noise, other)
     if not there.any() and bug:
         what = "it is 0, its own central differences are not"
     elif spread < 0.02 and abs(ratio - 1) > 0.02:
