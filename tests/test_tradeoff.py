@@ -293,3 +293,14 @@ def test_bad_input(place, capsys, options, expected):
     assert text.count("\n") == 1
     assert expected in text
     assert not list((place / "bad").glob("*"))
+
+
+def test_groups_without_a_derivative_have_no_error(place):
+    """Rotating a sphere changes nothing: its rounding is not taken for an error of 100 %."""
+    g = load_ply(place / "scene.ply")
+    g = g.replace(log_scales=g.log_scales[:, :1].expand(-1, 3).contiguous())
+    variants = tuple(v for v in tradeoff.VARIANTS if v.name in ("exact", "extent=4"))
+    row = measure(g, load_cameras_json(place / "cameras.json"), variants, repeats=0)["rows"][1]
+    assert row["gradient"]["groups"]["quats"] is None
+    assert row["information"]["groups"]["rotations"] == {"l1": None, "median": None}
+    assert 0 < row["gradient"]["worst"] < 0.2
