@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["measure"]
 
-_SECONDS = 120.0  # rounds end after so many of the clock or, where others use the machine, of the processor
+_SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
 _AT_LEAST = 3  # but not before so many
 _RAYS = 200  # of a sample on Mitsuba's traversal
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
@@ -48,7 +48,7 @@ def measure(
         cameras: Pinhole, at least one.
         variants: Rows; the first one is the truth.
         fields: Settings that hold in every row that does not say otherwise.
-        repeats: Rounds of timing at most; they end after two minutes if three are done.
+        repeats: Rounds of timing at most; they end after 100 seconds if three are done.
         seed: Of the cotangents, of the samples of pixels and of the order within a round.
         advance: Called after each turn.
     Returns:
