@@ -112,9 +112,9 @@ class _Geometry:
         rho2, _, u = self.m.along(r, ray)
         if self.m.world:
             _, a, d, inverse = self.m.local(r, ray)
-            shift = dot(a, d) * inverse
             root = dr.sqrt(inverse)
-            return [dr.fma(-shift, y, x) for x, y in zip(a, d, strict=True)], [x * root for x in d], u, rho2
+            # a - (a.d) d / |d|^2 would cancel where a is long: across a sheet it is 1e6 times p.
+            return [x * inverse for x in cross(d, cross(a, d))], [x * root for x in d], u, rho2
         c1, c2, d, inverse = self.m.screen(r, ray)
         q = [dr.fma(c1, extra[_SHAPE + i], c2 * extra[_SHAPE + 3 + i]) for i in range(3)]
         root = dr.sqrt(inverse)

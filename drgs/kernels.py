@@ -109,7 +109,10 @@ class Model:
         t0, a, d, inverse = self.local(r, ray)
         c = cross(a, d)
         key = t0 - dot(a, d) * inverse
-        u = key * dr.rsqrt(inverse) if self.s.response == "integral" else None
+        u = None
+        if self.s.response == "integral":
+            # |d'|^2 is 0 where a scale is beyond 1e19: all that is in sight is then at u = 0.
+            u = dr.select(dr.detach(dot(d, d)) > 0, key * dr.rsqrt(inverse), 0)
         return dot(c, c) * inverse, key, u
 
     def hit(self, record, ray, active):

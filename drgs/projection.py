@@ -143,11 +143,12 @@ class _Activated:
         ]
         self.scale = [dr.exp(Float64(column("log_scales", k, 3))) for k in range(3)]
         logit = Float64(column("logit_opacities", 0, 1))
-        # exp of a non-positive number on both sides: no overflow at any logit.
-        e = dr.exp(-abs(logit))
+        # exp of a non-positive number on both sides: no overflow at any logit. Not of -|logit|, whose derivative at a
+        # logit of 0 is 0.
+        e = dr.exp(dr.select(logit >= 0, -logit, logit))
         self.opacity = dr.select(logit >= 0, 1, e) / (1 + e)
         if settings.response == "integral":
-            self.strength = dr.maximum(logit, 0) + dr.log(1 + e)
+            self.strength = dr.select(logit >= 0, logit, 0) + dr.log(1 + e)
         else:
             self.strength = self.opacity
         extent = settings.extent
@@ -258,7 +259,7 @@ def _peak(g: _Activated, ax, ay, dx, dy, pinhole):
     f1 = _scaled(d, unit)
     Dx, Dy = _scaled(local(dx, inverse), unit), _scaled(local(dy, inverse), unit)
     e2, e3 = dot(f1, Dx), dot(f1, Dy)
-    rest = _less(Dx, f1, e2)
+    rest = _perpendicular(_less(Dx, f1, e2), f1)
     e4 = dr.sqrt(dot(rest, rest))
     f2 = _scaled(rest, dr.rcp(e4))
     f3 = cross(f1, f2)
@@ -282,6 +283,21 @@ def _frame(n):
     u = _less(e, n, dot(e, n))
     u = _scaled(u, dr.rsqrt(dot(u, u)))
     return u, cross(n, u)
+
+
+def _perpendicular(a, n):
+    """a, perpendicular to n but for rounding, without that: its component along the largest axis of n is put right.
+
+    Of a Gaussian as thin as a sheet n is the thin axis, nearly, and what a has of it is multiplied by 1 / scale.
+    """
+    size = [abs(dr.detach(x)) for x in n]
+    largest = dr.maximum(dr.maximum(size[0], size[1]), size[2])
+    result = []
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        here = size[k] == largest
+        result.append(dr.select(here, -(n[i] * a[i] + n[j] * a[j]) / dr.select(here, n[k], 1), a[k]))
+    return result
 
 
 def _listed_extent(g: _Activated, settings):

@@ -99,7 +99,16 @@ class Scene:
     def _pose(self):
         """w2c in float64; a copy of an array, which may be read-only."""
         w2c = self.camera.w2c
-        return (w2c if isinstance(w2c, torch.Tensor) else torch.tensor(w2c)).to(torch.float64)
+        if not isinstance(w2c, torch.Tensor):
+            return torch.tensor(w2c).to(torch.float64)
+        # The camera has checked it, but an optimizer may have moved it since.
+        bad = ~torch.isfinite(w2c.detach())
+        if bool(bad.any()):
+            at = bad.nonzero()[0].tolist()
+            raise ValueError(
+                f"render: the pose must be finite, got {float(w2c[tuple(at)]):g} at {at}; go back to the last good one"
+            )
+        return w2c.to(torch.float64)
 
     def _set_rays(self, o, d):
         if self.settings.traversal == "bvh":
