@@ -1,65 +1,93 @@
 """The extremes of the renderer: everything finite, and as close to the float64 oracle as anywhere else.
 
-The cases are in scenes_extreme.py; `python benchmarks/numerics.py` prints their errors for docs/numerics.md.
+The cases are in drgs/extremes.py and drgs/refusals.py; `drgs stress` runs them on any machine, and
+`python benchmarks/numerics.py` prints their errors for docs/numerics.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 
 import numpy as np
 import pytest
 import torch
 from scenes_extreme import CASES, CROWDS, crowd
-from scenes_random import FIELDS, Oracle, camera, compare, gaussians, gradients
+from scenes_random import camera, gaussians, gradients
 
 from drgs import bvh, reference
-from drgs.integrator import render, render_rays
+from drgs.integrator import render, render_jvp, render_rays
+from drgs.refusals import REFUSALS
 from drgs.settings import RenderSettings
-
-COLORS = tuple(name for name in FIELDS if name != "depth")
-
-
-def _run(case, traversal):
-    rng = np.random.default_rng(3)
-    g, cam = case.build(rng)
-    oracle = Oracle(g, cam, case.settings, rng, 1e-6, FIELDS if case.depth else COLORS)
-    return compare(g, cam, case.settings.replace(traversal=traversal), oracle), oracle
+from drgs.stress import measure, refused, truth_of
 
 
-def _check(errors):
-    assert errors.finite
-    assert max(errors.image.values()) <= 1e-5, errors.image
-    assert max(errors.gradient.values()) <= 1e-4, errors.gradient
-    assert errors.joint <= 1e-4
-    assert errors.duality <= 1e-4
+@pytest.fixture(scope="module", params=CASES, ids=lambda c: c.name.replace("`", ""))
+def known(request):
+    """A case and what the oracle says about it, shared by both traversals."""
+    return request.param, truth_of(request.param)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name.replace("`", ""))
-def test_tiles(case):
-    """Image within 1e-5 and gradients within 1e-4 of the oracle, in the worst places too."""
-    errors, oracle = _run(case, "tiles")
-    _check(errors)
-    assert oracle.good.double().mean() > 0.8
-    if case.name != "0 Gaussians":
-        assert oracle.out.count.max() > 0
+def _check(row):
+    assert row.finite, row
+    assert row.image <= 1e-5, row
+    assert row.gradient <= 1e-4, row
+    assert row.forward <= 1e-4, row
+    assert row.duality <= 1e-4, row
+    assert row.fisher is None or row.fisher <= 1e-4, row
 
 
-@pytest.mark.parametrize(
-    "case", [c for c in CASES if c.bvh != "skip" and "ewa" not in c.name], ids=lambda c: c.name.replace("`", "")
-)
-def test_bvh(case):
+def test_tiles(known):
+    """Image within 1e-5, derivatives and information within 1e-4 of the oracle, in the worst places too."""
+    case, truth = known
+    row = measure(case, "tiles", truth)
+    _check(row)
+    assert row.verdict == "holds"
+    assert truth.oracle.good.double().mean() > 0.8
+    if len(truth.g):
+        assert truth.oracle.out.count.max() > 0
+
+
+def test_bvh(known):
     """The same bounds on `bvh`; where float32 world space cannot hold them, finite values and a warning."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        errors, _ = _run(case, "bvh")
-    told = [str(w.message) for w in caught if "traversal='tiles'" in str(w.message)]
-    assert errors.finite
-    assert bool(told) == (case.bvh == "warns")
-    assert all("\n" not in message for message in told)
+    case, truth = known
+    if "bvh" not in case.traversals:
+        pytest.skip("`ewa` has no bvh")
+    row = measure(case, "bvh", truth)
+    assert row.finite, row
+    assert row.verdict == ("warns" if case.bvh == "warns" else "holds"), row
+    assert ("traversal='tiles'" in row.remark) == (case.bvh == "warns")
+    assert "\n" not in row.remark
     if case.bvh == "holds":
-        _check(errors)
+        _check(row)
+
+
+@pytest.mark.parametrize("case", REFUSALS, ids=lambda c: c.name)
+def test_refusals(case):
+    """What cannot be rendered is told in one line."""
+    row = refused(case)
+    assert row.verdict == "warns", row
+
+
+@pytest.mark.parametrize("response", ["peak", "integral", "ewa"])
+@pytest.mark.parametrize("traversal", ["tiles", "bvh"])
+def test_opacity_of_one_half_is_no_kink(response, traversal):
+    """The derivative by a logit of exactly 0 is that by 1e-6, both ways."""
+    if (response, traversal) == ("ewa", "bvh"):
+        pytest.skip("`ewa` has no bvh")
+    rng = np.random.default_rng(0)
+    g, cam = gaussians(rng, 1, 1, scale=0.5, spread=0.2), camera(rng, (9, 7))
+    settings = RenderSettings.preset("exact", response=response, order="center", traversal=traversal)
+    slopes = []
+    for logit in (0.0, 1e-6):
+        with torch.no_grad():
+            g.logit_opacities[:] = logit
+        back = torch.autograd.grad(render(g, cam, settings).alpha.sum(), g.logit_opacities)[0]
+        forward = render_jvp(g, cam, {"logit_opacities": torch.ones(1)}, settings).alpha.sum()
+        slopes.append((float(back), float(forward)))
+    assert min(slopes[1]) > 0.1
+    assert all(math.isclose(a, b, rel_tol=1e-5) for a, b in zip(*slopes, strict=True)), slopes
 
 
 @pytest.mark.filterwarnings("ignore:render:UserWarning")

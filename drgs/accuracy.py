@@ -1,0 +1,297 @@
+"""The renderer against the float64 oracle: images, derivatives both ways, Fisher information; random scenes for it.
+
+`J` is the Jacobian of everything a view shows by the raw parameters and the pose. The oracle (`reference.render`) gets
+the float32-rounded parameters; its pixels that hang on a near tie are left out of every comparison.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from drgs import reference
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.integrator import render, render_jvp
+
+__all__ = [
+    "FIELDS",
+    "Errors",
+    "Oracle",
+    "compare",
+    "entry_error",
+    "gradients",
+    "inner",
+    "jacobian",
+    "leaves",
+    "pose_gradient",
+    "random_camera",
+    "random_gaussians",
+    "relative",
+    "rotation",
+    "squares",
+    "turn",
+    "twist_basis",
+]
+
+FIELDS = ("rgb", "alpha", "depth", "features")
+_ENTRIES = 1 << 22  # of an intermediate of the dense Jacobian held at once: 32 MB
+
+
+# -------------------------------------------------- random scenes
+
+
+def rotation(vector) -> np.ndarray:
+    """(3, 3) rotation by a rotation vector."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = np.asarray(vector) / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def random_camera(rng, size=(24, 22), distance=4.0, focal=None, turn=0.2, center=None) -> Camera:
+    """Looks at the origin from `distance` away, off its axis, with an off-center principal point.
+
+    The focal length keeps 2 world units around the origin in the image unless it is given.
+    """
+    width, height = size
+    focal = focal or 0.5 * max(width, height, 6) * distance / 2
+    w2c = np.eye(4)
+    w2c[:3, :3] = rotation(turn * rng.normal(size=3))
+    w2c[:3, 3] = [0.1, -0.1, distance]
+    cx, cy = center or (width * rng.uniform(0.3, 0.7), height * rng.uniform(0.3, 0.7))
+    K = np.array([[focal, 0, cx], [0, 1.04 * focal, cy], [0, 0, 1]])
+    pose = torch.tensor(w2c, dtype=torch.float64).requires_grad_()
+    return Camera(K=K, w2c=pose, width=width, height=height)
+
+
+def random_gaussians(rng, n=20, K=4, D=0, scale=0.15, spread=1.0, anisotropy=0.5, opacity=1.5) -> Gaussians:
+    """N Gaussians in a cube of half size `spread` around the origin, float32, all leaves.
+
+    Args:
+        anisotropy: Standard deviation of each log-scale around log(scale).
+        opacity: Standard deviation of the logits.
+    """
+    values = {
+        "means": rng.uniform(-spread, spread, (n, 3)),
+        "quats": rng.normal(size=(n, 4)) * rng.uniform(0.3, 3, (n, 1)),
+        "log_scales": np.log(scale) + anisotropy * rng.normal(size=(n, 3)),
+        "logit_opacities": opacity * rng.normal(size=n),
+        "sh": rng.normal(size=(n, K, 3)) * 0.4,
+    }
+    if D:
+        values["features"] = rng.normal(size=(n, D))
+    return Gaussians(**{k: torch.tensor(v, dtype=torch.float32).requires_grad_() for k, v in values.items()})
+
+
+# -------------------------------------------------- derivatives both ways
+
+
+def twist_basis() -> torch.Tensor:
+    """(6, 4, 4) generators of rigid motions, rotations first."""
+    basis = torch.zeros(6, 4, 4, dtype=torch.float64)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[k, j, i], basis[k, i, j] = 1, -1
+        basis[3 + k, k, 3] = 1
+    return basis
+
+
+def pose_gradient(cam: Camera, gradient: torch.Tensor) -> torch.Tensor:
+    """(6,) the part of a gradient of w2c along the world twists c2w <- exp(xi) c2w."""
+    change = -cam.w2c.detach() @ twist_basis()
+    return (change * gradient).sum((1, 2))
+
+
+def leaves(g: Gaussians, cam: Camera) -> dict[str, torch.Tensor]:
+    """Everything that is differentiated, by group name."""
+    return {**g.parameters(), "camera": cam.w2c}
+
+
+def inner(a: dict, b: dict) -> float:
+    """Sum over groups of <a, b>."""
+    return float(sum((a[name] * b[name]).sum() for name in a))
+
+
+def relative(a: torch.Tensor, b: torch.Tensor, floor: float = 1e-6) -> float:
+    """|a - b| / max(|b|, floor) in the L2 norm; the floor stands for a gradient that is 0."""
+    return float((a - b).norm() / b.norm().clamp_min(floor))
+
+
+class Oracle:
+    """The float64 oracle on one scene: images, J^T u for random u, J v for a random v.
+
+    Attributes:
+        out: `reference.Output`.
+        good: (H, W) pixels that do not hang on a near tie, and are not in `skip`.
+        u, back: Cotangents of the images, 0 where not `good`, and the gradient they give, by group.
+        v, push: Tangents of the groups and the tangent images they give.
+    """
+
+    def __init__(self, g, cam, settings, rng, tolerance=1e-5, names=FIELDS, skip=None):
+        self.out = reference.render(g, cam, settings, tolerance=tolerance)
+        self.good = ~self.out.ambiguous
+        if skip is not None:
+            self.good &= ~skip
+        images = {name: x for name in names if (x := getattr(self.out, name)) is not None}
+        self.u = {}
+        for name, x in images.items():
+            mask = self.good.reshape(*self.good.shape, *[1] * (x.ndim - self.good.ndim))
+            self.u[name] = torch.tensor(rng.normal(size=tuple(x.shape))) * mask
+            self.u[name].requires_grad_()
+        self.v = {name: torch.tensor(rng.normal(size=tuple(x.shape))) for name, x in g.parameters().items()}
+        self.v["camera"] = torch.tensor(rng.normal(size=6))
+        # J^T u is linear in u: differentiating <v, J^T u> by u gives J v.
+        loss = sum((images[name] * u).sum() for name, u in self.u.items())
+        groups = leaves(g, cam)
+        back = _grad(loss, groups, create_graph=True)
+        change = {**self.v, "camera": -cam.w2c.detach() @ (self.v["camera"][:, None, None] * twist_basis()).sum(0)}
+        self.push = _grad(sum((back[name].double() * change[name]).sum() for name in back), self.u)
+        self.back = {n: x.detach().double() for n, x in back.items()}
+        self.back["camera"] = pose_gradient(cam, self.back["camera"])
+        self.u = {name: u.detach() for name, u in self.u.items()}
+
+
+def _grad(loss, groups: dict, **options) -> dict:
+    if not loss.requires_grad:
+        return {name: torch.zeros_like(x) for name, x in groups.items()}
+    found = torch.autograd.grad(loss, list(groups.values()), allow_unused=True, **options)
+    return {n: torch.zeros_like(x) if y is None else y for (n, x), y in zip(groups.items(), found, strict=True)}
+
+
+def gradients(g: Gaussians, cam: Camera, out, u: dict) -> dict[str, torch.Tensor]:
+    """float64 gradient of sum <u, image> by group, `camera` as a twist."""
+    loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
+    found = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
+    return {**found, "camera": pose_gradient(cam, found["camera"])}
+
+
+@dataclasses.dataclass
+class Errors:
+    """Renderer against oracle on one scene, outside of ambiguous pixels.
+
+    Attributes:
+        image: Output name -> largest absolute error (depths: relative to the largest depth, or 1).
+        gradient: Group -> relative L2 error of the adjoint.
+        forward: Output name -> relative L2 error of the forward mode.
+        joint: relative L2 error of the forward mode over all outputs but depth.
+        duality: |<Jv, u> - <v, J^T u>| / (|Jv| |u|).
+        finite: Every output, gradient and tangent is finite, ambiguous pixels included.
+        count: Largest difference of the number of hits of a pixel.
+        out: The renderer's `Output`.
+    """
+
+    image: dict
+    gradient: dict
+    forward: dict
+    joint: float
+    duality: float
+    finite: bool
+    count: int
+    out: object
+
+
+def compare(g, cam, settings, oracle: Oracle) -> Errors:
+    """Render, differentiate both ways and compare with the oracle."""
+    out, ref, good = render(g, cam, settings, outputs="all"), oracle.out, oracle.good
+    size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])
+    image, finite = {}, True
+    for name in (*FIELDS, "median_depth"):
+        a, b = getattr(out, name), getattr(ref, name)
+        if b is not None:
+            finite &= bool(torch.isfinite(a).all())
+            image[name] = _largest((a.double() - b)[good]) / (size if "depth" in name else 1.0)
+    if good.all():
+        image["visibility"] = _largest((out.visibility.double() - ref.visibility) / (1 + ref.visibility))
+    ours = gradients(g, cam, out, oracle.u)
+    pushed = render_jvp(g, cam, oracle.v, settings)
+    jv = {name: getattr(pushed, name).double() for name in oracle.u}
+    finite &= all(bool(torch.isfinite(x).all()) for x in (*ours.values(), *jv.values()))
+    scale = (inner(jv, jv) * inner(oracle.u, oracle.u)) ** 0.5
+    colors = [name for name in jv if name != "depth"]
+    both = [torch.cat([x[name][good].reshape(-1) for name in colors] or [torch.zeros(0)]) for x in (jv, oracle.push)]
+    return Errors(
+        image=image,
+        gradient={name: relative(x, oracle.back[name]) for name, x in ours.items()},
+        forward={name: relative(x[good], oracle.push[name][good]) for name, x in jv.items()},
+        joint=relative(*both),
+        duality=abs(inner(jv, oracle.u) - inner(oracle.v, ours)) / max(scale, 1e-12),
+        finite=finite,
+        count=int(_largest((out.count - ref.count)[good])),
+        out=out,
+    )
+
+
+def _largest(x: torch.Tensor) -> float:
+    return float(x.detach().abs().max()) if x.numel() else 0.0
+
+
+# -------------------------------------------------- the dense Jacobian
+
+
+def jacobian(g, out, features: bool = False) -> dict[str, torch.Tensor]:
+    """Group of `drgs.fisher` -> (3 P, parameters...) float64 derivative of the oracle's rgb.
+
+    Args:
+        g: The Gaussians, leaves.
+        out: `reference.Output` with its graph.
+        features: Whether `features` (P, N), the derivative of a pixel's feature by those of the Gaussians, is added.
+    """
+    wanted = {name: x for name, x in g.parameters().items() if name != "features"}
+    J = dict(zip(wanted, _dense(out.rgb.reshape(-1), list(wanted.values())), strict=True))
+    J["rotations"] = turn(g.quats.detach().double(), J.pop("quats"))
+    J = {name: J[name] for name in ("means", "rotations", "log_scales", "logit_opacities", "sh")}
+    if features and g.features is not None:
+        # Channels do not mix, and all have the same derivative: that of the first.
+        J["features"] = _dense(out.features[..., 0].reshape(-1), [g.features])[0][..., 0]
+    return J
+
+
+def turn(quats, slope) -> torch.Tensor:
+    """(..., N, 3) derivative by a world-frame rotation R <- exp([w]x) R of one by the quaternion (..., N, 4)."""
+    w, x, y, z = quats.unbind(1)
+    moves = torch.stack(  # dq/dw_k = (0, e_k) q / 2, written out
+        [torch.stack([-x, w, -z, y], 1), torch.stack([-y, z, w, -x], 1), torch.stack([-z, -y, x, w], 1)], 1
+    )
+    return 0.5 * torch.einsum("...nq,nkq->...nk", slope, moves)
+
+
+def squares(J: dict) -> dict[str, torch.Tensor]:
+    """The diagonal of J^T J by group."""
+    return {name: x.square().sum(0) for name, x in J.items()}
+
+
+def entry_error(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Largest difference, relative to the largest entry of b."""
+    return _largest(a - b) / max(_largest(b), 1e-12)
+
+
+def _dense(flat: torch.Tensor, inputs: list[torch.Tensor]) -> list[torch.Tensor]:
+    """(len(flat), *shape) derivative by each input: row by row, or column by column where these are fewer."""
+    zeros = [torch.zeros(len(flat), *x.shape, dtype=torch.float64) for x in inputs]
+    if not flat.requires_grad or not any(x.numel() for x in inputs):
+        return zeros
+    step = max(1, _ENTRIES // (len(flat) * len(inputs[0])))
+    if len(flat) <= sum(x.numel() for x in inputs):
+        rows = _batched(flat, inputs, step)
+        return [zero if row is None else row.double() for zero, row in zip(zeros, rows, strict=True)]
+    # J^T u is linear in u: its derivatives by u are the columns.
+    u = torch.zeros_like(flat, requires_grad=True)
+    back = torch.autograd.grad(flat @ u, inputs, create_graph=True, allow_unused=True)
+    columns = [None if x is None else _batched(x.reshape(-1), [u], step)[0] for x in back]
+    return [zero if x is None else x.double().T.reshape(zero.shape) for zero, x in zip(zeros, columns, strict=True)]
+
+
+def _batched(flat: torch.Tensor, inputs: list[torch.Tensor], step: int) -> list[torch.Tensor | None]:
+    """The Jacobian of `flat` by each input, `step` rows at a time."""
+    parts = []
+    for start in range(0, len(flat), step):
+        stop = min(start + step, len(flat))
+        rows = torch.zeros(stop - start, len(flat), dtype=flat.dtype)
+        rows[torch.arange(stop - start), torch.arange(start, stop)] = 1
+        parts.append(torch.autograd.grad(flat, inputs, rows, True, is_grads_batched=True, allow_unused=True))
+    return [None if part[0] is None else torch.cat(part) for part in zip(*parts, strict=True)]
