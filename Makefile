@@ -34,6 +34,9 @@ smoke: setup
 	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 40
 	$(BIN)/drgs select out/smoke/run --candidates dome --count 6 -k 2 -o out/smoke/selection.json
 	$(BIN)/drgs fisher out/smoke/run --limit 2 --pose -o out/smoke/fisher
+	$(BIN)/drgs crossval out/smoke/run --limit 1 --max-pixels 768 --no-ladder -o out/smoke/crossval
+	$(BIN)/drgs tradeoff out/smoke/run --limit 1 --max-pixels 768 --repeats 1 -o out/smoke/tradeoff
+	$(BIN)/drgs stress --match "1 Gaussian"
 
 lint: setup
 	$(BIN)/ruff check .

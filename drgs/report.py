@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 
 import numpy as np
 
@@ -75,7 +76,10 @@ not and are left out, with {{ g.differences.pixels_left_out }} pixels at cut-off
 {% for i in g.differences.entries %}<tr><td>{{ i }}</td><td>{{ "%.5g" | format(g.differences.gradient[loop.index0]) }}
 </td><td>{{ "%.5g" | format(g.differences.central[loop.index0]) }}</td>
 <td>{{ num(g.differences.uncertainty[loop.index0]) }}</td></tr>{% endfor %}</table>{% endfor %}
-{% if ladder %}<h2>From this model to the exact one</h2>{{ ladder }}{% endif %}
+{% if ladder %}<h2>From this model to the exact one</h2>
+<p>One approximation is switched at a time, in the order of the rows / in its reverse as far as there is such a model.
+RMS and largest difference of each step of the image; its share of the whole difference, of the image and of each
+group's gradient. Shares add up to 100 %; a negative one makes up for another.</p>{{ ladder }}{% endif %}
 <h2>Settings</h2><table>{% for k, v in r.settings.items() %}<tr><td>{{ k }}</td><td class="text">{{ v }}</td></tr>
 {% endfor %}</table></html>
 """
@@ -123,7 +127,8 @@ def _table(markdown: str) -> str:
 
     parts, head = [], True
     for line in markdown.splitlines():
-        cells = [str(escape(cell.strip().replace("`", ""))) for cell in line.strip().strip("|").split("|")]
+        cells = re.split(r"(?<!\\)\|", line.strip().removeprefix("|").removesuffix("|"))
+        cells = [str(escape(cell.strip().replace("`", "").replace("\\|", "|"))) for cell in cells]
         if not line.startswith("|"):
             if parts and parts[-1].endswith("</tr>"):
                 parts.append("</table>")

@@ -66,7 +66,9 @@ def assert_matches(
     return results
 
 
-def random_scene(seed: int = 0, count: int = 60, width: int = 48, height: int = 40) -> tuple[Gaussians, list[Camera]]:
+def random_scene(
+    seed: int = 0, count: int = 60, width: int = 48, height: int = 40, aspect: float = 1.03
+) -> tuple[Gaussians, list[Camera]]:
     """Gaussians and a camera on which faults of rasterizers show.
 
     A wide, off-center view (depth keys, field-of-view clamps), opaque Gaussians in front (clamped alpha, rays that
@@ -76,10 +78,11 @@ def random_scene(seed: int = 0, count: int = 60, width: int = 48, height: int = 
         seed: Of everything.
         count: Number of Gaussians.
         width, height: Of the image.
+        aspect: fy / fx; 1 for renderers that know square pixels only.
     """
     rng = np.random.default_rng(seed)
     focal = 0.55 * width
-    K = np.array([[focal, 0, width * rng.uniform(0.42, 0.58)], [0, 1.03 * focal, height * rng.uniform(0.42, 0.58)]])
+    K = np.array([[focal, 0, width * rng.uniform(0.42, 0.58)], [0, aspect * focal, height * rng.uniform(0.42, 0.58)]])
     camera = Camera(
         K=np.vstack([K, [0, 0, 1]]),
         w2c=look_at(rng.normal(size=3) * 0.3, np.array([0.3, -0.2, 4.0]), np.array([0.1, -1.0, 0.05])),

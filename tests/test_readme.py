@@ -24,6 +24,9 @@ _SMALLER = {
     "render": ["--frames", "2", "--width", "24"],
     "select": ["--count", "6"],
     "fisher": ["--limit", "1"],
+    "crossval": ["--limit", "1", "--max-pixels", "192", "--no-ladder"],
+    "tradeoff": ["--limit", "1", "--max-pixels", "192", "--repeats", "1"],
+    "stress": ["--match", "1 Gaussian"],
     "demo": ["--quick"],
 }
 # Structure from motion needs real texture and the demo takes half a minute: tests/test_sfm.py, tests/test_demo.py.
