@@ -72,7 +72,7 @@ class Pictures:
     Args:
         g: N Gaussians.
         cameras: Pinhole cameras, at least one.
-        crop: Width and height in pixels of the crops of the first camera.
+        crop: Width and height in pixels of the crops of the first camera; 0 for none.
         seed: Of the cotangent.
         gradients: Whether J^T u is wanted.
         advance: Called after each image.
@@ -83,8 +83,8 @@ class Pictures:
             raise ValueError(
                 f"ladder: there must be a camera and a Gaussian, got {len(cameras)} and {len(g)}; give both"
             )
-        if crop < 1:
-            raise ValueError(f"ladder: crop must be >= 1 pixel, got {crop}; correct it")
+        if crop < 0:
+            raise ValueError(f"ladder: crop must be >= 0 pixels, got {crop}; correct it")
         self.g, self.cameras, self.crop, self.gradients = g.detach(), list(cameras), crop, gradients
         self.advance = advance or (lambda: None)
         self.background = (0.0, 0.0, 0.0)
@@ -180,7 +180,8 @@ def ladder(
         g: N Gaussians.
         cameras: Pinhole cameras; the images of all are one vector. Crops are of the first.
         start: The rasterizer, for example `RenderSettings.preset("gsplat")`; its background stays.
-        crop: Width and height in pixels of the crops, in the middle and in a corner.
+        crop: Width and height in pixels of the crops, in the middle and in a corner; 0 leaves crops, and with them
+            float32 and the far end, out.
         seed: Of the cotangent.
         volume: Also the far end, on the crops: response peak to integral, and sorting to the true volume.
         gradients: Also the gradients by group.
@@ -198,7 +199,7 @@ def ladder(
     """
     made = pictures or Pictures(g, cameras, crop, seed, gradients, advance)
     end = RenderSettings.preset("exact", background=start.background)
-    if not made.windows:
+    if made.crop and not made.windows:
         made.place_crops(start)
     orders = sequences(start, end)
     report = {
@@ -217,6 +218,8 @@ def ladder(
         switched = [_switched(a, b) for a, b in pairwise([start, *(s for _, s in steps)])]
         states = [made.full(start), *(made.full(s) for _, s in steps)]
         report["image"][name], report["image"]["total"] = _rungs(names, switched, states)
+        if not made.windows:
+            continue
         states = [made.part(start, "float32"), *(made.part(s, "float32") for _, s in steps)]
         if name == "forward":
             rounding = _minus(made.part(start, "float64"), states[0])
@@ -225,7 +228,9 @@ def ladder(
         else:
             states, names, switched = [*states, made.part(end, "float64")], [*names, "float32"], [*switched, {}]
         report["crops"][name], report["crops"]["total"] = _rungs(names, switched, states)
-    if volume:
+    if not made.windows:
+        del report["crops"]
+    elif volume:
         integral = end.replace(response="integral")
         states = [made.part(end, "float64"), made.part(integral, "float64"), made.part(integral, "volume")]
         rungs, total = _rungs(list(_BEYOND), [_switched(end, integral), {}], states, states[0])
@@ -350,14 +355,18 @@ def _minus(a: _State, b: _State) -> _State:
 
 
 def table(report: dict) -> str:
-    """Markdown of a report: image, gradients, crops."""
+    """Markdown of a report: image, gradients, crops.
+
+    A pair is `stated order / reverse`, one number where they agree; gradients show shares, in asides |step| / |exact|.
+    """
     groups = report["groups"]
     lines = _both(report["image"], groups, "all pixels")
-    windows = ", ".join(f"{w}x{h} at ({x}, {y})" for x, y, w, h in report["crops"]["windows"])
-    lines += ["", *_both(report["crops"], groups, f"crops {windows}")]
+    if "crops" in report:
+        windows = ", ".join(f"{w}x{h} at ({x}, {y})" for x, y, w, h in report["crops"]["windows"])
+        lines += ["", *_both(report["crops"], groups, f"crops {windows}")]
     if "far" in report:
         lines += ["", *_both({"reverse": [], **report["far"]}, groups, "beyond `exact`, crops")]
-    lines += ["", "| aside, all pixels | RMS | max |" + "".join(f" {name} |" for name in groups)]
+    lines += ["", "| aside, all pixels | RMS | max |" + "".join(f" {name}, of exact |" for name in groups)]
     lines += ["|---" * (3 + len(groups)) + "|"]
     for row in report["asides"]:
         cells = [_percent(row["gradient"][name]["of_exact"]) for name in groups]
@@ -372,7 +381,8 @@ def _both(part: dict, groups: list[str], what: str) -> list[str]:
     lines.append("|---" * (4 + len(groups)) + "|")
 
     def pair(row, other, read, show):
-        return " / ".join(show(read(x)) for x in (row, other) if x is not None)
+        found = [show(read(x)) for x in (row, other) if x is not None]
+        return " / ".join(dict.fromkeys(found))  # once where both orders agree
 
     for row in part["forward"]:
         other = back.get(row["rung"])
@@ -394,5 +404,6 @@ def _percent(x: float | None) -> str:
     """Two digits below 1 %, none above 10."""
     if x is None:
         return "-"
-    digits = 0 if abs(x) >= 0.1 else 1 if abs(x) >= 0.01 else 2
+    digits = 0 if abs(x) >= 0.1 or abs(x) < 5e-5 else 1 if abs(x) >= 0.01 else 2
+    x = 0.0 if abs(x) < 5e-5 else x
     return f"{100 * x:.{digits}f} %"

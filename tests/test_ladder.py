@@ -136,7 +136,9 @@ def test_dilation_alone(rng):
 def test_order_alone(rng):
     """`exact` but for one depth a Gaussian: nothing else can matter."""
     g, cam = made(rng, n=60, scale=0.4)
-    found = ladder(g, [cam], EXACT.replace(order="center"), crop=8, volume=False)
+    found = ladder(g, [cam], EXACT.replace(order="center"), crop=0)
+    assert "crops" not in found
+    assert "far" not in found
     for order in ("forward", "reverse"):
         assert [row["rung"] for row in found["image"][order]] == ["order"]
         assert found["image"][order][0]["share"] == pytest.approx(1, abs=1e-12)
@@ -219,7 +221,7 @@ def test_bad_arguments(rng):
     g, cam = made(rng, n=3)
     with pytest.raises(ValueError, match="ladder: there must be a camera and a Gaussian, got 0 and 3"):
         ladder(g, [], EXACT)
-    with pytest.raises(ValueError, match="ladder: crop must be >= 1"):
-        ladder(g, [cam], EXACT, crop=0)
+    with pytest.raises(ValueError, match="ladder: crop must be >= 0"):
+        ladder(g, [cam], EXACT, crop=-1)
     with pytest.raises(ValueError, match="both ends must share background"):
         sequences(EXACT, EXACT.replace(background=(1, 1, 1)))
