@@ -23,7 +23,6 @@ from drgs.settings import RenderSettings
 __all__ = ["Finding", "Found", "Model", "find"]
 
 _SH0 = math.sqrt(1 / (4 * math.pi))
-_SETTLED = 1e-5  # RMS of an image that equals the model's
 _SHARE = 0.3  # of the remaining difference that a variation must explain to be named
 _ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
 _COMPENSATION_FLOOR = 0.005**2  # of the ratio of determinants
@@ -248,7 +247,9 @@ _VARIATIONS: dict[str, tuple[str, tuple, tuple]] = {
 _FITTED = ("dilation", "alpha_min", "alpha_max", "transmittance_min")  # refined around the best value
 
 
-def find(image: torch.Tensor, raw: dict, camera: Camera, starts: list[Model], oracle: bool = False) -> Found:
+def find(
+    image: torch.Tensor, raw: dict, camera: Camera, starts: list[Model], oracle: bool = False, settled: float = 1e-5
+) -> Found:
     """The model whose image is nearest to a given one, and what is unusual about it.
 
     Variations are added one at a time, each time the one that explains most of what is left, as long as that is at
@@ -261,6 +262,7 @@ def find(image: torch.Tensor, raw: dict, camera: Camera, starts: list[Model], or
         starts: Models that may be meant: the claimed one, or one a preset. What differs is counted from the one that
             needs least.
         oracle: Search with the float64 oracle.
+        settled: RMS below which two images are one: what their rounding does.
     """
     known: dict[Model, float] = {}
 
@@ -271,15 +273,15 @@ def find(image: torch.Tensor, raw: dict, camera: Camera, starts: list[Model], or
         return known[model]
 
     start = min(starts, key=distance)
-    model = _descend(distance, start, start)
+    model = _descend(distance, start, start, settled)
     odd = [field for field in _different(model, start) if not hasattr(model, field) and field != "background"]
-    for other in starts if odd or distance(model) > _SETTLED else ():
+    for other in starts if odd or distance(model) > settled else ():
         # Beside a gross difference the nearest preset need not be the right one.
         moved = dataclasses.replace(model, settings=other.settings.replace(background=model.settings.background))
         if other != start and distance(moved) < 2 * distance(start):
-            moved = _descend(distance, moved, other)
+            moved = _descend(distance, moved, other, settled)
             few, many = (len(_different(*pair)) for pair in ((moved, other), (model, start)))
-            near, far = max(distance(moved), _SETTLED), max(distance(model), _SETTLED)
+            near, far = max(distance(moved), settled), max(distance(model), settled)
             if near < 0.8 * far or (near <= 1.1 * far and few < many):
                 model, start = moved, other
     findings = []
@@ -308,19 +310,19 @@ class Found:
     findings: list[Finding]
 
 
-def _descend(distance: Callable[[Model], float], model: Model, start: Model) -> Model:
+def _descend(distance: Callable[[Model], float], model: Model, start: Model, settled: float) -> Model:
     """Add variations while they explain much, then drop those that `start` does without as well."""
-    while distance(model) > _SETTLED:
+    while distance(model) > settled:
         tried = list(_variations(model))
         best = min(distance(new) for new, _ in tried)
         # Of those that explain as much, the first one listed: what differs then is rounding.
-        new, field = next(pair for pair in tried if distance(pair[0]) <= max(1.001 * best, _SETTLED))
+        new, field = next(pair for pair in tried if distance(pair[0]) <= max(1.001 * best, settled))
         if distance(new) > (1 - _SHARE) * distance(model):
             break
-        model = _refined(distance, new, field) if field in _FITTED else new
+        model = _refined(distance, new, field, settled) if field in _FITTED else new
     for field in _different(model, start):
         without = model.replace(**{field: _get(start, field)})
-        if distance(without) <= 1.05 * max(distance(model), _SETTLED):
+        if distance(without) <= 1.05 * max(distance(model), settled):
             model = without
     return model
 
@@ -337,11 +339,11 @@ def _variations(model: Model) -> Iterator[tuple[Model, str]]:
                 continue
 
 
-def _refined(distance, model: Model, field: str) -> Model:
+def _refined(distance, model: Model, field: str, settled: float) -> Model:
     """The number that fits best, by golden section on a logarithmic scale around the one that was tried."""
     value = _get(model, field)
     flip = field == "alpha_max"  # what matters there is the distance from 1
-    if distance(model) <= _SETTLED or value == float(flip):
+    if distance(model) <= settled or value == float(flip):
         return model
     center, ratio = math.log(1 - value if flip else value), (math.sqrt(5) - 1) / 2
     low, high = center - 1.0, min(center + 1.0, -1e-3)

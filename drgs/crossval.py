@@ -41,6 +41,7 @@ _PIXEL = 1e-3  # a pixel that differs by more hangs on a cut-off or on the order
 _FEW = 0.01
 _IMAGE = 1e-3  # RMS of images that agree
 _TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}
+_SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs
 _ENOUGH = 3  # converged differences that a verdict needs
 _OWN = 0.02  # relative difference from its own central differences that is a bug
 
@@ -144,8 +145,8 @@ def crossval(
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
     if oracle:
         g, cameras = _part(g, cameras, starts[0].settings)
-    if tolerance is None:
-        tolerance = _TOLERANCE[getattr(rasterizer, "dtype", torch.float32)]
+    dtype = getattr(rasterizer, "dtype", torch.float32)
+    tolerance = tolerance or _TOLERANCE[dtype]
     raw, u = raw_of(g), cotangents(cameras, seed)
     say("images")
     if isinstance(rasterizer, Dump):
@@ -157,7 +158,7 @@ def crossval(
         raise ValueError(f"{rasterizer.name}: its image must be finite, view {bad[0]} has NaN or Inf")
     say("conventions")
     first = int(np.argmax([float(x.var()) for x in pictures]))  # the view that shows most
-    found = conventions.find(pictures[first], raw, cameras[first], starts, oracle)
+    found = conventions.find(pictures[first], raw, cameras[first], starts, oracle, _SETTLED[dtype])
     model = found.model
     drawn = [_drawn(model, raw, camera, oracle) for camera in cameras]
     views = [_image_row(c, a, b, s, t) for c, a, b, (s, t) in zip(cameras, pictures, alphas, drawn, strict=True)]

@@ -264,7 +264,7 @@ def cotangents(cameras: list[Camera], seed: int) -> torch.Tensor:
 def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict[str, np.ndarray]:
     """What tells a scene from another: float32 raw parameters, world frame, cameras and background."""
     arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
-    arrays["viewmat"] = np.stack([np.asarray(torch.as_tensor(c.w2c).detach(), np.float32) for c in cameras])
+    arrays["viewmat"] = np.stack([_tensor(c.w2c).float().numpy() for c in cameras])
     arrays["K"] = np.stack([np.asarray(c.K, np.float32) for c in cameras])
     arrays["width"], arrays["height"] = np.int64(cameras[0].width), np.int64(cameras[0].height)
     arrays["background"] = np.asarray(background, np.float32)
