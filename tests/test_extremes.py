@@ -7,6 +7,7 @@ The cases are in drgs/extremes.py and drgs/refusals.py; `drgs stress` runs them 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import warnings
 
@@ -23,10 +24,11 @@ from drgs.settings import RenderSettings
 from drgs.stress import measure, refused, truth_of
 
 
-@pytest.fixture(scope="module", params=CASES, ids=lambda c: c.name.replace("`", ""))
-def known(request):
-    """A case and what the oracle says about it, shared by both traversals."""
-    return request.param, truth_of(request.param)
+@functools.lru_cache(maxsize=1)
+def _known(name):
+    """A case and what the oracle says about it; both traversals follow one another."""
+    case = next(c for c in CASES if c.name == name)
+    return case, truth_of(case)
 
 
 def _check(row):
@@ -38,29 +40,28 @@ def _check(row):
     assert row.fisher is None or row.fisher <= 1e-4, row
 
 
-def test_tiles(known):
-    """Image within 1e-5, derivatives and information within 1e-4 of the oracle, in the worst places too."""
-    case, truth = known
-    row = measure(case, "tiles", truth)
-    _check(row)
-    assert row.verdict == "holds"
+@pytest.mark.parametrize(
+    ("name", "traversal"),
+    [(case.name, traversal) for case in CASES for traversal in case.traversals],
+    ids=lambda text: text.replace("`", ""),
+)
+def test_extremes(name, traversal):
+    """Image within 1e-5, derivatives and information within 1e-4 of the oracle, in the worst places too.
+
+    On `bvh` where float32 world space cannot hold these bounds: finite values and a warning.
+    """
+    case, truth = _known(name)
+    row = measure(case, traversal, truth)
+    warns = (traversal, case.bvh) == ("bvh", "warns")
+    assert row.finite, row
+    assert row.verdict == ("warns" if warns else "holds"), row
+    assert ("traversal='tiles'" in row.remark) == warns
+    assert "\n" not in row.remark
+    if traversal == "tiles" or case.bvh == "holds":
+        _check(row)
     assert truth.oracle.good.double().mean() > 0.8
     if len(truth.g):
         assert truth.oracle.out.count.max() > 0
-
-
-def test_bvh(known):
-    """The same bounds on `bvh`; where float32 world space cannot hold them, finite values and a warning."""
-    case, truth = known
-    if "bvh" not in case.traversals:
-        pytest.skip("`ewa` has no bvh")
-    row = measure(case, "bvh", truth)
-    assert row.finite, row
-    assert row.verdict == ("warns" if case.bvh == "warns" else "holds"), row
-    assert ("traversal='tiles'" in row.remark) == (case.bvh == "warns")
-    assert "\n" not in row.remark
-    if case.bvh == "holds":
-        _check(row)
 
 
 @pytest.mark.parametrize("case", REFUSALS, ids=lambda c: c.name)
