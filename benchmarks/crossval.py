@@ -93,9 +93,10 @@ def broken() -> list[str]:
 def outside() -> list[str]:
     """One line a rasterizer and scene."""
     lines = [
-        "| rasterizer | scene | preset | conventions that differ | RMS of the image | pixels off by > 0.001 | verdict "
-        "| relative difference of gradients: means, quats, log_scales, logit_opacities, sh | seconds |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| rasterizer | scene | preset | conventions that differ | RMS of the image | pixels off by > 0.001 "
+        "| mean of alpha | verdict | relative difference of gradients: means, quats, log_scales, logit_opacities, sh "
+        "| seconds |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     scenes = {f"random {seed}": random_scene(seed, aspect=1.0) for seed in range(3)}
     scenes["random 0, 10 times smaller"] = shrunk(scenes["random 0"], 0.1)
@@ -117,7 +118,8 @@ def outside() -> list[str]:
                 mark = {"gradient bug": "**", "agreement": ""}.get(row["verdict"], "")
                 groups.append(f"{mark}{row['relative']:.0e}{mark}")
             lines.append(
-                f"| {label} | {place} | {preset} | {odd} | {view['rms']:.0e} | {view['share']:.1%} | {found.verdict} | "
+                f"| {label} | {place} | {preset} | {odd} | {view['rms']:.0e} | {view['share']:.1%} "
+                f"| {view['alpha']['bias']:+.0e} | {found.verdict} | "
                 f"{', '.join(groups)} | {seconds:.0f} |"
             )
             print(lines[-1], flush=True)

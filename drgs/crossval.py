@@ -42,6 +42,7 @@ _FEW = 0.01
 _IMAGE = 1e-3  # RMS of images that agree
 _TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}
 _SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs
+_ALPHA = 1e-4  # a mean difference of alpha that is worth a word
 _ENOUGH = 3  # converged differences that a verdict needs
 _OWN = 0.02  # relative difference from its own central differences that is a bug
 
@@ -100,6 +101,10 @@ class Result:
         lines = [f"{r['rasterizer']}: {r['verdict']} (model: preset {r['preset']})"]
         for c in r["conventions"]:
             lines.append(f"convention: {c['name']} is {c['found']}, expected {c['expected']}")
+        for view in r["image"]["views"]:
+            if abs(bias := view["alpha"]["bias"]) > _ALPHA:
+                what = "lower: hits are missing" if bias < 0 else "higher"
+                lines.append(f"view {view['view']}: alpha is {abs(bias):.1e} {what}, in the mean")
         for name, group in r["groups"].items():
             what = group["verdict"] + (f": {group['why']}" if group["why"] else "")
             lines.append(f"{name}: {what}; relative difference {group['relative']:.2g}, cosine {group['cosine']:.6f}")

@@ -72,8 +72,9 @@ def _print(result: Result, args: Crossval) -> None:
         numbers = f"{row['relative']:.1e}", f"{row['cosine']:.6f}", f"{row['bias']:+.1e}"
         table.add_row(name, row["verdict"], *numbers, row["why"])
     console.print(table)
-    for c in report["conventions"]:
-        console.print(f"convention: {c['name']} is {c['found']}, expected {c['expected']}", markup=False)
+    for line in result.lines():
+        if line.startswith(("convention:", "view ")):
+            console.print(line, markup=False)
     rms, share = (max(view[k] for view in report["image"]["views"]) for k in ("rms", "share"))
     console.print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
     console.print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json", markup=False)
