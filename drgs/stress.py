@@ -90,6 +90,7 @@ def run(args: Stress) -> int:
     start, found = time.perf_counter(), []
     width = max(len(case.name) for case in chosen)
     if not args.quiet:
+        print(f"{len(chosen)} cases; the first run compiles their kernels, which takes minutes, later ones one or two")
         print(_line(width, "case", "on", *_SHORT, "finite", "verdict"))
     with Bar("stress", len(chosen), not args.quiet) as bar:
         for number, case in enumerate(chosen):
