@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import math
 import subprocess
 import sys
@@ -111,6 +112,16 @@ def rounded(x):
     return float(f"{x:.5g}") if isinstance(x, float) and math.isfinite(x) else x
 
 
+def write(path: Path, result: dict) -> None:
+    """JSON, atomically, a line a report: the whole of it is long."""
+    text = json.dumps(result, separators=(",", ":"))
+    for name in STARTS:
+        text = text.replace(f'"{name}":', f'\n"{name}":')
+    part = path.with_suffix(".part")
+    part.write_text(text + "\n")
+    part.replace(path)
+
+
 def plot(result: dict, path: Path) -> None:
     """A row a scene: size of every step, shares of the image's difference, of two groups' gradients."""
     import matplotlib
@@ -125,10 +136,10 @@ def plot(result: dict, path: Path) -> None:
     height = 4.1 * len(rows) + 1.1
     figure, axes = plt.subplots(len(rows), 4, figsize=(15.5, height), squeeze=False)
     titles = (
-        "size of each step: RMS of the image",
-        "share of the image's difference",
-        "share of the gradient's: means",
-        "share of the gradient's: log-scales",
+        "size of each step (RMS of the image)",
+        "share of the difference of the image",
+        "... of the gradient, means",
+        "... of the gradient, log-scales",
     )
     reads = (
         lambda row: row["share"],
@@ -142,16 +153,19 @@ def plot(result: dict, path: Path) -> None:
         for axis, read in zip(row[1:], reads, strict=True):
             bars(axis, places, reports, read)
         for axis, title in zip(row, titles, strict=True):
-            axis.set_title(title, fontsize=11)
             axis.set_xlabel(across)
+            if name == rows[0][0]:
+                axis.set_title(title, fontsize=12)
         row[0].set_ylabel(f"{name}: {SHOWN} to exact", fontsize=13)
     handles = [Patch(color=color, label=LABELS.get(name, name)) for name, color in COLORS.items()]
     handles += [
-        Line2D([], [], color="black", lw=2, label="all of it"),
+        Line2D([], [], color="black", alpha=0.25, lw=6, label="all of it"),
         *(Line2D([], [], color="black", lw=1.2, ls=style, label=label) for _, _, label, style in BEYOND),
     ]
+    note = "Bars: left in the stated order, right in the reverse. Lines: the order in which the step is larger."
+    figure.text(0.5, 0.985, note, ha="center", va="top", fontsize=10)
     figure.legend(handles=handles, ncol=4, loc="lower center", fontsize=10, frameon=False)
-    figure.tight_layout(rect=(0, 0.95 / height, 1, 1))
+    figure.tight_layout(rect=(0, 0.95 / height, 1, 0.98))
     figure.savefig(path, dpi=90)
 
 
@@ -161,7 +175,7 @@ def lines(axis, places: list, reports: list) -> None:
     for name, color in COLORS.items():
         rows = [[r for o in ("forward", "reverse") for r in y["image"][o] if r["rung"] == name] for y in reports]
         axis.plot(x, [max((r["rms"] for r in y), default=0) or np.nan for y in rows], "-o", color=color, ms=3.5, lw=1.6)
-    axis.plot(x, [y["image"]["total"]["rms"] for y in reports], "k-", lw=2)
+    axis.plot(x, [y["image"]["total"]["rms"] for y in reports], color="black", alpha=0.25, lw=6, zorder=1)
     for part, name, _, style in BEYOND:
         if all(part in y for y in reports):
             axis.plot(x, [rms(y[part], "forward", name) for y in reports], color="black", lw=1.2, ls=style)
@@ -201,11 +215,18 @@ def page(result: dict, made: str) -> str:
     parts = [(scene, result[scene], "°") for scene in result["order"]]
     for name, found, unit in [*parts, (f"wolf at {FULL}°, by the image's width", result["widths"], " px")]:
         places = sorted(found, key=int)
-        for start in STARTS if places else ():
-            reports = [found[place][start] for place in places]
-            heads = [f"{place}{unit}" for place in places]
-            sizes = [found[place]["sigma"] for place in places]
-            out += ["", f"### {name}, from `{start}`", "", *summary(heads, reports, sizes)]
+        if not places:
+            continue
+        reports, others = ([found[place][start] for place in places] for start in STARTS)
+        heads, sizes = [f"{place}{unit}" for place in places], [found[place]["sigma"] for place in places]
+        out += [
+            "",
+            f"### {name}, from `{SHOWN}`",
+            "",
+            *summary(heads, reports, sizes),
+            "",
+            *apart(heads, reports, others),
+        ]
     out += ["", f"### Whole reports at {FULL} degrees, from `{SHOWN}`", "", "Pairs: stated order / reverse."]
     for scene in result["order"]:
         if str(FULL) in result[scene]:
@@ -249,6 +270,24 @@ def summary(heads: list[str], reports: list[dict], sizes: list[float]) -> list[s
     return out
 
 
+def apart(heads: list[str], reports: list[dict], others: list[dict]) -> list[str]:
+    """How far the other rasterizer's image shares are from these."""
+    worst = []
+    for head, a, b in zip(heads, reports, others, strict=True):
+        for order in ("forward", "reverse"):
+            rows = [{r["rung"]: r["share"] for r in x["image"][order]} for x in (a, b)]
+            names = rows[0].keys() | rows[1].keys()
+            worst += [(abs(rows[0].get(n, 0.0) - rows[1].get(n, 0.0)), n, head) for n in names]
+    worst.sort(reverse=True)
+    most, name, head = worst[0]
+    sizes = [[x["image"]["total"]["rms"] for x in y] for y in (reports, others)]
+    off = max(abs(b / a - 1) for a, b in zip(*sizes, strict=True))
+    return [
+        f"From `{STARTS[1]}`: every share within {100 * most:.1f} points of these (furthest: {name}, {head}), the RMS "
+        f"within {100 * off:.1f} %; its reports are in benchmarks/ladder.json."
+    ]
+
+
 def rms(part: dict, order: str, name: str) -> float:
     """Of one rung."""
     return next(row["rms"] for row in part[order] if row["rung"] == name)
@@ -277,7 +316,7 @@ def main():
             scene = scene[0], scene[1][:1], scene[2]
         rows[key] = measure(scene, 0 if widths else CROP[name])
         result["made"] = studies.stamp("ladder")
-        studies.write_rows(store, result)
+        write(store, result)
         print(f"{name}, {fov} degrees, {width} pixels: {time.perf_counter() - begin:.0f} s", flush=True)
     found = {**result["scenes"], "widths": result["widths"], "order": [x for x in CROP if result["scenes"].get(x)]}
     plot(found, ROOT / "docs" / "pictures" / "ladder.png")
