@@ -47,7 +47,8 @@ def softplus(x):
 @pytest.mark.parametrize("inside", [False, True])
 def test_single_gaussian_is_the_integral_response(rng, inside):
     """Off axis, rotated, with SH and features; the camera outside or inside of it."""
-    cam, g = scenes_random.camera(rng, (9, 8)), scenes_random.gaussians(rng, n=1, D=2, spread=0.1, scale=0.5, opacity=0.5)
+    cam = scenes_random.camera(rng, (9, 8))
+    g = scenes_random.gaussians(rng, n=1, D=2, spread=0.1, scale=0.5, opacity=0.5)
     if inside:
         g = scenes_random.around_camera(g.replace(log_scales=g.log_scales.detach() + 1), cam)
     with torch.no_grad():
