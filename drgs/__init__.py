@@ -30,6 +30,7 @@ _MODULES = frozenset(
     {
         "cameras",
         "cli",
+        "crossval",
         "data",
         "demo",
         "ellipsoids",
@@ -37,12 +38,14 @@ _MODULES = frozenset(
         "fisher",
         "gain",
         "integrator",
+        "ladder",
         "metrics",
         "reference",
         "runtime",
         "select",
         "settings",
         "sfm",
+        "testing",
         "tiles",
         "train",
     }
