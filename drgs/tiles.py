@@ -1,13 +1,14 @@
 """Which Gaussians a pinhole tile must look at, and the walk of its pixels along that list.
 
-A frame is cut into 8x8-pixel tiles. Every Gaussian is listed in each tile that its screen bounds touch, tiles are
-grouped and ordered by one sort of packed 64-bit keys. `center` order sorts by (depth of the mean, index); `ray` order
-by t* at the tile's center, which walk.py makes exact on each ray.
+A frame is cut into 8x8-pixel tiles. Every Gaussian is listed in each tile of its screen bounds in which a pixel may be
+hit; tiles are grouped and ordered by one sort of packed 64-bit keys. `center` order sorts by (depth of the mean,
+index); `ray` order by t* at the tile's center, which walk.py makes exact on each ray.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import drjit as dr
 
@@ -17,6 +18,7 @@ __all__ = ["TILE", "Lists", "build", "depth_order"]
 
 TILE = 8
 _FAR = 3.0e38
+_NOWHERE = 2**64 - 1
 
 
 @dataclasses.dataclass
@@ -40,13 +42,13 @@ class Lists:
     pairs: int
 
 
-def build(t, projected, settings, width: int, height: int, record=None) -> Lists:
+def build(t, projected, settings, width: int, height: int, record) -> Lists:
     """List the Gaussians of each tile.
 
     Args:
         t: Dr.Jit types.
         projected: `Projected` of the view.
-        record: Flat record buffer; `ray` order only, to sort by t* at the center of each tile.
+        record: Flat record buffer.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     x0, y0, x1, y1 = projected.bounds
@@ -75,16 +77,22 @@ def build(t, projected, settings, width: int, height: int, record=None) -> Lists
         )
     pairs = int(total64)
     start, end = dr.zeros(t.UInt32, columns * rows), dr.zeros(t.UInt32, columns * rows)
+    nothing = Lists(dr.zeros(t.UInt32, 1), start, end, dr.zeros(t.Float, 1), columns, rows, 0)
     if pairs == 0:
-        empty = dr.zeros(t.UInt32, 1)
-        return Lists(empty, start, end, dr.zeros(t.Float, 1), columns, rows, 0)
+        return nothing
     offset = dr.cumsum(amount) - amount
-    keys = dr.zeros(t.UInt64, pairs)
+    keys = dr.full(t.UInt64, _NOWHERE, pairs)
     bits = max(1, (columns * rows - 1).bit_length()), max(1, (count - 1).bit_length())
     box = [dr.gather(t.Int32, b, order) for b in (tx0, tx1, ty0, ty1)]
-    _emit(t, keys, gaussian, amount, offset, box, columns, bits, record if settings.order == "ray" else None)
-    dr.eval(keys)
-    keys = dr.sort(keys)
+    loaded = [dr.gather(t.Float, record, order * layout.RECORD + k) for k in range(layout.EXT2 + 1)]
+    meets = _Meets(t, settings, loaded)
+    _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, settings.order == "ray")
+    # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera.
+    kept = dr.compress(keys != _NOWHERE)
+    pairs = dr.width(kept)
+    if pairs == 0:
+        return nothing
+    keys = dr.sort(dr.gather(t.UInt64, keys, kept))
     if settings.order == "ray":
         tile = t.UInt32(keys >> (64 - bits[0]))
         index = t.UInt32(keys & ((1 << bits[1]) - 1))
@@ -115,22 +123,84 @@ def depth_order(t, key, gaussian):
     return order
 
 
-def _emit(t, keys, gaussian, amount, offset, box, columns, bits, record):
-    """Write the sort key of every (tile, Gaussian) pair."""
+class _Meets:
+    """Whether a tile has a pixel center that may be hit: bounds over the tile of what `kernels.Model` tests.
+
+    Args:
+        t: Dr.Jit types.
+        settings: Of the render.
+        r: The first entries of each lane's record.
+    """
+
+    def __init__(self, t, settings, r):
+        self.t, self.r, self.response = t, r, settings.response
+        self.limit = r[layout.EXT2]
+        if settings.alpha_min > 0:
+            least = -math.log1p(-settings.alpha_min) if self.response == "integral" else settings.alpha_min
+            needed = 2 * dr.log(r[layout.ALPHA] / dr.opaque(t.Float, least))
+            self.limit = dr.minimum(self.limit, needed + 1e-4 * abs(needed) + 1e-4)
+
+    def center(self, x, y):
+        """Of tile (x, y), from the anchor."""
+        t, r = self.t, self.r
+        return (t.Float(x) + 0.5) * TILE - r[layout.AX], (t.Float(y) + 0.5) * TILE - r[layout.AY]
+
+    def direction(self, dx, dy):
+        """The three parts of d' there."""
+        L, r = layout, self.r
+        return [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
+
+    def depth(self, dx, dy):
+        """t* there, at least 0: orders the list, decides nothing."""
+        L, r = layout, self.r
+        d = self.direction(dx, dy)
+        along = dr.fma(r[L.H1], d[0], dr.fma(r[L.H2], d[1], r[L.H3] * d[2]))
+        depth = along * dr.rcp(dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2])))
+        return dr.select(depth > 0, dr.minimum(depth, _FAR), 0)
+
+    def __call__(self, dx, dy):
+        """False only where rho^2 <= limit has no solution in the tile, or (`peak`) all of it is behind the camera."""
+        L, r, half = layout, self.r, 0.5 * (TILE - 1)
+
+        def least(a, b, c):  # of |a x + b y + c| over the tile, rounding taken off
+            parts = a * dx, b * dy, c
+            rounding = 1e-6 * (abs(parts[0]) + abs(parts[1]) + abs(c))
+            return dr.maximum(abs(parts[0] + parts[1] + parts[2]) - half * (abs(a) + abs(b)) - rounding, 0)
+
+        m1, m2 = least(r[L.R11], r[L.R12], r[L.R13]), least(r[L.R21], r[L.R22], r[L.R23])
+        outside = dr.fma(m1, m1, m2 * m2)
+        if self.response == "ewa":
+            return ~(outside > 1.0001 * self.limit)
+        d = self.direction(dx, dy)
+        slopes = (r[L.E2], r[L.E3]), (r[L.E4], r[L.E5]), (0.0, r[L.E6])
+        most = [abs(v) + half * (abs(a) + abs(b)) for v, (a, b) in zip(d, slopes, strict=True)]
+        length2 = dr.fma(most[0], most[0], dr.fma(most[1], most[1], most[2] * most[2]))
+        met = ~(outside > 1.0001 * self.limit * length2)
+        if self.response == "peak":
+            h = r[L.H1], r[L.H2], r[L.H3]
+            along = [a * b for a, b in zip(h, d, strict=True)]
+            rise = [sum(a * b[k] for a, b in zip(h, slopes, strict=True)) for k in range(2)]
+            rounding = 1e-6 * sum(abs(x) for x in along)
+            met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
+        return met
+
+
+def _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, by_depth):
+    """Write the sort key of every (tile, Gaussian) pair that may have a hit."""
     x0, x1, y0, _ = box
     tile_bits, index_bits = bits
     depth_bits = 64 - tile_bits - index_bits
 
     def body(k, x, y):
         tile = t.UInt32(y * columns + x)
-        if record is None:
-            key = (t.UInt64(tile) << 32) | t.UInt64(gaussian)
-        else:
-            depth = _center_depth(t, record, gaussian, x, y, k < amount)
-            quantized = t.UInt64(dr.reinterpret_array(t.UInt32, depth))
+        dx, dy = meets.center(x, y)
+        if by_depth:
+            quantized = t.UInt64(dr.reinterpret_array(t.UInt32, meets.depth(dx, dy)))
             quantized = quantized >> (31 - depth_bits) if depth_bits < 31 else quantized << (depth_bits - 31)
             key = (t.UInt64(tile) << (64 - tile_bits)) | (quantized << index_bits) | t.UInt64(gaussian)
-        dr.scatter(keys, key, offset + k)
+        else:
+            key = (t.UInt64(tile) << 32) | t.UInt64(gaussian)
+        dr.scatter(keys, key, offset + k, meets(dx, dy))
         wrap = x >= x1
         return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)
 
@@ -138,18 +208,7 @@ def _emit(t, keys, gaussian, amount, offset, box, columns, bits, record):
         dr.while_loop(
             (dr.zeros(t.UInt32, dr.width(gaussian)), t.Int32(x0), t.Int32(y0)), lambda k, x, y: k < amount, body
         )
-
-
-def _center_depth(t, record, gaussian, x, y, active):
-    """t* on the ray through the center of tile (x, y), at least 0: orders the list, decides nothing."""
-    r = [dr.gather(t.Float, record, gaussian * layout.RECORD + k, active) for k in range(layout.H3 + 1)]
-    dx, dy = (t.Float(x) + 0.5) * TILE - r[layout.AX], (t.Float(y) + 0.5) * TILE - r[layout.AY]
-    d1 = dr.fma(r[layout.E2], dx, dr.fma(r[layout.E3], dy, 1))
-    d2 = dr.fma(r[layout.E4], dx, r[layout.E5] * dy)
-    d3 = r[layout.E6] * dy
-    along = dr.fma(r[layout.H1], d1, dr.fma(r[layout.H2], d2, r[layout.H3] * d3))
-    depth = along * dr.rcp(dr.fma(d1, d1, dr.fma(d2, d2, d3 * d3)))
-    return dr.select(depth > 0, dr.minimum(depth, _FAR), 0)
+    dr.eval(keys)
 
 
 def _suffix_minimum(t, values, start, end):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scenes_random import around_camera, camera, gaussians
 
-from drgs import reference, runtime
+from drgs import reference, runtime, tiles
 from drgs.integrator import render
 from drgs.scene import Scene, to_drjit
 from drgs.settings import RenderSettings
@@ -146,3 +146,56 @@ def test_too_many_pairs():
     cam, g = camera(rng, (2**15, 2**15)), gaussians(rng, 300, 1, scale=1e3)
     with pytest.raises(ValueError, match="fewer than 2\\^32 entries.*lower extent or image size"):
         _scene(g, cam, RenderSettings())
+
+
+_CUT = {"alpha_min": 1 / 255, "transmittance_min": 1e-4}
+
+
+@pytest.mark.parametrize("anisotropy", [0.5, 2.5])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"order": "ray"},
+        {"order": "ray", **_CUT},
+        {"response": "integral", "order": "ray"},
+        {"response": "integral", **_CUT},
+        {"response": "ewa", "dilation": 0.3},
+        {"response": "ewa", "dilation": 0.3, "culling": "gsplat", "fov_clamp": "gsplat", **_CUT},
+        {"extent": 3.0},
+    ],
+    ids=lambda f: "-".join(map(str, f.values())),
+)
+def test_tiles_left_out_change_nothing(rng, monkeypatch, fields, anisotropy):
+    """Listing a Gaussian only where a pixel may be hit gives the same bits as listing it in its whole box."""
+    settings, pairs = RenderSettings(**fields), []
+    for _ in range(3):
+        cam = camera(rng, (61, 45))
+        g = around_camera(gaussians(rng, 40, 4, scale=0.1, anisotropy=anisotropy, opacity=2.5), cam)
+        images = []
+        for whole in (False, True):
+            with monkeypatch.context() as patch:
+                if whole:
+                    patch.setattr(tiles._Meets, "__call__", lambda self, dx, dy: self.t.Bool(True))
+                out = render(g.detach(), cam, settings, outputs=("count", "depth"))
+                images.append(
+                    torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None], out.count[..., None]], -1)
+                )
+                pairs.append(out.certificate["pairs"])
+        assert torch.equal(*images)
+    assert sum(pairs[::2]) < sum(pairs[1::2])
+
+
+def test_a_gaussian_behind_the_camera_is_listed_where_it_reaches(rng):
+    """What crosses the camera plane has the whole screen for its box, and few tiles that it can be seen in."""
+    cam = camera(rng, (320, 240), turn=0.0)
+    g = gaussians(rng, 50, 1).detach()
+    c2w = torch.tensor(cam.c2w)
+    local = torch.tensor(np.stack([rng.uniform(3, 4, 50), rng.uniform(3, 4, 50), rng.uniform(-0.5, 0.5, 50)], 1))
+    g.means[:] = (local @ c2w[:3, :3].T + c2w[:3, 3]).float()
+    g.log_scales[:] = math.log(0.3)
+    settings = RenderSettings(extent=3.0)
+    projected, lists = _scene(g, cam, settings)
+    tiles_of_screen = lists.columns * lists.rows
+    full = np.asarray(projected.alive.numpy()).sum()
+    assert full > 20
+    assert lists.pairs < 0.1 * full * tiles_of_screen
