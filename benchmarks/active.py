@@ -77,7 +77,7 @@ def row_of(folder: Path, name: str, label: str, seed: int) -> dict:
         "seconds": metrics["seconds"],
         "pick seconds": float(np.mean([pick["seconds"] for pick in picks])),
         "picks": [pick["index"] for pick in picks],
-        "commit": studies.commit(),
+        "commit": json.loads((folder / "env.json").read_text())["commit"][:7],
     }
 
 

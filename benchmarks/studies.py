@@ -31,7 +31,6 @@ __all__ = [
     "SCALES",
     "SCENES",
     "base",
-    "commit",
     "dataset",
     "interval",
     "rank_correlation",
@@ -117,17 +116,12 @@ def interval(values, draws: int = 10_000) -> tuple[float, float, float]:
     return float(values.mean()), float(np.quantile(means, 0.025)), float(np.quantile(means, 0.975))
 
 
-def commit() -> str:
-    """Of this checkout."""
-    head = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    return head.stdout.strip()
-
-
 def stamp(script: str) -> str:
     """Where and when a study ran."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     return (
         f"`python benchmarks/{script}.py`, {runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
-        f"{runtime.backend().variant}, {datetime.date.today().isoformat()}, commit {commit()}."
+        f"{runtime.backend().variant}, {datetime.date.today().isoformat()}, commit {commit.stdout.strip()}."
     )
 
 
