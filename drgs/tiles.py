@@ -1,8 +1,8 @@
 """Which Gaussians a pinhole tile must look at, and the walk of its pixels along that list.
 
-A frame is cut into 8x8-pixel tiles. Every Gaussian is listed in each tile of its screen bounds in which a pixel may be
-hit; tiles are grouped and ordered by one sort of packed 64-bit keys. `center` order sorts by (depth of the mean,
-index); `ray` order by t* at the tile's center, which walk.py makes exact on each ray.
+A frame is cut into 8x8-pixel tiles. Every Gaussian is listed in each tile of its screen bounds, where these are large
+only in those in which a pixel may be hit; tiles are grouped and ordered by one sort of packed 64-bit keys. `center`
+order sorts by (depth of the mean, index); `ray` order by t* at the tile's center, which walk.py makes exact.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ __all__ = ["TILE", "Lists", "build", "depth_order"]
 TILE = 8
 _FAR = 3.0e38
 _NOWHERE = 2**64 - 1
+_LARGE = 8  # tiles of a box, in the mean
 
 
 @dataclasses.dataclass
@@ -82,17 +83,21 @@ def build(t, projected, settings, width: int, height: int, record) -> Lists:
         return nothing
     offset = dr.cumsum(amount) - amount
     keys = dr.full(t.UInt64, _NOWHERE, pairs)
+    # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera. Small
+    # boxes hold few, and looking for them costs more than they do.
+    large = pairs > _LARGE * int(dr.sum(dr.select(seen, t.UInt32(1), 0))[0])
     bits = max(1, (columns * rows - 1).bit_length()), max(1, (count - 1).bit_length())
     box = [dr.gather(t.Int32, b, order) for b in (tx0, tx1, ty0, ty1)]
     loaded = [dr.gather(t.Float, record, order * layout.RECORD + k) for k in range(layout.EXT2 + 1)]
     meets = _Meets(t, settings, loaded)
-    _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, settings.order == "ray")
-    # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera.
-    kept = dr.compress(keys != _NOWHERE)
-    pairs = dr.width(kept)
-    if pairs == 0:
-        return nothing
-    keys = dr.sort(dr.gather(t.UInt64, keys, kept))
+    _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, large, settings.order == "ray")
+    if large:
+        kept = dr.compress(keys != _NOWHERE)
+        pairs = dr.width(kept)
+        if pairs == 0:
+            return nothing
+        keys = dr.gather(t.UInt64, keys, kept)
+    keys = dr.sort(keys)
     if settings.order == "ray":
         tile = t.UInt32(keys >> (64 - bits[0]))
         index = t.UInt32(keys & ((1 << bits[1]) - 1))
@@ -185,8 +190,8 @@ class _Meets:
         return met
 
 
-def _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, by_depth):
-    """Write the sort key of every (tile, Gaussian) pair that may have a hit."""
+def _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, large, by_depth):
+    """Write the sort key of every (tile, Gaussian) pair; of those that may have a hit, if boxes are `large`."""
     x0, x1, y0, _ = box
     tile_bits, index_bits = bits
     depth_bits = 64 - tile_bits - index_bits
@@ -200,7 +205,7 @@ def _emit(t, keys, gaussian, amount, offset, box, columns, bits, meets, by_depth
             key = (t.UInt64(tile) << (64 - tile_bits)) | (quantized << index_bits) | t.UInt64(gaussian)
         else:
             key = (t.UInt64(tile) << 32) | t.UInt64(gaussian)
-        dr.scatter(keys, key, offset + k, meets(dx, dy))
+        dr.scatter(keys, key, offset + k, meets(dx, dy) if large else True)
         wrap = x >= x1
         return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)
 
