@@ -46,7 +46,8 @@ class Model:
         sh_degree: Bands above it are left out.
         sh_sign: Coefficients whose sign is turned: `none`, `odd m` (a basis without the factor (-1)^m), or a band.
         channels: Order of the color channels of the image, or of the Gaussians' colors alone (`bgr, not behind`).
-        transfer: `none`, or `sRGB to linear`: applied to the finished image.
+        transfer: `none`, or `sRGB to linear`: applied to the finished image, or to what is in front of the background
+            (`sRGB to linear, not behind`).
         pixel_center: Of column 0 and row 0.
         flip: `none`, `vertical`, `horizontal`.
         pose: `w2c`, or `c2w`: how the camera matrix is read.
@@ -86,7 +87,10 @@ class Model:
         if self.channels in _ORDERS:
             image = image[..., ["rgb".index(c) for c in self.channels]]
         if self.transfer != "none":
-            image = torch.where(image <= 0.04045, image / 12.92, ((image.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+            behind = 0.0
+            if self.transfer.endswith("behind"):
+                behind = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
+            image = _linear(image - behind) + behind
         if self.flip != "none":
             axis = ("vertical", "horizontal").index(self.flip)
             image, alpha = image.flip(axis), alpha.flip(axis)
@@ -183,6 +187,11 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
     return ratio.clamp_min(floor).sqrt()
 
 
+def _linear(x: torch.Tensor) -> torch.Tensor:
+    """Linear light of sRGB values."""
+    return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
 def _rotation(quats: torch.Tensor) -> torch.Tensor:
     """(N, 3, 3) of quaternions wxyz of any length."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
@@ -227,7 +236,7 @@ _VARIATIONS: dict[str, tuple[str, tuple, tuple]] = {
     "flip": ("image axes", _ALL, ("none", "vertical", "horizontal")),
     "pose": ("camera matrix", _ALL, ("w2c", "c2w")),
     "channels": ("channel order", ("sh",), (*_ORDERS, *(f"{order}, not behind" for order in _ORDERS[1:]))),
-    "transfer": ("transfer function", ("sh",), ("none", "sRGB to linear")),
+    "transfer": ("transfer function", ("sh",), ("none", "sRGB to linear", "sRGB to linear, not behind")),
     "direction": ("SH direction", ("means", "sh"), ("to the mean", "to the camera", "camera frame")),
     "sh_direction": ("SH direction", ("means", "sh"), ("gaussian", "ray")),
     "sh_degree": ("SH bands", ("sh",), (0, 1, 2, 3)),

@@ -96,11 +96,13 @@ def random_scene(
     logits = 1.5 * rng.normal(size=count)
     opaque, near, behind = count // 3, count // 8, max(2, count // 15)
     logits[:opaque] = rng.uniform(3, 5, opaque)
-    # Clamped alpha needs a center within a tenth of sigma of a pixel's.
+    # Clamped alpha needs a center within a tenth of sigma of a pixel's, and not on it: there its slope is 0.
+    turn, sigma = rng.uniform(0, 2 * np.pi, near), 2.5
     pixel = np.floor(rng.uniform((4, 4), (width - 4, height - 4), (near, 2))) + 0.5
+    pixel += 0.03 * sigma * np.stack([np.cos(turn), np.sin(turn)], 1)
     depth = rng.uniform(1.5, 1.9, near)
     local[:near] = depth[:, None] * np.concatenate([(pixel - K[:, 2]) / K[[0, 1], [0, 1]], np.ones((near, 1))], 1)
-    log_scales[:near] = np.log(2.5 * depth[:, None] / focal) + 0.2 * rng.normal(size=(near, 3))
+    log_scales[:near] = np.log(sigma * depth[:, None] / focal) + 0.2 * rng.normal(size=(near, 3))
     logits[:near] = rng.uniform(8, 10, near)
     local[count - behind :, 2] *= -0.5
     c2w = camera.c2w
