@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 from drgs import rasterizers, runtime
@@ -25,21 +26,20 @@ def run(args: Crossval) -> int:
     from drgs.report import html
 
     g, fields, cameras, source = seen_views(args)
-    background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
     if args.export is not None:
+        background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
         rasterizers.export(args.export, g, cameras, background, args.seed)
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0
-    rasterizer = rasterizers.load(args.rasterizer, g, cameras, background)
+    rasterizer = rasterizers.load(args.rasterizer, g, cameras, fields)
     make_folder(args.output)
     with Bar("crossval", _STAGES, not args.quiet) as bar:
+        done = itertools.count()
 
         def advance(stage: str) -> None:
-            bar.update(advance.done, _STAGES, stage)
-            advance.done += 1
+            bar.update(next(done), _STAGES, stage)
 
-        advance.done = 0
         result = crossval(rasterizer, g, cameras, args.preset, fields, seed=args.seed, advance=advance)
         report = {"schema": SCHEMA, "command": "crossval", "scene": str(args.scene), "source": source} | result.report
         table = ""

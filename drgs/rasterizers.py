@@ -98,7 +98,7 @@ def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
     return raw
 
 
-def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, background: tuple = (0, 0, 0)):
+def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, fields: dict | None = None):
     """A rasterizer by its name.
 
     Args:
@@ -107,20 +107,22 @@ def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = N
             file .npz or .safetensors with `image` (C,H,W,3), `alpha` (C,H,W), `cotangent` (C,H,W,3), `grad_means`,
             `grad_quats`, `grad_log_scales`, `grad_logit_opacities`, `grad_sh` (of raw parameters), and the arrays of
             the scene as `export` wrote them (C = 1 may be left out).
-        g, cameras, background: What a dump must be of.
+        g, cameras: What a dump must be of.
+        fields: Settings that hold whatever the preset is: ours are drawn with them, a dump is of their background.
     Returns:
         A `Rasterizer` or a `Dump`.
     Raises:
         ValueError: If there is no such rasterizer, or a dump is damaged or of another scene; one line.
     """
+    fields = fields or {}
     if Path(text).suffix in _DUMPS:
-        return _dump(Path(text), g, cameras, background)
+        return _dump(Path(text), g, cameras, tuple(fields.get("background", (0.0, 0.0, 0.0))))
     if text.startswith("drgs:"):
         name = text.removeprefix("drgs:")
         preset = "gsplat" if name == "ewa" else name
         if preset not in PRESETS:
             raise ValueError(f"--rasterizer {text}: must be drgs:ewa or drgs: and one of {', '.join(PRESETS)}")
-        return ours(RenderSettings.preset(preset), text, preset)
+        return ours(RenderSettings.preset(preset, **fields), text, preset)
     if text == "gsplat":
         try:
             from gsplat import rasterization

@@ -56,7 +56,7 @@ def assert_matches(
     results = []
     for g, views in scenes:
         if isinstance(rasterizer, str):
-            made = load(rasterizer, g, views, background)
+            made = load(rasterizer, g, views, {"background": background})
         else:
             made = function(rasterizer, getattr(rasterizer, "__name__", "rasterizer"))
         result = crossval(made, g, views, preset, {"background": background}, **options)

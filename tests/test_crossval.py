@@ -204,6 +204,20 @@ def test_our_own_presets_agree_with_the_oracle(preset):
     assert result.report["preset"] == preset
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [{"response": "integral"}, {"order": "center", "extent": 3.0}, {"traversal": "bvh", "sh_direction": "ray"}],
+    ids=lambda f: next(iter(f)),
+)
+def test_settings_hold_for_both_sides(fields):
+    """What --set says changes the rasterizer of ours and the oracle alike."""
+    g, cameras = random_scene(2, count=40, width=32, height=24)
+    fields = {"background": BACKGROUND, **fields}
+    result = crossval(rasterizers.load("drgs:exact", fields=fields), g, cameras, "exact", fields)
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert result.model.settings.background == BACKGROUND
+
+
 def test_assert_matches():
     """The helper for other people's tests passes what is right, and says what is wrong."""
     results = assert_matches(torch_rasterizer.rasterization, preset="gsplat", seeds=(0, 1))
