@@ -12,8 +12,8 @@ from drgs.render_command import make_folder
 from drgs.viewpoints import seen_views
 
 if TYPE_CHECKING:
-    from drgs.cli import Crossval
     from drgs.crossval import Result
+    from drgs.options import Crossval
 
 __all__ = ["run"]
 

@@ -25,9 +25,9 @@ from drgs.progress import Bar
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.cli import Demo
     from drgs.ellipsoids import Gaussians
     from drgs.frames import Frame
+    from drgs.options import Demo
 
 __all__ = ["Plan", "make_demo", "run"]
 

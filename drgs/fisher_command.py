@@ -24,9 +24,9 @@ from drgs.viewpoints import evenly, known_views, other_views, scene_of
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.cli import Fisher
     from drgs.fisher import Information
     from drgs.gain import Prior
+    from drgs.options import Fisher
     from drgs.viewpoints import Scene
 
 __all__ = ["map_weights", "run"]

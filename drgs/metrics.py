@@ -17,9 +17,9 @@ from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.pictures import file_names, write_png
 
 if TYPE_CHECKING:
-    from drgs.cli import Eval
     from drgs.ellipsoids import Gaussians
     from drgs.frames import Frame
+    from drgs.options import Eval
     from drgs.settings import RenderSettings
 
 __all__ = [

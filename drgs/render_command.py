@@ -24,9 +24,9 @@ from drgs.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.cli import Crossval, Render, Tradeoff
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
+    from drgs.options import Crossval, Render, Tradeoff
     from drgs.settings import RenderSettings
 
 __all__ = [

@@ -12,8 +12,8 @@ from drgs.render_command import described, make_folder
 from drgs.viewpoints import known_views, other_views, scene_of
 
 if TYPE_CHECKING:
-    from drgs.cli import Select
     from drgs.greedy import Selection
+    from drgs.options import Select
 
 __all__ = ["print_table", "run"]
 

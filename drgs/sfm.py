@@ -15,7 +15,7 @@ from drgs.data.checks import image_size, list_images
 from drgs.progress import Bar
 
 if TYPE_CHECKING:
-    from drgs.cli import Sfm
+    from drgs.options import Sfm
 
 __all__ = ["SfmSummary", "run_command", "run_sfm"]
 

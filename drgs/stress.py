@@ -24,9 +24,9 @@ from drgs.progress import Bar
 if TYPE_CHECKING:
     from drgs.accuracy import Oracle
     from drgs.cameras import Camera
-    from drgs.cli import Stress
     from drgs.ellipsoids import Gaussians
     from drgs.extremes import Case
+    from drgs.options import Stress
     from drgs.refusals import Refusal
 
 __all__ = ["BOUNDS", "COLUMNS", "Row", "Truth", "markdown", "measure", "refused", "rows", "run", "truth_of"]

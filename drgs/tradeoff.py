@@ -34,7 +34,7 @@ from drgs.tradeoff_measure import measure
 from drgs.viewpoints import seen_views
 
 if TYPE_CHECKING:
-    from drgs.cli import Tradeoff
+    from drgs.options import Tradeoff
 
 __all__ = ["USES", "VARIANTS", "Variant", "recommend", "run"]
 

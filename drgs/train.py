@@ -29,9 +29,9 @@ from drgs.pictures import write_png
 from drgs.trainer import FitConfig, Trainer
 
 if TYPE_CHECKING:
-    from drgs.cli import Fit
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
+    from drgs.options import Fit
 
 __all__ = ["FitConfig", "FitResult", "Trainer", "fit", "run_fit"]
 

@@ -20,9 +20,9 @@ from drgs.render_command import cameras_of, is_camera_list, load_scene, run_back
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.cli import Crossval, Fisher, Select, Tradeoff
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
+    from drgs.options import Crossval, Fisher, Select, Tradeoff
 
 __all__ = ["Known", "Scene", "dome", "evenly", "known_views", "other_views", "scene_of", "seen_views"]
 

@@ -97,7 +97,7 @@ def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
 
 def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys):
     """`drgs eval` measures from the files what `fit` measured."""
-    from drgs.cli import Eval
+    from drgs.options import Eval
 
     result = fit(dataset, tmp_path / "run", config(max_steps=5), progress=False)
     monkeypatch.setattr("drgs.data.load", lambda path, **_: dataset)
