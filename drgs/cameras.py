@@ -20,11 +20,8 @@ Conventions, stated once for the whole project:
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,10 +41,8 @@ __all__ = [
     "c2w_to_opengl",
     "intrinsics",
     "intrinsics_from_fov",
-    "load_cameras_json",
     "look_at",
     "orbit",
-    "save_cameras_json",
 ]
 
 _OPENCV_LENGTHS = (4, 5, 8)
@@ -353,83 +348,6 @@ def orbit(
         outward = np.cos(rise) * (np.cos(turn) * first + np.sin(turn) * second) + np.sin(rise) * axis
         w2c = look_at(center + radius * outward, center, axis)
         cameras.append(Camera(K=K, w2c=w2c, width=width, height=height, name=f"orbit_{index:04d}"))
-    return cameras
-
-
-# -------------------------------------------------- files
-
-
-def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
-    """Write cameras in INRIA's ``cameras.json`` layout, with cx and cy added; atomically.
-
-    Raises:
-        ValueError: a camera is distorted or skewed (the layout has no room for that).
-    """
-    entries = []
-    for index, camera in enumerate(cameras):
-        if camera.is_distorted or camera.K[0, 1] != 0.0:
-            raise ValueError(
-                f"{path}: cameras.json holds pinhole cameras without skew, camera {index} "
-                f"({camera.name!r}) is not one; "
-                "use camera.undistorted()"
-            )
-        c2w = camera.c2w
-        entries.append(
-            {
-                "id": index,
-                "img_name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "position": c2w[:3, 3].tolist(),
-                "rotation": c2w[:3, :3].tolist(),
-                "fx": float(camera.K[0, 0]),
-                "fy": float(camera.K[1, 1]),
-                "cx": float(camera.K[0, 2]),
-                "cy": float(camera.K[1, 2]),
-            }
-        )
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(entries, indent=1))
-    partial.replace(path)
-
-
-def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
-    """Read cameras in INRIA's layout: a list of id, img_name, width, height, position, rotation
-    (c2w), fx, fy[, cx, cy].
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not that layout, or a camera that cannot be; names the first one.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a cameras.json file, found none; check the path")
-    try:
-        entries = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
-    if not isinstance(entries, list) or not entries:
-        raise ValueError(
-            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see INRIA's layout"
-        )
-    cameras = []
-    for index, entry in enumerate(entries):
-        try:
-            w, h = entry["width"], entry["height"]
-            K = intrinsics(entry["fx"], entry["fy"], entry.get("cx", w / 2), entry.get("cy", h / 2))
-            c2w = np.eye(4)
-            c2w[:3, :3], c2w[:3, 3] = entry["rotation"], entry["position"]
-            # The rotation's transpose stands for its inverse; Camera refuses what is not a
-            # rotation.
-            w2c = np.eye(4)
-            w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
-            name = str(entry.get("img_name", entry.get("id", index)))
-            cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name))
-        except KeyError as error:
-            raise ValueError(f"{path}: camera {index} must have the key {error}, found none; add it") from None
-        except (TypeError, AttributeError, ValueError) as error:
-            raise ValueError(f"{path}: camera {index}: {error}") from None
     return cameras
 
 

@@ -17,7 +17,7 @@ import torch
 
 import drgs
 from drgs import pictures, runtime
-from drgs.cameras import load_cameras_json, save_cameras_json
+from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.orbits import UP, capture_orbit, scene_orbit
 from drgs.progress import Bar

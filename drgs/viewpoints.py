@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.active import at_most, fitted_views, resized_alike
-from drgs.cameras import Camera, load_cameras_json, orbit
+from drgs.camera_lists import load_cameras_json
+from drgs.cameras import Camera, orbit
 from drgs.files import Run
 from drgs.orbits import UP, capture_orbit, scene_orbit
 from drgs.render_command import cameras_of, is_camera_list, load_scene, run_background

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drgs import runtime
+from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.cameras import (
     Camera,
     c2w_from_llff,
@@ -18,10 +19,8 @@ from drgs.cameras import (
     c2w_to_opengl,
     intrinsics,
     intrinsics_from_fov,
-    load_cameras_json,
     look_at,
     orbit,
-    save_cameras_json,
 )
 
 POSE = look_at((1.0, 2.0, 3.0), (0.2, -0.1, 0.3))

@@ -16,7 +16,8 @@ from torch_rasterizer import DEFECTS
 
 import drgs
 from drgs import cli, rasterizers
-from drgs.cameras import Camera, save_cameras_json
+from drgs.camera_lists import save_cameras_json
+from drgs.cameras import Camera
 from drgs.crossval import crossval
 from drgs.differences import central
 from drgs.ellipsoids import Gaussians

@@ -11,7 +11,8 @@ import torch
 from test_active import SIZE, config, lazily, plan, write_still
 
 from drgs import cli, fisher
-from drgs.cameras import Camera, load_cameras_json, look_at, orbit, save_cameras_json
+from drgs.camera_lists import load_cameras_json, save_cameras_json
+from drgs.cameras import Camera, look_at, orbit
 from drgs.data import load
 from drgs.files import load_ply, load_state, save_ply
 from drgs.fisher_command import map_weights

@@ -12,7 +12,8 @@ import torch
 
 import drgs
 from drgs import cli, orbits, pictures
-from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit, save_cameras_json
+from drgs.camera_lists import load_cameras_json, save_cameras_json
+from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.files import save_ply
 
 N = 60
@@ -76,7 +77,7 @@ def test_files_hold_the_render(scene, gaussians, camera, tmp_path, capsys):
     assert report["rays"] == 24 * 16
     assert report["redone"] == truth.certificate["redone"]
     assert report["views"][0]["seconds"] > 0
-    again = drgs.cameras.load_cameras_json(out / "cameras.json")
+    again = load_cameras_json(out / "cameras.json")
     np.testing.assert_allclose(again[0].w2c, camera.w2c, atol=1e-12)
     assert "exact order:" in capsys.readouterr().out
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
@@ -166,7 +167,7 @@ def test_data_set_split_limit_and_size(scene, tmp_path):
     assert cli.main([*command, "--split", "test", "-o", str(tmp_path / "test")]) == 0
     assert sorted(path.name for path in (tmp_path / "test").glob("*.png")) == ["00.png", "08.png"]
     assert cli.main([*command, "--limit", "3", "-o", str(tmp_path / "few")]) == 0
-    made = drgs.cameras.load_cameras_json(tmp_path / "few" / "cameras.json")
+    made = load_cameras_json(tmp_path / "few" / "cameras.json")
     assert [(c.width, c.height) for c in made] == [(12, 8)] * 3
 
 

@@ -10,7 +10,8 @@ from test_active import SIZE, config, lazily, plan, write_still
 
 import drgs
 from drgs import cli, fisher
-from drgs.cameras import Camera, look_at, orbit, save_cameras_json
+from drgs.camera_lists import save_cameras_json
+from drgs.cameras import Camera, look_at, orbit
 from drgs.data import load
 from drgs.files import Run, load_ply, save_ply
 from drgs.gain import Prior, information_gain

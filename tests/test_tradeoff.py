@@ -11,7 +11,8 @@ import torch
 from scenes_random import gaussians
 
 from drgs import cli, fisher, reference, tradeoff
-from drgs.cameras import load_cameras_json, orbit, save_cameras_json
+from drgs.camera_lists import load_cameras_json, save_cameras_json
+from drgs.cameras import orbit
 from drgs.files import load_ply, save_ply
 from drgs.integrator import render
 from drgs.settings import RenderSettings
