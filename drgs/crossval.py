@@ -166,6 +166,8 @@ def crossval(
     found = conventions.find(pictures[first], raw, cameras[first], starts, oracle, _SETTLED[dtype])
     model = found.model
     drawn = [_drawn(model, raw, camera, oracle) for camera in cameras]
+    if not any(bool(alpha.any()) for _, alpha in drawn):
+        raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     views = [_image_row(c, a, b, s, t) for c, a, b, (s, t) in zip(cameras, pictures, alphas, drawn, strict=True)]
     agrees = all(row["rms"] <= _IMAGE and row["share"] <= _FEW for row in views)
     if agrees and not isinstance(rasterizer, Dump):

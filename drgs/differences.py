@@ -148,7 +148,7 @@ def _extrapolated(sums: list[float], bars: list[float]) -> tuple[float | None, f
     value, error, k = best
     if error <= 1e-3 * abs(value) or all(gap <= 4 * bar for gap, bar in zip(gaps, bars[1:], strict=True)):
         return value, error  # settled, or below rounding on all steps
-    ratios = [math.log2(a / b) for a, b, bar in zip(gaps, gaps[1:], bars[2:], strict=False) if b > 4 * bar]
+    ratios = [math.log2(max(a, 1e-300) / b) for a, b, bar in zip(gaps, gaps[1:], bars[2:], strict=False) if b > 4 * bar]
     if ratios and all(1.5 <= ratio <= 2.5 for ratio in ratios):
         return value, error
     return None, math.inf

@@ -19,7 +19,7 @@ from drgs import cli, rasterizers
 from drgs.camera_lists import save_cameras_json
 from drgs.cameras import Camera
 from drgs.crossval import crossval
-from drgs.differences import central
+from drgs.differences import _extrapolated, central
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, save_ply
 from drgs.orbits import UP, scene_orbit
@@ -193,6 +193,34 @@ def test_central_differences(dtype):
         size = own.values[name].abs().max()
         assert (error <= own.uncertainty[name] + 1e-5 * size).double().mean() >= 0.8
         assert error.max() <= (1e-5 if dtype == torch.float64 else 5e-3) * size, name
+
+
+def test_extrapolation():
+    """Differences that converge with h^2 give a value, others none."""
+    smooth = [3 + 0.5 * h * h for h in (0.4, 0.2, 0.1, 0.05)]
+    value, error = _extrapolated(smooth, [1e-12] * 4)
+    assert abs(value - 3) <= error + 1e-9
+    assert error < 2e-3
+    assert _extrapolated([3 + 0.5 * h for h in (0.4, 0.2, 0.1, 0.05)], [1e-12] * 4)[0] is None
+    assert _extrapolated([1.0, 1.1, 2.0, 4.0], [1e-12] * 4)[0] is None
+    assert _extrapolated([0.0, 0.0, 0.0, 0.0], [1e-12] * 4) == (0.0, 1e-12)
+
+
+def test_a_model_beside_another():
+    """A rasterizer that is far from what it claims is another model, or undecided; no bug is made up."""
+    g, cameras = random_scene(0, count=40, width=32, height=24)
+    result = crossval(rasterizers.load("drgs:inria"), g, cameras, "exact", {"background": BACKGROUND})
+    assert result.verdict in ("model difference", "undecided"), "\n".join(result.lines())
+
+
+def test_cameras_that_show_nothing():
+    """Nothing is compared where there is nothing to see."""
+    g, (camera,) = random_scene(0, count=40, width=32, height=24)
+    w2c = np.diag([-1.0, 1, -1, 1]) @ np.array(camera.w2c)
+    w2c[2, 3] -= 1000
+    away = dataclasses.replace(camera, w2c=w2c)
+    with pytest.raises(ValueError, match="must show Gaussians"):
+        crossval(function(torch_rasterizer.rasterization, "correct"), g, [away], "gsplat")
 
 
 @pytest.mark.parametrize("preset", ["exact", "fast", "inria", "gsplat"])
