@@ -20,6 +20,7 @@ __all__ = ["Differences", "central"]
 _STEPS = 4  # each half of the one before
 _FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # in units of what changes the image by its own size
 _EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # of an image: rounding, and of float32 renderers in general
+_LEFT = 0.5  # of the pixels that an entry changes must be kept
 _JUMP = 0.05  # of the largest slope in the image: what no smooth change of half a step reaches
 
 
@@ -31,7 +32,7 @@ class Differences:
         entries: Group -> list of flat indices that converged.
         values: Group -> central differences there of <cotangent, image>, over the pixels that are kept.
         uncertainty: Group -> error bars of `values`.
-        left_out: Group -> number of entries that did not converge.
+        left_out: Group -> number of entries that did not converge, or lost most of their pixels.
         kept: (H, W) bool, pixels that no step made jump.
     """
 
@@ -81,7 +82,11 @@ def central(
     for group, indices in entries.items():
         for index, found, used in zip(indices, slopes[group], steps[group], strict=True):
             sums = [float((weight * x).sum()) for x in found]
-            touched = int(((found[-1] != 0) & kept[..., None]).sum())
+            changed = found[-1] != 0
+            touched = int((changed & kept[..., None]).sum())
+            if touched < _LEFT * int(changed.sum()):  # what is left says nothing about this entry
+                left_out[group] += 1
+                continue
             # Each pixel's rounding is divided by the step; random signs add up as a square root.
             bar = [noise * math.sqrt(max(touched, 1)) / h for h in used]
             value, error = _extrapolated(sums, bar)

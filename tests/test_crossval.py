@@ -206,6 +206,22 @@ def test_extrapolation():
     assert _extrapolated([0.0, 0.0, 0.0, 0.0], [1e-12] * 4) == (0.0, 1e-12)
 
 
+def test_entries_that_jump_are_left_out():
+    """A Gaussian that is there or not: what its own jump leaves says nothing, and is not called agreement."""
+
+    def blinking(means, width, height, **arguments):
+        image, alpha, info = torch_rasterizer.rasterization(means=means, width=width, height=height, **arguments)
+        shown = (1e5 * means[0, 0]).floor().remainder(2) == 0
+        return image * torch.where(shown, 1.0, 0.5), alpha, info
+
+    g, (camera,), background = _made(0)
+    made, raw = function(blinking, "blinking"), raw_of(g)
+    own = central(made, raw, camera, background, rasterizers.cotangents([camera], 0)[0], {"means": [0]})
+    assert own.entries["means"] == []
+    assert own.left_out["means"] == 1
+    assert not own.kept.all()
+
+
 def test_a_model_beside_another():
     """A rasterizer that is far from what it claims is another model, or undecided; no bug is made up."""
     g, cameras = random_scene(0, count=40, width=32, height=24)
