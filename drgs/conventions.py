@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
+from drgs.oracle import activate, screen_rows
 from drgs.settings import RenderSettings
 
 __all__ = ["Finding", "Found", "Model", "find"]
@@ -167,20 +169,10 @@ class Model:
 def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) -> torch.Tensor:
     """(N,) sqrt(det Sigma' / det(Sigma' + dilation I)) of the projected covariances, as Mip-Splatting has it."""
     w2c = torch.tensor(camera.w2c)
-    fx, fy, cx, cy = (float(camera.K[i][j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x, y, z = (raw["means"] @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
     z = torch.where(z > 1e-6, z, 1e-6)
-    slopes = []
-    for slope, f, c, size in ((x / z, fx, cx, camera.width), (y / z, fy, cy, camera.height)):
-        tan = size / (2 * f)
-        if s.fov_clamp == "inria":
-            slope = slope.clamp(-1.3 * tan, 1.3 * tan)
-        elif s.fov_clamp == "gsplat":
-            slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
-        slopes.append(slope)
-    jacobian = torch.stack([fx / z, 0 * z, -fx * slopes[0] / z, 0 * z, fy / z, -fy * slopes[1] / z], -1)
-    axes = _rotation(raw["quats"]) * raw["log_scales"].exp()[:, None]
-    a, b = (jacobian.reshape(-1, 2, 3) @ w2c[:3, :3] @ axes).unbind(1)
+    axes = activate(SimpleNamespace(**raw, features=None), s).axes
+    a, b = screen_rows(x, y, z, camera, s.fov_clamp, w2c[:3, :3], axes).unbind(1)
     det = torch.linalg.cross(a, b).square().sum(-1)
     trace = (a * a + b * b).sum(-1)
     ratio = det / (det + s.dilation * (trace + s.dilation))
@@ -190,15 +182,6 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
 def _linear(x: torch.Tensor) -> torch.Tensor:
     """Linear light of sRGB values."""
     return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def _rotation(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 3, 3) of quaternions wxyz of any length."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
 # ---------------------------------------------------------------------------------------- search

@@ -119,6 +119,27 @@ def cull_near(scene: SimpleNamespace, rotation, center, s: RenderSettings, toler
     return take(scene, keep)
 
 
+def screen_rows(x, y, z, cam, fov_clamp: str, rotation: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
+    """(N, 2, 3) rows of J W R S: semi-axes (N, 3, 3) projected by the local affine approximation of the perspective.
+
+    Args:
+        x, y, z: (N,) means in the camera's frame.
+        fov_clamp: Of `RenderSettings`.
+        rotation: (3, 3) of w2c.
+    """
+    fx, fy, cx, cy = intrinsics(cam)
+    slopes = []
+    for slope, f, c, size in ((x / z, fx, cx, cam.width), (y / z, fy, cy, cam.height)):
+        tan = size / (2 * f)
+        if fov_clamp == "inria":
+            slope = slope.clamp(-1.3 * tan, 1.3 * tan)
+        elif fov_clamp == "gsplat":
+            slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
+        slopes.append(slope)
+    jacobian = [fx / z, 0 * z, -fx * slopes[0] / z, 0 * z, fy / z, -fy * slopes[1] / z]
+    return torch.stack(jacobian, dim=-1).reshape(-1, 2, 3) @ rotation @ axes
+
+
 def sh_colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
     """max(0.5 + SH, 0) of coefficients (N, K, 3) for directions (..., N, 3) of any length."""
     length = towards.norm(dim=-1, keepdim=True)

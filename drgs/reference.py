@@ -17,7 +17,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from drgs.oracle import activate, cull_near, float64, intrinsics, sh_basis, sh_colors, take, view_rays, within
+from drgs.oracle import (
+    activate,
+    cull_near,
+    float64,
+    intrinsics,
+    screen_rows,
+    sh_basis,
+    sh_colors,
+    take,
+    view_rays,
+    within,
+)
 from drgs.volume import render_volume
 
 if TYPE_CHECKING:
@@ -136,16 +147,7 @@ def _project(scene: SimpleNamespace, cam, rotation, center, s: RenderSettings, t
     fx, fy, cx, cy = intrinsics(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
     mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
-    slopes = []
-    for slope, f, c, size in ((x / z, fx, cx, cam.width), (y / z, fy, cy, cam.height)):
-        tan = size / (2 * f)
-        if s.fov_clamp == "inria":
-            slope = slope.clamp(-1.3 * tan, 1.3 * tan)
-        elif s.fov_clamp == "gsplat":
-            slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
-        slopes.append(slope)
-    jacobian = [fx / z, 0 * z, -fx * slopes[0] / z, 0 * z, fy / z, -fy * slopes[1] / z]
-    rows = torch.stack(jacobian, dim=-1).reshape(-1, 2, 3) @ rotation @ scene.axes
+    rows = screen_rows(x, y, z, cam, s.fov_clamp, rotation, scene.axes)
     diagonal = rows.square().sum(-1) + s.dilation
     if s.culling == "extent":
         return mean2d, rows, diagonal, None
