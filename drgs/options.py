@@ -85,6 +85,16 @@ class _Settings(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class _Around:
+    """Options of commands that can make cameras around a scene."""
+
+    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
+    """World direction that is up on an orbit or a dome; auto: as a run's photographs or known views, else minus-y."""
+    elevation: float | None = None
+    """Degrees of an orbit above its center; default as a run's photographs or known views, else 20."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Information(_Settings):
     """Options of commands that compute Fisher information."""
 
@@ -119,7 +129,7 @@ class Info(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(_Settings):
+class Render(_Settings, _Around):
     """Render a Gaussian PLY, or a finished run, to pictures or a video."""
 
     scene: Positional[Path]
@@ -134,10 +144,6 @@ class Render(_Settings):
     """Image height in pixels; default the camera's."""
     frames: int = 60
     """Views of an orbit."""
-    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
-    """World direction that is up on an orbit; auto: as a run's photographs, else minus-y."""
-    elevation: float | None = None
-    """Degrees of an orbit above its center; default as a run's photographs, else 20."""
     fov: float = 45.0
     """Horizontal field of view of an orbit in degrees."""
     format: str = "png"
@@ -221,7 +227,7 @@ class Fit(_Policy):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Views(_Information):
+class _Views(_Information, _Around):
     """Options of commands that compare views with known ones."""
 
     scene: Positional[Path]
@@ -232,10 +238,6 @@ class _Views(_Information):
     """Which of the other views, where they are a data set's."""
     count: int = 40
     """Cameras of an orbit or a dome."""
-    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
-    """World direction that is up on an orbit or a dome; auto: as the known views, else minus-y."""
-    elevation: float | None = None
-    """Degrees of an orbit above its center; default as the known views, else 20."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -267,7 +269,7 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seen(_Settings):
+class _Seen(_Settings, _Around):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Positional[Path]
@@ -280,10 +282,6 @@ class _Seen(_Settings):
     """At most this many views, evenly spaced."""
     max_pixels: int = 20_000
     """Views are reduced to at most this many pixels."""
-    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
-    """World direction that is up on an orbit; auto: as a run's photographs, else minus-y."""
-    elevation: float | None = None
-    """Degrees of an orbit above its center; default as a run's photographs, else 20."""
     fov: float = 45.0
     """Horizontal field of view of an orbit in degrees."""
     seed: int = 0
