@@ -173,28 +173,8 @@ def crossval(
     if agrees and not isinstance(rasterizer, Dump):
         far = torch.stack([(a - s).abs().amax(-1) > _PIXEL for a, (s, _) in zip(pictures, drawn, strict=True)])
         u = u * ~far[..., None]
-    say("gradients")
-    theirs = _gradients(rasterizer, raw, cameras, background, u)
-    ours = _sum(model.gradient(raw, camera, w, oracle) for camera, w in zip(cameras, u, strict=True))
-    groups = {name: _group_row(theirs[name], ours[name], tolerance) for name in GROUPS}
-    if agrees:
-        _known(groups, theirs, model, raw, cameras, u, oracle, tolerance)
-    open_ones = [name for name, row in groups.items() if row["verdict"] is None]
-    if open_ones and isinstance(rasterizer, Rasterizer):
-        say("central differences")
-        _decide(
-            groups, open_ones, rasterizer, model if agrees else None, raw, cameras[first], background, u[first], entries
-        )
-    for row in groups.values():
-        if row["verdict"] is None:
-            row["verdict"] = "gradient bug" if agrees else "undecided"
-            row["why"] = (
-                "the image is the model's, the gradient is not"
-                if agrees
-                else "the image is of another model, a dump cannot be asked for central differences"
-            )
-    verdicts = [row["verdict"] for row in groups.values()]
-    worst = min(verdicts, key=VERDICTS.index)
+    groups = _judged(rasterizer, model, agrees, raw, cameras, background, u, first, oracle, tolerance, entries, say)
+    worst = min((row["verdict"] for row in groups.values()), key=VERDICTS.index)
     if not agrees:
         worst = min(worst, "model difference", key=VERDICTS.index)
     elif found.findings:
@@ -215,13 +195,36 @@ def crossval(
         "seed": seed,
         "settings": dataclasses.asdict(model.settings),
     }
-    exact = RenderSettings.preset("exact", background=background)
     say("pictures")
-    images = []
+    exact, images = Model(RenderSettings.preset("exact", background=background)), []
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
-        true, _ = _drawn(Model(exact), raw, camera, False)
+        true, _ = _drawn(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
     return Result(report, images, model, g, cameras)
+
+
+def _judged(
+    rasterizer, model: Model, agrees, raw, cameras, background, u, first, oracle, tolerance, entries, say
+) -> dict:
+    """Group -> how its gradient compares, with its verdict; `first` is the view that is asked for differences."""
+    say("gradients")
+    theirs = _gradients(rasterizer, raw, cameras, background, u)
+    ours = _sum(model.gradient(raw, camera, w, oracle) for camera, w in zip(cameras, u, strict=True))
+    groups = {name: _group_row(theirs[name], ours[name], tolerance) for name in GROUPS}
+    if agrees:
+        _known(groups, theirs, model, raw, cameras, u, oracle, tolerance)
+    names = [name for name, row in groups.items() if row["verdict"] is None]
+    if names and isinstance(rasterizer, Rasterizer):
+        say("central differences")
+        same = model if agrees else None
+        _decide(groups, names, rasterizer, same, raw, cameras[first], background, u[first], entries)
+    elif names:
+        verdict, why = "undecided", "the image is of another model, a dump cannot be asked for central differences"
+        if agrees:
+            verdict, why = "gradient bug", "the image is the model's, the gradient is not"
+        for name in names:
+            groups[name] |= {"verdict": verdict, "why": why}
+    return groups
 
 
 def _presets(rasterizer, preset: str) -> list[str]:
