@@ -9,8 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
+from drgs.files import atomic_write
+from drgs.json_files import check_json, read_json
 
 __all__ = ["load_cameras_json", "save_cameras_json"]
+
+_ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position": [float], "rotation": [[float]]}
 
 
 def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
@@ -42,10 +46,8 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
                 "cy": float(camera.K[1, 2]),
             }
         )
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(entries, indent=1))
-    partial.replace(path)
+    with atomic_write(path) as file:
+        file.write(json.dumps(entries, indent=1).encode())
 
 
 def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
@@ -57,31 +59,29 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
         ValueError: not that layout, or a camera that cannot be; names the first one.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a cameras.json file, found none; check the path")
-    try:
-        entries = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
+    entries = read_json(path, "a cameras.json file")
     if not isinstance(entries, list) or not entries:
         raise ValueError(
             f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see INRIA's layout"
         )
     cameras = []
     for index, entry in enumerate(entries):
+        where = f"{path}: camera {index}"
+        check_json(where, entry, _ENTRY, "see INRIA's layout")
+        w, h = entry["width"], entry["height"]
+        center = {"cx": entry.get("cx", w / 2), "cy": entry.get("cy", h / 2)}
+        check_json(where, center, {"cx": float, "cy": float}, "see INRIA's layout")
+        sizes = len(entry["position"]), [len(row) for row in entry["rotation"]]
+        if sizes != (3, [3, 3, 3]):
+            raise ValueError(f"{where}: position must hold 3 numbers and rotation 3x3, got other sizes; correct them")
+        rotation = np.array(entry["rotation"], np.float64)
+        # The rotation's transpose stands for its inverse; Camera refuses what is not a rotation.
+        w2c = np.eye(4)
+        w2c[:3, :3], w2c[:3, 3] = rotation.T, -rotation.T @ np.array(entry["position"], np.float64)
+        name = str(entry.get("img_name", entry.get("id", index)))
         try:
-            w, h = entry["width"], entry["height"]
-            K = intrinsics(entry["fx"], entry["fy"], entry.get("cx", w / 2), entry.get("cy", h / 2))
-            c2w = np.eye(4)
-            c2w[:3, :3], c2w[:3, 3] = entry["rotation"], entry["position"]
-            # The rotation's transpose stands for its inverse; Camera refuses what is not a
-            # rotation.
-            w2c = np.eye(4)
-            w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
-            name = str(entry.get("img_name", entry.get("id", index)))
+            K = intrinsics(entry["fx"], entry["fy"], center["cx"], center["cy"])
             cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name))
-        except KeyError as error:
-            raise ValueError(f"{path}: camera {index} must have the key {error}, found none; add it") from None
-        except (TypeError, AttributeError, ValueError) as error:
-            raise ValueError(f"{path}: camera {index}: {error}") from None
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
     return cameras

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from drgs.foreign import refuse_foreign
+
 if TYPE_CHECKING:
     import torch
 
@@ -154,6 +156,7 @@ def _check_ply(path: Path) -> list[str]:
     """Columns of the vertex element, once the file is known to be as long as its header claims."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a PLY file, found none; check the path")
+    refuse_foreign(path, "a 3DGS PLY file")
     with path.open("rb") as file:
         head = file.read(_MAX_HEADER)
     end = head.find(b"end_header")
@@ -205,8 +208,6 @@ def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:
 
 
 def _layout_hint(names: list[str]) -> str:
-    if any(name.startswith("packed_") for name in names):
-        return "this is PlayCanvas' compressed layout, decompress it to a 3DGS PLY"
     if {"red", "green", "blue"} & set(names):
         return "this is a plain point cloud, fit Gaussians with `drgs fit`"
     return "export it as a 3DGS point_cloud.ply"
@@ -275,6 +276,7 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a checkpoint, found none; start without --resume")
+    refuse_foreign(path, "a checkpoint")
     try:
         with safe_open(str(path), "pt") as file:
             header = json.loads((file.metadata() or {}).get("drgs", "{}"))

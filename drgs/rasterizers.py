@@ -20,6 +20,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, sh_degree_of
 from drgs.files import atomic_write
+from drgs.foreign import refuse_foreign
 from drgs.integrator import render
 from drgs.settings import PRESETS, RenderSettings
 
@@ -327,6 +328,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file; nothing in it is executed."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file, there is none")
+    refuse_foreign(path, f"a {path.suffix} file of arrays")
     if path.stat().st_size > _LARGEST:
         raise ValueError(f"{path}: must have at most {_LARGEST >> 30} GiB, has {path.stat().st_size >> 30}")
     try:

@@ -19,6 +19,7 @@ import drgs
 from drgs import pictures, runtime
 from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import SCHEMA, Run, load_ply, write_json
+from drgs.foreign import refuse_foreign
 from drgs.orbits import UP, capture_orbit, scene_orbit
 from drgs.progress import Bar
 
@@ -184,6 +185,7 @@ def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
     if not path.is_dir():
         return load_ply(path), None
     folder = Run(path)
+    refuse_foreign(path, "a run folder or a 3DGS PLY file")
     folder.config()  # says that it is no run folder, or of another version
     if not folder.point_cloud.is_file():
         raise FileNotFoundError(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
+from drgs.foreign import refuse_foreign
 from drgs.progress import Bar
 
 if TYPE_CHECKING:
@@ -83,6 +84,8 @@ def run_sfm(
         ValueError: fewer than 2 photos, an unknown option, or photos that do not connect.
     """
     image_dir, out_dir = Path(image_dir), Path(out_dir)
+    if image_dir.is_file():
+        refuse_foreign(image_dir, "a folder of photos")
     if not image_dir.is_dir():
         raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]

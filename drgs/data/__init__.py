@@ -13,6 +13,7 @@ from drgs.data.llff import load_llff
 from drgs.data.points import initial_points, scene_extent
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.views import Dataset, View
+from drgs.foreign import refuse_foreign
 
 __all__ = ["Dataset", "View", "initial_points", "load", "scene_extent"]
 
@@ -52,6 +53,7 @@ def load(
     if path.is_file():
         loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
         if loader is None:
+            refuse_foreign(path, "a data set")
             raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
     elif find_transforms(path):
         loader = load_transforms

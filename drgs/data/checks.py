@@ -4,14 +4,15 @@ allocated.
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-__all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_json", "read_npy"]
+from drgs.foreign import refuse_foreign
+
+__all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_npy"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
@@ -20,21 +21,6 @@ _MAX_NPY_HEADER = 65536
 def list_images(folder: Path) -> list[Path]:
     """Image files directly in a folder, by name; hidden files are left out."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-
-
-def read_json(path: Path) -> Any:
-    """Parse a JSON file.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not JSON.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a JSON file, found none; check the path")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: must be valid JSON, got {error}; write the file again") from None
 
 
 def read_npy(path: Path) -> np.ndarray:
@@ -47,6 +33,7 @@ def read_npy(path: Path) -> np.ndarray:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a .npy file, found none; check the path")
+    refuse_foreign(path, "a .npy file")
     try:
         with path.open("rb") as file:
             version = np.lib.format.read_magic(file)
@@ -111,6 +98,7 @@ def read_image(path: Path) -> np.ndarray:
     except cv2.error:
         data = None
     if data is None:
+        refuse_foreign(path, "an image")
         raise ValueError(f"{path}: must be an image, could not be decoded; copy or convert it again")
     if data.ndim == 3:
         order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(data.shape[2])

@@ -12,6 +12,7 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.views import Dataset, View, fit_to_image
+from drgs.foreign import refuse_foreign
 
 __all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
 
@@ -180,6 +181,7 @@ def _read(model: Path, points: bool = True) -> object:
     read = [name for name in (*_REQUIRED, "rigs", "frames") if points or name != "points3D"]
     read = [name for name in read if (model / f"{name}{suffix}").is_file()]
     for name in read:
+        refuse_foreign(model / f"{name}{suffix}", "part of a COLMAP model")
         check(model / f"{name}{suffix}", name)
     if points:
         return _reconstruction(model, model, suffix)

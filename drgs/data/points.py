@@ -13,6 +13,7 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.matching import extract, match, nearby_pairs, quiet
 from drgs.data.views import Dataset, View
+from drgs.foreign import refuse_foreign
 
 __all__ = ["initial_points", "read_point_ply", "scene_extent"]
 
@@ -111,6 +112,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FileNotFoundError(f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path")
     import plyfile
 
+    refuse_foreign(path, "a PLY point cloud")
     try:
         _check_ply_size(path)
         vertex = plyfile.PlyData.read(str(path))["vertex"]

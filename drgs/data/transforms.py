@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, read_json
+from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.points import read_point_ply
 from drgs.data.views import Dataset, View, fit_to_image
+from drgs.json_files import read_json
 
 __all__ = ["find_transforms", "load_transforms"]
 

@@ -1,0 +1,120 @@
+"""Files that are something else than what a reader expects: named as what they are, with the way round.
+
+Known by their first bytes, and by their extension where a format has no mark of its own.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+__all__ = ["refuse_foreign"]
+
+_HEAD = 4096
+_SPLATS = {
+    ".spz": "an SPZ file (Niantic's compressed Gaussians)",
+    ".sog": "a SOG file (PlayCanvas' compressed Gaussians)",
+    ".splat": "a .splat file (32 bytes a Gaussian, no SH)",
+    ".ksplat": "a .ksplat file (compressed Gaussians of mkkellogg's viewer)",
+    ".lcc": "an LCC file (XGRIDS' compressed Gaussians)",
+}
+
+
+def refuse_foreign(path: Path, wanted: str) -> None:
+    """Raise ValueError if a file is known to be of another kind than its reader expects; else do nothing.
+
+    Args:
+        path: The file, or a folder; it must exist.
+        wanted: What the reader expects, for the message.
+    """
+    if path.is_dir():  # of folders, only that of an unbundled SOG scene is known, by its index
+        path = path / "meta.json"
+        if not path.is_file():
+            return
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    found = _lfs(head, path) or _splats(head, path) or _other(head, path)
+    if found:
+        raise ValueError(f"{path}: must be {wanted}, is {found[0]}; {found[1]}")
+
+
+def _conversion(path: Path) -> str:
+    name = "scene" if path.name == "meta.json" else path.stem.removesuffix(".compressed")
+    target = path.with_name(f"{name}.ply")
+    if target == path:
+        target = path.with_name(f"{name}_3dgs.ply")
+    return (
+        f"convert it with `npx @playcanvas/splat-transform {path} {target}`, "
+        "or open it in SuperSplat (superspl.at/editor) and export a PLY that is not compressed"
+    )
+
+
+def _lfs(head: bytes, path: Path) -> tuple[str, str] | None:
+    if head.startswith(b"version https://git-lfs.github.com/spec/"):
+        return (
+            "a Git LFS pointer, the note that stands for a file which was not downloaded",
+            f"run `git lfs install` once and then `git lfs pull` in {path.parent}",
+        )
+    return None
+
+
+def _splats(head: bytes, path: Path) -> tuple[str, str] | None:
+    """Gaussians in a format of somebody else."""
+    suffix = path.suffix.lower()
+    kind = None
+    if head.startswith(b"NGSP") or (head.startswith(b"\x1f\x8b") and _unpacked(head).startswith(b"NGSP")):
+        kind = _SPLATS[".spz"]
+    elif head.startswith(b"PK\x03\x04") and _is_sog(path):
+        kind = _SPLATS[".sog"]
+    elif path.suffix == ".json" and _is_sog_meta(head):
+        kind = "the index of an unbundled SOG scene (PlayCanvas' compressed Gaussians)"
+    elif suffix in _SPLATS and not head.startswith(b"ply"):
+        kind = _SPLATS[suffix]
+    elif head.startswith(b"ply") and b" packed_position" in head:
+        kind = "a PLY in PlayCanvas' compressed layout"
+    return (kind, _conversion(path)) if kind else None
+
+
+def _other(head: bytes, path: Path) -> tuple[str, str] | None:
+    """Anything else that people pass by mistake."""
+    start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:16].lower()
+    brand = head[8:12] if head[4:8] == b"ftyp" else b""
+    if head.startswith(b"glTF") or path.suffix.lower() == ".gltf":
+        return "a glTF file", "export a 3DGS PLY from the program that wrote it"
+    if start.startswith((b"<!doctype", b"<html")):
+        return "a web page", "download the file itself (on GitHub: the link named Raw)"
+    if brand in (b"heic", b"heix", b"mif1", b"msf1", b"avif"):
+        return "an HEIC or AVIF photograph", "convert it to JPEG or PNG"
+    if brand or head.startswith(b"\x1aE\xdf\xa3") or head[8:12] == b"AVI ":
+        return "a video", (
+            f"take photographs out of it first, e.g. `mkdir photos; ffmpeg -i {path} -vf fps=2 photos/%04d.jpg`, "
+            "and run `drgs sfm photos -o scene`"
+        )
+    if head.startswith(b"PK\x03\x04") and path.suffix.lower() != ".npz":
+        return "a zip archive", "unpack it first"
+    if head.startswith(b"\x1f\x8b"):
+        return "a gzip file", "unpack it first with gunzip"
+    return None
+
+
+def _unpacked(head: bytes) -> bytes:
+    """The first bytes of a gzip stream."""
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 16)
+    except zlib.error:
+        return b""
+
+
+def _is_sog(path: Path) -> bool:
+    if path.suffix.lower() == ".sog":
+        return True
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.rpartition("/")[2] == "meta.json" for name in archive.namelist())
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return False
+
+
+def _is_sog_meta(head: bytes) -> bool:
+    return b'"means"' in head and b"means_" in head
