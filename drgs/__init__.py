@@ -22,6 +22,7 @@ _NAMES = {
     "Gaussians": "ellipsoids",
     "RenderSettings": "settings",
     "load_ply": "files",
+    "rasterization": "rasterize",
     "render": "integrator",
     "render_jvp": "integrator",
     "save_ply": "files",
@@ -60,6 +61,7 @@ __all__ = [
     "fisher",
     "gain",
     "load_ply",
+    "rasterization",
     "reference",
     "render",
     "render_jvp",
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply
     from drgs.integrator import render, render_jvp
+    from drgs.rasterize import rasterization
     from drgs.settings import RenderSettings
 
 # Before anything can import drjit: it loads libLLVM at once, and the wrong one aborts the process.

@@ -360,7 +360,11 @@ def _is_tensor(value: Any) -> bool:
 
 
 def _as_numpy(value: Any) -> np.ndarray:
-    return value.detach().cpu().numpy() if _is_tensor(value) else np.asarray(value)
+    if not _is_tensor(value):
+        return np.asarray(value)
+    from drgs.runtime import unwrapped
+
+    return unwrapped(value, lambda values: values.cpu().numpy())
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:

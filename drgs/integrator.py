@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import torch
 
+from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.scene import EPS_ALPHA, Output, Scene, to_drjit
@@ -167,10 +168,5 @@ class _Bridge(torch.autograd.Function):
 
 
 def _plain(t, x):
-    """The values below any `torch.func` wrapper."""
-    F = torch._C._functorch
-    # Otherwise every operation wraps its result again.
-    with torch._C._DisableFuncTorch():
-        while F.is_functorch_wrapped_tensor(x):
-            x = F.get_unwrapped(x)
-        return to_drjit(t, x)
+    """As a Dr.Jit tensor: the values below any `torch.func` wrapper."""
+    return runtime.unwrapped(x, lambda values: to_drjit(t, values))

@@ -73,6 +73,18 @@ class Backend:
 _active: Backend | None = None
 
 
+def unwrapped(x, convert):
+    """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph."""
+    import torch
+
+    functorch = torch._C._functorch
+    # Otherwise every operation wraps its result again.
+    with torch._C._DisableFuncTorch():
+        while functorch.is_functorch_wrapped_tensor(x):
+            x = functorch.get_unwrapped(x)
+        return convert(x.detach())
+
+
 def setup(variant: str | None = None, threads: int | None = None) -> Backend:
     """Choose the backend and its thread counts; `backend()` returns the last one chosen.
 

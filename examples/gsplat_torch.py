@@ -39,9 +39,11 @@ def rasterization(
     height,
     *,
     near_plane=0.01,
+    far_plane=1e10,
     eps2d=0.3,
     sh_degree=None,
     backgrounds=None,
+    render_mode="RGB",
     rasterize_mode="classic",
     **unused,
 ):
@@ -84,9 +86,11 @@ def rasterization(
             width,
             height,
             near_plane=near_plane,
+            far_plane=far_plane,
             eps2d=eps2d,
             sh_degree=sh_degree,
             backgrounds=backgrounds,
+            render_mode=render_mode,
             rasterize_mode=rasterize_mode,
         )
 

@@ -1,0 +1,396 @@
+"""`drgs.rasterization`: our renderer behind the call that users of gsplat know.
+
+Argument names, shapes, defaults and meanings are those of `gsplat.rasterization` 1.5.3, so that a script changes one
+import and runs without CUDA. What gsplat can do and this cannot is refused by name; what only steers gsplat's memory
+and speed (`packed`, `tile_size`, `channel_chunk`, `segmented`) is accepted and changes nothing.
+
+Channels: rendering is linear in the colors, so up to three of them travel as the color of SH degree 0, shifted above
+the clamp at 0 (the shift times alpha is taken off the image again), and the others as features. Depth of the
+rasterizers' model is a Gaussian's own z, as in gsplat.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+
+from drgs import runtime
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.integrator import EPS_ALPHA, render
+from drgs.settings import RenderSettings
+
+__all__ = ["rasterization"]
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+_SH0 = 0.28209479177387814  # Y_00
+# Raw parameters are logarithms and logits: values at the ends of their range are moved inside by less than float32
+# can tell from them, and keep their derivative.
+_LEAST_SCALE, _LEAST_OPACITY, _MOST_OPACITY = 1e-20, 1e-12, 1 - 2.0**-26
+# Defaults of gsplat's signature: another preset's own constants hold unless an argument differs from these.
+_NEAR, _FAR, _DILATION = 0.01, 1e10, 0.3
+
+
+def rasterization(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    near_plane: float = _NEAR,
+    far_plane: float = _FAR,
+    radius_clip: float = 0.0,
+    eps2d: float = _DILATION,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: torch.Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: torch.Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: torch.Tensor | None = None,
+    tangential_coeffs: torch.Tensor | None = None,
+    thin_prism_coeffs: torch.Tensor | None = None,
+    ftheta_coeffs: object | None = None,
+    rolling_shutter: object | None = None,
+    viewmats_rs: torch.Tensor | None = None,
+    *,
+    preset: str | RenderSettings = "gsplat",
+) -> tuple[torch.Tensor, torch.Tensor, dict]:
+    """Draw Gaussians from C cameras, as `gsplat.rasterization` does.
+
+    Args:
+        means: (..., N, 3), world frame.
+        quats: (..., N, 4) wxyz, not necessarily normalized.
+        scales: (..., N, 3) standard deviations, >= 0.
+        opacities: (..., N) in [0, 1].
+        colors: (..., N, D) or (..., C, N, D), used as they are, any D; with `sh_degree` coefficients (..., N, K, 3) or
+            (..., C, N, K, 3), of which the first (sh_degree + 1)^2 are used.
+        viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
+        Ks: (..., C, 3, 3) in pixels, pixel centers at +0.5. A skew is followed (gsplat ignores it).
+        width, height: Of every image.
+        near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out.
+        radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
+        eps2d: Added to the diagonal of the projected covariance, in px^2.
+        sh_degree: 0 to 3, or None for plain colors.
+        backgrounds: (..., C, D) or None for black; behind a depth there is 0.
+        render_mode: RGB, D (sum w z), ED (that over alpha), RGB+D or RGB+ED (depth as the last channel).
+        rasterize_mode: classic, or antialiased: opacities times sqrt(det Sigma / det (Sigma + eps2d I)).
+        preset: A preset's name or `RenderSettings`. Of others than `gsplat`, `near_plane` and `eps2d` replace the
+            preset's own constants only where they are not gsplat's defaults; those without projected covariance
+            (`exact`, `fast`) have no eps2d and no antialiased mode, and their z is that of the peak on each ray.
+    Returns:
+        colors (..., C, H, W, X), alphas (..., C, H, W, 1), in the precision of `means`, and a dict: `radii` (..., C, N,
+        2) int32 in pixels, 0 where a Gaussian is left out; `means2d` (..., C, N, 2), `depths` (..., C, N), `conics`
+        (..., C, N, 3), valid where radii > 0, without a graph; `opacities` (..., C, N); `width`, `height`,
+        `n_batches`, `n_cameras`.
+    Raises:
+        ValueError: If a shape or value is wrong.
+        NotImplementedError: If an option of gsplat's is asked for that does not exist here; the way round is named.
+    Gradients:
+        With respect to means, quats, scales, opacities, colors, viewmats and backgrounds, in reverse and forward mode;
+        with respect to viewmats as rigid motions (SH see the camera's center at -R^T t, gsplat's at -R^-1 t: no
+        difference along any motion of a camera).
+        No gradient passes through `means2d`: density control that needs its norm (gsplat's DefaultStrategy) has none,
+        gsplat's MCMCStrategy works.
+    Reference:
+        V. Ye et al., gsplat, JMLR 26, 2025; Z. Yu et al., Mip-Splatting, CVPR 2024 (antialiased).
+    """
+    _refuse(
+        sparse_grad=(sparse_grad, "gradients are dense here; drop it"),
+        absgrad=(absgrad, "there are no gradients of projected means; use gsplat's MCMCStrategy, which needs none"),
+        distributed=(distributed, "one process renders; split the cameras among processes yourself"),
+        covars=(covars is not None, "pass quats and scales, e.g. from an eigendecomposition"),
+        with_ut=(with_ut, "no unscented transform; preset='exact' evaluates along true rays"),
+        with_eval3d=(with_eval3d, "preset='exact' or 'fast' evaluates the response in 3D"),
+        radial_coeffs=(radial_coeffs is not None, "lenses are traced by drgs.render(..., traversal='bvh')"),
+        tangential_coeffs=(tangential_coeffs is not None, "lenses are traced by drgs.render(..., traversal='bvh')"),
+        thin_prism_coeffs=(thin_prism_coeffs is not None, "use drgs.integrator.render_rays with your own rays"),
+        ftheta_coeffs=(ftheta_coeffs is not None, "use drgs.integrator.render_rays with your own rays"),
+        viewmats_rs=(viewmats_rs is not None, "use drgs.integrator.render_rays with your own rays"),
+        rolling_shutter=(
+            rolling_shutter is not None and getattr(rolling_shutter, "name", "") != "GLOBAL",
+            "use drgs.integrator.render_rays with your own rays",
+        ),
+        camera_model=(camera_model != "pinhole", "use drgs.integrator.render_rays with your own rays"),
+    )
+    _one_of("render_mode", render_mode, RENDER_MODES)
+    _one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
+    settings = _settings(preset, near_plane, eps2d, rasterize_mode)
+    lead, count, cameras = _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
+    _check_values(scales, opacities)
+    scales, opacities = _inside(scales, _LEAST_SCALE, math.inf), _inside(opacities, _LEAST_OPACITY, _MOST_OPACITY)
+    by_camera = colors.ndim == len(lead) + (3 if sh_degree is None else 4)
+    of = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
+    means_b, quats_b, scales_b, opacities_b, colors_b, viewmats_b, Ks_b = map(
+        of, (means, quats, scales, opacities, colors, viewmats, Ks)
+    )
+    behind_b = None if backgrounds is None else of(backgrounds)
+    made = []
+    for b in range(len(means_b)):
+        for c in range(cameras):
+            shown = colors_b[b, c] if by_camera else colors_b[b]
+            made.append(
+                _view(
+                    _Splats(means_b[b], quats_b[b], scales_b[b], opacities_b[b], shown, sh_degree),
+                    Camera(
+                        K=runtime.unwrapped(Ks_b[b, c], lambda K: K.cpu().double().numpy()),
+                        w2c=viewmats_b[b, c],
+                        width=width,
+                        height=height,
+                    ),
+                    settings,
+                    render_mode,
+                    rasterize_mode == "antialiased",
+                    (far_plane, radius_clip),
+                    None if behind_b is None else behind_b[b, c],
+                )
+            )
+    stacked = [torch.stack(x).reshape(*lead, cameras, *x[0].shape) for x in zip(*(v[:2] for v in made), strict=True)]
+    meta = {
+        name: torch.stack([v[2][name] for v in made]).reshape(*lead, cameras, *made[0][2][name].shape)
+        for name in made[0][2]
+    }
+    meta |= {"width": width, "height": height, "n_batches": math.prod(lead), "n_cameras": cameras}
+    return *stacked, meta
+
+
+@dataclasses.dataclass
+class _Splats:
+    """One scene as gsplat stores it: means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), and colors (N, D), or
+    with a degree (N, K, 3).
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    colors: torch.Tensor
+    degree: int | None
+
+    def take(self, index) -> _Splats:
+        parts = (getattr(self, f.name)[index] for f in dataclasses.fields(self) if f.name != "degree")
+        return _Splats(*parts, self.degree)
+
+    def gaussians(self, with_color: bool) -> tuple[Gaussians, float]:
+        """Raw parameters, and what was added to the first three channels to keep them above the clamp."""
+        n, shift, features = len(self.means), 0.0, None
+        if not with_color:
+            sh = self.means.new_zeros(n, 1, 3)
+        elif self.degree is not None:
+            sh = self.colors[:, : (self.degree + 1) ** 2]
+        else:
+            first, rest = self.colors[:, :3], self.colors[:, 3:]
+            # At exactly 0 the clamp would end the gradient; one half is exact and keeps black clear of it.
+            shift = 0.5 - min(0.0, float(first.detach().min()) if first.numel() else 0.0)
+            first = torch.nn.functional.pad(first, (0, 3 - first.shape[1]))
+            sh = ((first + (shift - 0.5)) / _SH0)[:, None, :]
+            features = rest if rest.shape[1] else None
+        opacities = self.opacities.double()  # near 1 float32 cannot hold 1 - opacity
+        logits = torch.log(opacities) - torch.log1p(-opacities)
+        return Gaussians(self.means, self.quats, torch.log(self.scales), logits, sh, features), shift
+
+
+def _view(splats: _Splats, camera: Camera, settings, mode: str, antialiased: bool, limits, background):
+    """One image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
+    far, clip = limits
+    meta, compensation = _projected(splats, camera, settings, antialiased)
+    if antialiased:
+        splats = dataclasses.replace(
+            splats, opacities=_inside(splats.opacities * compensation, _LEAST_OPACITY, _MOST_OPACITY)
+        )
+    meta["opacities"] = splats.opacities.detach().to(splats.means.dtype)
+    # A Gaussian that is left out must not be drawn: the renderer itself knows no far plane and no smallest radius.
+    kept = (meta["depths"] <= far) & (meta["depths"] > settings.near)
+    if clip > 0:
+        kept &= (meta["radii"] > clip).any(-1)
+    meta["radii"] = meta["radii"] * kept[:, None]
+    if not bool(kept.all()) and (far < _FAR or clip > 0):
+        splats = splats.take(kept.nonzero()[:, 0])
+    gaussians, shift = splats.gaussians(with_color="RGB" in mode)
+    out = render(gaussians, camera, settings, outputs=("depth",) if "D" in mode else ())
+    alpha, channels = out.alpha[..., None], []
+    if "RGB" in mode:
+        width = 3 if splats.degree is not None else min(3, splats.colors.shape[1])
+        color = out.rgb[..., :width] - shift * alpha
+        if out.features is not None:
+            color = torch.cat([color, out.features], -1)
+        channels.append(color if background is None else color + (1 - alpha) * background)
+    if "D" in mode:
+        depth = out.depth[..., None]
+        if settings.response != "ewa":
+            depth = depth * _z_of_rays(camera).to(depth)  # along the ray -> along the axis
+        channels.append(depth if "ED" in mode else depth * alpha.clamp_min(EPS_ALPHA))
+    kind = splats.means.dtype
+    return torch.cat(channels, -1).to(kind), alpha.to(kind), meta
+
+
+def _projected(splats: _Splats, camera: Camera, settings: RenderSettings, antialiased: bool):
+    """gsplat's `meta` of a view, without a graph, and the compensation of opacities, (N,), with one.
+
+    Sigma' = J W Sigma W^T J^T, J the derivative of the projection at the mean, its slopes clamped where the settings
+    clamp them.
+    """
+    with torch.set_grad_enabled(antialiased and torch.is_grad_enabled()):
+        like = {"dtype": torch.float64, "device": splats.means.device}
+        w2c = torch.as_tensor(camera.w2c).to(**like)
+        fx, skew, cx, fy, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+        x, y, z = (splats.means.to(**like) @ w2c[:3, :3].T + w2c[:3, 3]).unbind(1)
+        valid = z.detach() > settings.near
+        z = torch.where(valid, z, 1)  # the others have no projection
+        u, v = x / z, y / z
+        means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
+        if settings.fov_clamp == "gsplat":
+            half = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+            u = u.clamp(-cx / fx - half[0], (camera.width - cx) / fx + half[0])
+            v = v.clamp(-cy / fy - half[1], (camera.height - cy) / fy + half[1])
+        elif settings.fov_clamp == "inria":
+            u, v = (a.clamp(-0.65 * n / f, 0.65 * n / f) for a, n, f in ((u, camera.width, fx), (v, camera.height, fy)))
+        zero = torch.zeros_like(z)
+        rows = [fx / z, skew / z + zero, -(fx * u + skew * v) / z, zero, fy / z, -fy * v / z]
+        half_axes = torch.stack(rows, 1).reshape(-1, 2, 3) @ w2c[:3, :3] @ _half_axes(splats, like)
+        a, b = half_axes.unbind(1)
+        # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.
+        sharp = torch.linalg.cross(a, b).square().sum(1)
+        xx, yy, xy = a.square().sum(1), b.square().sum(1), (a * b).sum(1)
+        eps = settings.dilation
+        blurred = sharp + eps * (xx + yy + eps)
+        compensation = None
+        if antialiased:
+            # The square root has no derivative at 0, where the opacity is 0 anyway.
+            compensation = (sharp.clamp_min(1e-30) / blurred).sqrt().to(splats.means.dtype)
+    with torch.no_grad():
+        opacity = splats.opacities.to(**like) * (1 if compensation is None else compensation)
+        extent = (2 * (255 * opacity).clamp_min(1).log()).sqrt().clamp_max(3.33)
+        valid = valid & (opacity >= 1 / 255)  # not in place: the graph of z keeps the mask
+        radii = torch.ceil(extent[:, None] * torch.stack([xx + eps, yy + eps], 1).sqrt())
+        size = torch.tensor([camera.width, camera.height], **like)
+        valid = valid & ((means2d + radii > 0) & (means2d - radii < size)).all(1)
+        conics = torch.stack([yy + eps, -xy, xx + eps], 1) / blurred[:, None]
+        kind = splats.means.dtype
+        meta = {
+            "radii": (radii * valid[:, None]).to(torch.int32),
+            "means2d": means2d.detach().to(kind),
+            "depths": torch.where(valid, z, 0).to(kind),
+            "conics": conics.detach().to(kind),
+        }
+    return meta, compensation
+
+
+def _half_axes(splats: _Splats, like: dict) -> torch.Tensor:
+    """(N, 3, 3): columns are the semi-axes, rotation times scale."""
+    w, x, y, z = torch.nn.functional.normalize(splats.quats.to(**like), dim=1).unbind(1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(rows, 1).reshape(-1, 3, 3) * splats.scales.to(**like)[:, None, :]
+
+
+def _z_of_rays(camera: Camera) -> torch.Tensor:
+    """(H, W, 1) z of the unit direction of every pixel."""
+    identity = dataclasses.replace(camera, w2c=torch.eye(4, dtype=torch.float64).numpy())
+    return torch.from_numpy(identity.pixel_directions()[..., 2:])
+
+
+def _settings(preset: str | RenderSettings, near: float, eps2d: float, mode: str) -> RenderSettings:
+    """The preset with gsplat's arguments put in, on a black background (ours are added in torch)."""
+    settings = preset if isinstance(preset, RenderSettings) else RenderSettings.preset(preset)
+    black = settings.replace(background=(0.0, 0.0, 0.0))
+    if preset == "gsplat" or near != _NEAR:
+        black = black.replace(near=near)
+    if preset == "gsplat" or eps2d != _DILATION:
+        black = black.replace(dilation=eps2d)
+    if mode == "antialiased" and black.response != "ewa":
+        raise NotImplementedError(
+            "rasterization: rasterize_mode='antialiased' must have a preset with projected covariances, got "
+            f"preset={preset!r}; use preset='gsplat' or 'inria', or rasterize_mode='classic'"
+        )
+    return black
+
+
+def _inside(x: torch.Tensor, low: float, high: float) -> torch.Tensor:
+    """x moved into [low, high], with the derivative of x: at the ends gsplat's functions have one."""
+    return x + (x.detach().double().clamp(low, high) - x.detach()) if x.numel() else x
+
+
+def _refuse(**asked) -> None:
+    for name, (is_asked, instead) in asked.items():
+        if is_asked:
+            raise NotImplementedError(f"rasterization: {name} is not supported; {instead}")
+
+
+def _one_of(name: str, value, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise ValueError(f"rasterization: {name} must be one of {', '.join(allowed)}, got {value!r}")
+
+
+def _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, degree, backgrounds):
+    """Leading axes, number of Gaussians, number of cameras."""
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    tensors |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
+    for name, x in tensors.items():
+        if not isinstance(x, torch.Tensor):
+            raise ValueError(
+                f"rasterization: {name} must be a torch tensor, got {type(x).__name__}; use torch.as_tensor"
+            )
+    if means.ndim < 2 or means.shape[-1] != 3:
+        raise ValueError(f"rasterization: means must have shape (..., N, 3), got {tuple(means.shape)}")
+    if viewmats.ndim < 3:
+        raise ValueError(
+            f"rasterization: viewmats must have shape (..., C, 4, 4), got {tuple(viewmats.shape)}; add an axis for the "
+            "cameras, viewmat[None]"
+        )
+    lead, n, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
+    if degree is None:
+        shown = [(n, "D"), (cameras, n, "D")]
+    else:
+        if degree not in (0, 1, 2, 3):
+            raise ValueError(f"rasterization: sh_degree must be None or 0 to 3, got {degree!r}")
+        shown = [(n, "K", 3), (cameras, n, "K", 3)]
+    wanted = {"quats": [(n, 4)], "scales": [(n, 3)], "opacities": [(n,)], "colors": shown}
+    wanted |= {"viewmats": [(cameras, 4, 4)], "Ks": [(cameras, 3, 3)]}
+    if backgrounds is not None:
+        wanted["backgrounds"] = [(cameras, 3 if degree is not None else colors.shape[-1])]
+    for name, shapes in wanted.items():
+        got = tuple(tensors[name].shape)
+        if not any(_fits(got, lead + shape) for shape in shapes):
+            allowed = " or ".join("(" + ", ".join(map(str, lead + shape)) + ")" for shape in shapes)
+            raise ValueError(
+                f"rasterization: {name} must have shape {allowed} (N = {n} from means, C = {cameras} from viewmats"
+                f"{'' if name != 'colors' else f', sh_degree = {degree}'}), got {got}"
+            )
+    if degree is not None and colors.shape[-2] < (degree + 1) ** 2:
+        raise ValueError(
+            f"rasterization: colors must have at least {(degree + 1) ** 2} coefficients for sh_degree {degree}, got "
+            f"{colors.shape[-2]}"
+        )
+    return lead, n, cameras
+
+
+def _fits(got: tuple, wanted: tuple) -> bool:
+    return len(got) == len(wanted) and all(isinstance(w, str) or g == w for g, w in zip(got, wanted, strict=True))
+
+
+def _check_values(scales: torch.Tensor, opacities: torch.Tensor) -> None:
+    """What logarithms and logits cannot hold; the renderer checks the rest."""
+    for name, x, high in (("scales", scales, math.inf), ("opacities", opacities, 1.0)):
+        bad = ~((x.detach() >= 0) & (x.detach() <= high))
+        if bool(bad.any()):
+            at = tuple(bad.nonzero()[0].tolist())
+            allowed = "[0, 1], as sigmoid gives" if name == "opacities" else "[0, inf), linear, as exp gives"
+            raise ValueError(f"rasterization: {name} must be in {allowed}, got {float(x[at]):g} at index {list(at)}")
