@@ -32,6 +32,7 @@ __all__ = [
     "psnr",
     "run_eval",
     "ssim",
+    "through_viewers",
     "write_metrics",
 ]
 
@@ -46,6 +47,9 @@ METRICS = tuple(VARIANTS)
 _NO_LPIPS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11
+_VIEWERS = "gsplat"  # the model that viewers of PLY files draw with
+_VIEWERS_VIEWS = 8  # enough for a mean difference, and a second at most
+_VIEWERS_NOISE = 0.1  # dB; two fits differ by that much
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
@@ -201,6 +205,36 @@ def evaluate(
     return {"views": views, "mean": mean, "variants": variants, "reasons": reasons}
 
 
+def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:
+    """How Gaussians look in the viewers of PLY files, which draw with the rasterizers' model, not with `settings`.
+
+    That model widens every Gaussian by 0.3 px^2 on the screen, so what is lost depends on the image size: it is most
+    where Gaussians are smaller than a pixel, least where a viewer draws more pixels than were fitted.
+
+    Args:
+        g: Fitted with `settings`.
+        frames: Photographs to compare with, at the size of the fit; at most 8 of them, evenly spaced, are looked at.
+        settings: Of the fit.
+        split: Where the frames come from, to be recorded.
+    Returns:
+        JSON-serializable: `preset` (the viewers'), `psnr` and `own_psnr` (means in dB, through that preset and through
+        `settings`), `split`, `views` (names), `width` and `height` of the first; None if there is no view, or
+        `settings` are the viewers' own.
+    """
+    viewers = drgs.RenderSettings.preset(_VIEWERS, background=settings.background)
+    if settings == viewers or not frames:
+        return None
+    frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
+    values = {"psnr": viewers, "own_psnr": settings}
+    for name, model in values.items():
+        with torch.no_grad():
+            images = (drgs.render(g, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1) for frame in frames)
+            pairs = zip(images, frames, strict=True)
+            values[name] = float(np.mean([psnr(image, frame.image(), frame.mask) for image, frame in pairs]))
+    size = {"width": frames[0].camera.width, "height": frames[0].camera.height}
+    return {"preset": _VIEWERS, **values, "split": split, "views": [frame.name for frame in frames], **size}
+
+
 def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields) -> dict:
     """Write `metrics.json` of a run from the result of `evaluate`; returns what was written."""
     written = {"schema": SCHEMA, "split": split, "count": len(frames), **fields, **result}
@@ -237,12 +271,15 @@ def run_eval(args: Eval) -> None:
         raise ValueError(f"eval: split {args.split} must hold a view, holds none ({dataset.split_rule()}); use --split")
     frames = load_frames(views, config.max_pixels, config.mask)
     result = evaluate(g, frames, config.settings, lpips=lpips, pictures=run.renders / args.split)
-    written = write_metrics(run, args.split, frames, result, split_rule=dataset.split_rule(), gaussians=len(g))
+    viewers = through_viewers(g, frames, config.settings, args.split)
+    written = write_metrics(
+        run, args.split, frames, result, split_rule=dataset.split_rule(), gaussians=len(g), viewers=viewers
+    )
     print_table(written)
 
 
 def print_table(metrics: dict) -> None:
-    """The metrics of `write_metrics` as a table on stdout, reasons of missing ones below."""
+    """The metrics of `write_metrics` as a table on stdout, reasons of missing ones below, and what viewers show."""
     from rich.console import Console
     from rich.table import Table
 
@@ -258,6 +295,20 @@ def print_table(metrics: dict) -> None:
     console.print(table)
     for name, reason in metrics["reasons"].items():
         console.print(f"{name}: none ({reason})", highlight=False, soft_wrap=True)
+    if metrics["viewers"]:
+        console.print(_viewers_line(metrics["viewers"]), highlight=False, soft_wrap=True)
+
+
+def _viewers_line(viewers: dict) -> str:
+    """What `through_viewers` found, and what to do about it."""
+    line = (
+        f"In a viewer of PLY files (preset {viewers['preset']}, {viewers['width']}x{viewers['height']}): PSNR "
+        f"{viewers['psnr']:.2f} dB instead of {viewers['own_psnr']:.2f} dB, mean of {len(viewers['views'])} "
+        f"{viewers['split']} views"
+    )
+    if viewers["own_psnr"] - viewers["psnr"] <= _VIEWERS_NOISE:
+        return line
+    return f"{line}; to train for viewers, fit with --preset {viewers['preset']}"
 
 
 def _ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

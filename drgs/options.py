@@ -167,7 +167,7 @@ class Fit(_Policy):
     output: _Output
     """The run folder."""
     preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
-    """Render settings of a named system."""
+    """Render settings of a named system. Train with what will be rendered with: gsplat for viewers of PLY files."""
     max_steps: int = 3000
     """Optimizer steps."""
     max_pixels: int = 130_000

@@ -143,6 +143,9 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
         step=trainer.step_index,
         seconds=loop.seconds,
         bad_steps=trainer.bad_steps,
+        viewers=metrics.through_viewers(
+            g, held_out or trainer.frames, config.settings, "test" if held_out else "train"
+        ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
     )
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"])

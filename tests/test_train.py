@@ -1,5 +1,6 @@
 """Claims of drgs.train, drgs.trainer, drgs.density and drgs.losses on a tiny scene that is made of Gaussians."""
 
+import dataclasses
 import json
 import math
 import os
@@ -16,7 +17,7 @@ from drgs.data.views import Dataset, View
 from drgs.density import Model, add_gaussians, divide, explore, relocate
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state
-from drgs.frames import load_frames
+from drgs.frames import Frame, load_frames
 from drgs.losses import photometric_loss, ssim, ssim_map
 from drgs.pictures import write_png
 from drgs.train import FitConfig, Trainer, fit
@@ -104,10 +105,56 @@ def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys
     metrics.run_eval(Eval(run=tmp_path / "run"))
     again = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert again["mean"]["psnr"] == pytest.approx(result.metrics["mean"]["psnr"], abs=1e-3)
-    assert "2 test views" in capsys.readouterr().out
+    assert again["viewers"]["psnr"] == pytest.approx(result.metrics["viewers"]["psnr"], abs=1e-3)
+    said = capsys.readouterr().out
+    assert "2 test views" in said
+    assert f"In a viewer of PLY files (preset gsplat, {SIZE}x{SIZE}): PSNR {again['viewers']['psnr']:.2f} dB" in said
     metrics.run_eval(Eval(run=tmp_path / "run", split="train"))
     again = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (again["split"], again["count"]) == ("train", 7)
+
+
+@pytest.mark.parametrize("preset", ["fast", "gsplat"])
+def test_fit_says_how_viewers_show_it(dataset, tmp_path, preset, capsys):
+    """metrics.json and the end of the output hold the PSNR through the viewers' model: that of evaluating with preset
+    gsplat. Nothing is said of a fit with that preset. Without held-out views it is the PSNR of training views.
+    """
+    settings = drgs.RenderSettings.preset(preset, background=(0.1, 0.2, 0.3))
+    result = fit(dataset, tmp_path / "run", config(max_steps=5, settings=settings), progress=False)
+    metrics.print_table(result.metrics)
+    viewers, said = result.metrics["viewers"], capsys.readouterr().out
+    if preset == "gsplat":
+        assert viewers is None
+        assert "viewer" not in said
+        return
+    frames = load_frames(dataset.split()[1], SIZE * SIZE)
+    gsplat = drgs.RenderSettings.preset("gsplat", background=(0.1, 0.2, 0.3))
+    want = metrics.evaluate(result.gaussians, frames, gsplat)["mean"]["psnr"]
+    assert viewers["psnr"] == pytest.approx(want, abs=1e-3)
+    assert viewers["own_psnr"] == pytest.approx(result.metrics["mean"]["psnr"], abs=1e-3)
+    assert (viewers["split"], viewers["views"]) == ("test", ["0", "8"])
+    assert f"PSNR {want:.2f} dB instead of {viewers['own_psnr']:.2f} dB, mean of 2 test views" in said
+    unheld = fit(dataset, tmp_path / "all", config(max_steps=2, test_every=0), progress=False).metrics["viewers"]
+    assert (unheld["split"], len(unheld["views"])) == ("train", 5)  # every second of nine
+
+
+def test_viewers_widen_what_is_small():
+    """Gaussians of a third of a pixel are another picture in the viewers' model (measured: 17.9 dB), of 1.3 pixels
+    nearly the same one (36.7); the line says how to train for it.
+    """
+    camera = orbit((0, 0, 0), 3.0, 1, width=SIZE, height=SIZE)[0]
+    sigma = math.log(0.33 * 3.0 / float(camera.K[0, 0]))
+    g = dataclasses.replace(scene(200), log_scales=torch.full((200, 3), sigma))
+    psnr = []
+    for size in (SIZE, 4 * SIZE):
+        view = camera.resized(size, size)
+        frame = Frame("0", view, drgs.render(g, view, FAST).rgb.clamp(0, 1))
+        viewers = metrics.through_viewers(g, [frame], FAST, "test")
+        assert viewers["own_psnr"] == 100
+        assert metrics._viewers_line(viewers).endswith("to train for viewers, fit with --preset gsplat")
+        psnr.append(viewers["psnr"])
+    assert psnr[0] < 22
+    assert psnr[1] > 32
 
 
 def test_resumed_run_equals_an_uninterrupted_one(dataset, tmp_path, monkeypatch):
