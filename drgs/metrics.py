@@ -261,6 +261,7 @@ def run_eval(args: Eval) -> None:
         background=config.settings.background,
         lazy=bool(recorded.get("active")),
         points=False,
+        strict=args.strict,
     )
     train, test = dataset.split()
     if recorded.get("active"):  # the rest of the training split was never seen

@@ -85,6 +85,14 @@ class _Settings(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class _Data:
+    """Options of commands that load data sets."""
+
+    strict: bool = False
+    """Refuse a data set that lists images which are not there; else at least 3 must be, and the others are left out."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Around:
     """Options of commands that can make cameras around a scene."""
 
@@ -129,7 +137,7 @@ class Info(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(_Settings, _Around):
+class Render(_Settings, _Around, _Data):
     """Render a Gaussian PLY, or a finished run, to pictures or a video."""
 
     scene: Positional[Path]
@@ -159,7 +167,7 @@ class Render(_Settings, _Around):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(_Policy):
+class Fit(_Policy, _Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
@@ -227,7 +235,7 @@ class Fit(_Policy):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Views(_Information, _Around):
+class _Views(_Information, _Around, _Data):
     """Options of commands that compare views with known ones."""
 
     scene: Positional[Path]
@@ -269,7 +277,7 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seen(_Settings, _Around):
+class _Seen(_Settings, _Around, _Data):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Positional[Path]
@@ -299,7 +307,7 @@ class Crossval(_Seen):
     ladder: bool = True
     """Attribute what is left between that model and the exact one."""
     strict: bool = False
-    """Conventions that differ and known deviations fail, too."""
+    """Conventions that differ and known deviations fail, too, and so does a data set with images that are missing."""
     export: Path | None = None
     """Only write the scene, the cameras and cotangents to this .npz, for a rasterizer on another machine."""
     output: _Output = Path("out/crossval")
@@ -329,7 +337,7 @@ class Stress(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Eval(_Common):
+class Eval(_Common, _Data):
     """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS when weights are given."""
 
     run: Positional[Path]

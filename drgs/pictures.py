@@ -48,7 +48,9 @@ def file_names(names: list[str]) -> list[str]:
     for index, name in enumerate(names):
         clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".")[:100]
         clean = clean or f"view_{index:04d}"
-        result.append(clean if clean not in result else f"{clean}_{index:04d}")
+        while clean in result:
+            clean += f"_{index:04d}"
+        result.append(clean)
     return result
 
 

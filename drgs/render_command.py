@@ -235,7 +235,7 @@ def cameras_of(
         if args.split != "all":
             raise ValueError(f"{path}: --split {args.split} must have a data set, a cameras.json has no split")
         return load_cameras_json(path), str(path)
-    dataset, test_every = _dataset(path)
+    dataset, test_every = _dataset(path, args.strict)
     train, test = dataset.split(test_every)
     views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
     if not views:
@@ -252,20 +252,20 @@ def is_camera_list(path: Path) -> bool:
         return file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
 
 
-def _dataset(path: Path) -> tuple[Dataset, int | None]:
+def _dataset(path: Path, strict: bool) -> tuple[Dataset, int | None]:
     """A data set, or that of a run; and the run's rule of the split."""
     from drgs.data import load
 
     if (path / "config.json").is_file() and (path / "log.jsonl").is_file():
         config = Run(path).config()
-        return load(config["data"]), config["fit"]["test_every"]
-    return load(path), None
+        return load(config["data"], strict=strict), config["fit"]["test_every"]
+    return load(path, strict=strict), None
 
 
 def _captured(folder: Run) -> list[Camera]:
     """Cameras of the photographs that a run was fitted to; none if they are no longer there."""
     try:
-        return [view.camera for view in _dataset(folder.path)[0].views]
+        return [view.camera for view in _dataset(folder.path, strict=False)[0].views]
     except (ValueError, OSError, KeyError):
         return []
 

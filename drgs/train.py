@@ -120,6 +120,7 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
         "masks": sorted({_mask_kind(frame) for frame in frames}),
         "points": source,
+        **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
         "fit": config.to_json(),
     }
     if plan:
@@ -171,6 +172,7 @@ def run_fit(args: Fit) -> None:
         background=config.settings.background,
         lazy=active is not None,
         points=active is None or config.init_points == "all",
+        strict=args.strict,
     )
     result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
     metrics.print_table(result.metrics)

@@ -40,12 +40,14 @@ class Scene:
         run: The run folder, or None.
         settings: Of the renderer, over the run's background.
         pixels: Views are reduced to at most so many.
+        strict: Refuse data sets that list images which are not there.
     """
 
     gaussians: Gaussians
     run: Run | None
     settings: RenderSettings
     pixels: int
+    strict: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +88,7 @@ def scene_of(args: Select | Fisher) -> Scene:
         pixels = args.info_pixels or run.config()["fit"]["max_pixels"]
         if not any(text.startswith("background=") for text in args.overrides):
             settings = settings.replace(background=run_background(run))
-    return Scene(gaussians, run, settings, pixels)
+    return Scene(gaussians, run, settings, pixels, args.strict)
 
 
 def known_views(text: str | None, scene: Scene) -> Known:
@@ -105,11 +107,11 @@ def known_views(text: str | None, scene: Scene) -> Known:
     if is_camera_list(path):
         return Known([at_most(camera, scene.pixels) for camera in load_cameras_json(path)], str(path))
     if not _is_run(path):
-        views = _load(path).views
+        views = _load(path, scene).views
         return Known([_camera(view, {}, scene.pixels) for view in views], str(path), path.resolve())
     run = Run(path)
     data, names = Path(run.config()["data"]), fitted_views(run)
-    views = {view.name: view for view in _load(data).views}
+    views = {view.name: view for view in _load(data, scene).views}
     if missing := [name for name in names if name not in views]:
         raise ValueError(
             f"{data}: must still hold the {len(names)} views of {path}, {missing[0]!r} is gone; restore it"
@@ -150,7 +152,7 @@ def other_views(option: str, text: str, args: Select | Fisher, scene: Scene, kno
         path, every = Path(config["data"]), config["fit"]["test_every"]
     elif scene.run is not None:
         every = scene.run.config()["fit"]["test_every"]
-    dataset = _load(path)
+    dataset = _load(path, scene)
     train, test = dataset.split(every)
     views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
     same = path.resolve() == known.data
@@ -244,10 +246,10 @@ def _is_run(path: Path) -> bool:
     return (path / "config.json").is_file() and (path / "log.jsonl").is_file()
 
 
-def _load(path: Path):
+def _load(path: Path, scene: Scene):
     from drgs.data import load
 
-    return load(path, lazy=True, points=False)
+    return load(path, lazy=True, points=False, strict=scene.strict)
 
 
 def _camera(view: View, sizes: dict, pixels: int) -> Camera:

@@ -373,3 +373,18 @@ def test_barrel_lens_that_folds_back_is_masked():
         mask = View(camera, "a").mask()
     assert mask[0, 0] == 0
     assert mask[8, 12] == 1
+
+
+def test_views_of_one_name_are_told_apart(tmp_path):
+    """`a.png` beside `a.jpg`, in a folder that has an `a_2.png` already: three names, in LLFF as in COLMAP."""
+    rows = write_llff(tmp_path)
+    for index, name in enumerate(("a.jpg", "a.png", "a_2.png")):
+        (tmp_path / "images" / f"{index}.png").unlink()
+        write_image(tmp_path / "images" / name, gradient())
+    assert len(rows) == 3
+    assert [view.name for view in load(tmp_path).views] == ["a", "a_3", "a_2"]
+    target = write_colmap(tmp_path / "colmap", count=2)
+    images = target / "images.bin"
+    images.write_bytes(images.read_bytes().replace(b"im1.png\0", b"im0.jpg\0"))
+    (tmp_path / "colmap" / "images" / "im1.png").rename(tmp_path / "colmap" / "images" / "im0.jpg")
+    assert sorted(view.name for view in load(tmp_path / "colmap").views) == ["im0", "im0_2"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import struct
 
 import numpy as np
@@ -115,9 +116,6 @@ def test_colmap_bad_poses_and_missing_files(tmp_path):
         load(tmp_path)
     one_line(error)
     frames.write_bytes(whole)
-    (tmp_path / "images" / "im2.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"image 2 \(im2.png\): the image .* must exist"):
-        load(tmp_path)
     (tmp_path / "images").rename(tmp_path / "photos")
     with pytest.raises(FileNotFoundError, match="must lie in a folder named images"):
         load(tmp_path)
@@ -176,7 +174,6 @@ def test_transforms_bad_frames(tmp_path):
     attempt("frame 1: transform_matrix must be finite", transform_matrix=bad.tolist())
     attempt("frame 1: .*orthonormal to 1e-4", transform_matrix=(pose * 2).tolist())
     attempt("frame 1: transform_matrix must be 4x4", transform_matrix=[[1, 2], [3]])
-    attempt("frame 1: the image .* must exist", FileNotFoundError, file_path="images/9.png")
     attempt("frame 1: mask_path names", FileNotFoundError, mask_path="gone.png")
     attempt("frame 1: must be an object with a file_path", file_path=7)
     for text, message in [
@@ -188,6 +185,37 @@ def test_transforms_bad_frames(tmp_path):
         with pytest.raises(ValueError, match=message) as error:
             load(tmp_path)
         one_line(error)
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+@pytest.mark.parametrize("write", [write_transforms, write_colmap])
+def test_absent_images_are_named_and_left_out(tmp_path, caplog, write, lazy):
+    """Of 10 images 2 are gone: said with their names, split of the others as before; with `strict`, or with fewer than
+    3 left, refused. (An every-8th rule over what is left would move views from one split to the other.)
+    """
+    write(tmp_path, count=10)
+    whole = load(tmp_path, test_every=3, lazy=lazy)
+    names = [view.name for view in whole.views]
+    images = [view.image_path for view in whole.views]
+    for k in (1, 3):
+        images[k].unlink()
+    with caplog.at_level(logging.INFO):
+        left = load(tmp_path, test_every=3, lazy=lazy)
+    told = f"2 of the 10 images that it lists are not there ({images[1]}, {images[3]}); going on with the other 8"
+    assert told in caplog.text
+    assert [view.name for view in left.views] == [name for k, name in enumerate(names) if k not in (1, 3)]
+    assert sorted(view.name for view in left.absent) == [names[1], names[3]]
+    for one, other in zip(left.split(), whole.split(), strict=True):
+        assert [view.name for view in one] == [view.name for view in other if view.image_path.is_file()]
+    assert left.views[0].image(4, 4).shape == (4, 4, 3)
+    with pytest.raises(FileNotFoundError, match=r"2 of the 10 .*; all must be there: restore them, or drop") as error:
+        load(tmp_path, strict=True)
+    one_line(error)
+    for path in images[4:]:
+        path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"8 of the 10 .*, \.\.\.\); at least 3 must be there") as error:
+        load(tmp_path)
+    one_line(error)
 
 
 def test_transforms_rounded_poses_are_repaired(tmp_path):

@@ -175,3 +175,24 @@ def test_run_whose_views_are_gone(place, tmp_path, capsys):
     file.write_text(file.read_text().replace('"name": "5"', '"name": "gone"'))
     assert cli.main(["select", str(tmp_path / "run"), "--candidates", "orbit"]) == 2
     assert "'gone' is gone; restore it" in capsys.readouterr().err
+
+
+def test_data_set_with_absent_images(place, tmp_path, monkeypatch, capsys, caplog):
+    """Commands go on without an image that is not there and say so; with --strict they refuse."""
+    import shutil
+
+    shutil.copytree(place / "data", tmp_path / "data")
+    gone = load(tmp_path / "data").views[2]
+    gone.image_path.unlink()
+    line = f"{place}/scene.ply --train {place}/cameras.json --candidates {tmp_path}/data --policy uniform"
+    report, _ = select(f"{line} -o selection.json", tmp_path, monkeypatch, capsys)
+    names = [row["name"] for row in report["candidates"]]
+    assert len(names) == len(load(place / "data").views) - 1
+    assert gone.name not in names
+    assert "going on with the other" in caplog.text
+    fitting = ["fit", f"{tmp_path}/data", "-o", f"{tmp_path}/run", "--max-steps", "1"]
+    for strict in (["select", *line.split(), "--strict"], [*fitting, "--strict"]):
+        assert cli.main(strict) == 2
+        assert "all must be there: restore them" in capsys.readouterr().err
+    assert cli.main(fitting) == 0
+    assert Run(tmp_path / "run").config()["absent"] == [gone.name]

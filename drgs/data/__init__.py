@@ -25,6 +25,7 @@ def load(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     lazy: bool = False,
     points: bool = True,
+    strict: bool = False,
 ) -> Dataset:
     """Load a data set; its format is found out from its files. No image is decoded.
 
@@ -42,9 +43,11 @@ def load(
             views get the size of the first training image, the only one opened.
         points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
             from all its images.
+        strict: refuse a data set that lists images which are not there. By default at least 3 must be left; the
+            missing ones are named in the log and held in `Dataset.absent`.
 
     Raises:
-        FileNotFoundError: nothing there, or photos without poses.
+        FileNotFoundError: nothing there, photos without poses, or too few of the photos.
         ValueError: a file that is damaged or says something that cannot be.
     """
     path = Path(path)
@@ -63,7 +66,7 @@ def load(
         loader = load_llff
     else:
         raise _nothing_found(path)
-    dataset = loader(path, background=background, test_every=test_every, lazy=lazy, points=points)
+    dataset = loader(path, background=background, test_every=test_every, lazy=lazy, points=points, strict=strict)
     dataset.test_every = test_every
     dataset.split()  # refuses a test_every that cannot be
     return dataset

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.views import Dataset, View, fit_to_image
+from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
 from drgs.foreign import refuse_foreign
 
 __all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
@@ -42,6 +42,7 @@ def load_colmap(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     lazy: bool = False,
     points: bool = True,
+    strict: bool = False,
     **_,
 ) -> Dataset:
     """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a
@@ -50,11 +51,10 @@ def load_colmap(
     Args:
         path: the data set, or the model's own folder.
         background: color that images with alpha are composited on.
-        lazy, points: open no image, read no points and observations, see `drgs.data.load`.
+        lazy, points, strict: open no image, read no points and observations, need every image, see `drgs.data.load`.
 
     Raises:
-        FileNotFoundError: no model, no ``images`` folder, or an image that the model lists is
-            missing.
+        FileNotFoundError: no model, no ``images`` folder, or too few of the images that the model lists.
         ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
     """
     model = find_model(path)
@@ -66,7 +66,7 @@ def load_colmap(
         )
     reconstruction = _read(model, points)
     folder = _image_folder(path, model)
-    views = []
+    views, absent, listed = [], [], []
     # By name: COLMAP numbers images in the order in which its threads finish them.
     registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
@@ -76,21 +76,22 @@ def load_colmap(
         where = f"{model}: image {index} ({image.name})"
         if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
             raise ValueError(f"{where}: the name must stay inside {folder}, got {image.name!r}; rename it")
+        view = View(None, str(Path(image.name).with_suffix("")), image_path=folder / image.name)
+        listed.append(view)
+        if not view.image_path.is_file():
+            absent.append(view)
+            continue
         w2c = np.eye(4)
         w2c[:3] = image.cam_from_world().matrix()
         if not np.isfinite(w2c).all():
             raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model")
         camera = _camera(reconstruction.cameras[image.camera_id], w2c, image.name, where)
-        views.append(
-            View(
-                camera=fit_to_image(camera, folder / image.name, where, lazy),
-                name=str(Path(image.name).with_suffix("")),
-                image_path=folder / image.name,
-                mask_path=_mask(folder, image.name),
-                background=background,
-                is_checked=not lazy,
-            )
-        )
+        view.camera = fit_to_image(camera, view.image_path, where, lazy)
+        view.mask_path = _mask(folder, image.name)
+        view.background, view.is_checked = background, not lazy
+        views.append(view)
+    make_unique(listed)
+    go_on_without(model, [view.image_path for view in absent], len(views), strict)
     xyz, colors = _points(reconstruction, model)
     source = f"COLMAP model {model.name}, {len(xyz)} points" if len(xyz) else ""
     return Dataset(
@@ -100,6 +101,7 @@ def load_colmap(
         points=xyz if len(xyz) else None,
         colors=colors if len(xyz) else None,
         point_source=source,
+        absent=absent,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import list_images, read_npy
-from drgs.data.views import Dataset, View, fit_to_image
+from drgs.data.views import Dataset, View, fit_to_image, make_unique
 
 __all__ = ["load_llff"]
 
@@ -38,7 +38,8 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
     images = list_images(folder)
     if len(images) != len(rows):
         raise ValueError(
-            f"{file}: must have one row an image, got {len(rows)} rows and {len(images)} images; match them"
+            f"{file}: must have one row an image, in the order of their names, got {len(rows)} rows and {len(images)} "
+            "images; rows name no image, so that none may be missing: restore them, or drop the rows of missing ones"
         )
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
@@ -65,4 +66,5 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
                 is_checked=not lazy,
             )
         )
+    make_unique(views)
     return Dataset(path, "llff", views)

@@ -13,7 +13,7 @@ import numpy as np
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.points import read_point_ply
-from drgs.data.views import Dataset, View, fit_to_image
+from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
 from drgs.json_files import read_json
 
 __all__ = ["find_transforms", "load_transforms"]
@@ -47,6 +47,7 @@ def load_transforms(
     test_every: int = 8,
     lazy: bool = False,
     points: bool = True,
+    strict: bool = False,
 ) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 
@@ -59,10 +60,10 @@ def load_transforms(
     Args:
         path: the folder, or one JSON file.
         background: color that images with alpha are composited on.
-        test_every, lazy, points: see `drgs.data.load`.
+        test_every, lazy, points, strict: see `drgs.data.load`.
 
     Raises:
-        FileNotFoundError: no such file, or an image, mask or depth map that it names is missing.
+        FileNotFoundError: no such file, too few of the images that it names, or a mask or depth map is missing.
         ValueError: broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
     """
     files = find_transforms(path)
@@ -70,21 +71,23 @@ def load_transforms(
         raise FileNotFoundError(
             f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
         )
-    views: list[View] = []
     xyz = colors = None
     source = ""
     read = {file: _frames(file) for file in files}
-    first = _FirstImage(path, read, test_every) if lazy else None
+    dataset = Dataset(path, "transforms", [])
+    rows = _listed(read, dataset)
+    go_on_without(path, [view.image_path for view in dataset.absent], len(dataset.views), strict)
+    first = _FirstImage(dataset, test_every) if lazy else None
     for file, data in read.items():
         sizes: dict[tuple[int, int], int] = {}
-        splits = _splits(file, data)
         for index, frame in enumerate(data["frames"]):
+            view = rows[file][index]
+            if view is None:
+                continue
             where = f"{file}: frame {index}"
-            view, own = _view(file.parent, where, data, frame, background, first)
+            own = _fill(view, file.parent, where, data, frame, background, first)
             if not own:
                 sizes.setdefault((view.camera.width, view.camera.height), index)
-            view.split = splits[index]
-            views.append(view)
         if len(sizes) > 1:
             (first, i), (second, j) = list(sizes.items())[:2]
             raise ValueError(
@@ -96,8 +99,28 @@ def load_transforms(
             ply = file.parent / data["ply_file_path"]
             xyz, colors = read_point_ply(ply)
             source = f"{ply.name}, {len(xyz)} points"
-    _make_unique(views)
-    return Dataset(path, "transforms", views, xyz, colors, source)
+    dataset.points, dataset.colors, dataset.point_source = xyz, colors, source
+    return dataset
+
+
+def _listed(read: dict[Path, dict], dataset: Dataset) -> dict[Path, list[View | None]]:
+    """Name, split and image of every frame, put into `dataset.views`, or into `absent` where there is no image.
+
+    Returns:
+        The view of every frame of every file, None where it is absent.
+    """
+    rows, listed = {}, []
+    for file, data in read.items():
+        rows[file] = []
+        for frame, split in zip(data["frames"], _splits(file, data), strict=True):
+            name = frame["file_path"]
+            image = _image_file(file.parent, name)
+            view = View(None, _view_name(name), image_path=image or file.parent / name, split=split)
+            listed.append(view)
+            (dataset.absent if image is None else dataset.views).append(view)
+            rows[file].append(None if image is None else view)
+    make_unique(listed)
+    return rows
 
 
 def _frames(file: Path) -> dict:
@@ -123,54 +146,44 @@ def _splits(file: Path, data: dict) -> list[str]:
 class _FirstImage:
     """Size of the first training image, read when it is first asked for."""
 
-    def __init__(self, path: Path, read: dict[Path, dict], test_every: int) -> None:
-        self.path, self.read, self.test_every, self._size = path, read, test_every, None
+    def __init__(self, dataset: Dataset, test_every: int) -> None:
+        self.dataset, self.test_every, self._size = dataset, test_every, None
 
     def size(self) -> tuple[int, int]:
         if self._size is None:
-            views = []
-            for file, data in self.read.items():
-                for frame, split in zip(data["frames"], _splits(file, data), strict=True):
-                    image = _image_file(file.parent, frame["file_path"])
-                    views.append(View(None, _view_name(frame["file_path"]), image_path=image, split=split))
-            _make_unique(views)
-            train = Dataset(self.path, "transforms", views, test_every=self.test_every).split()[0]
-            if not train or train[0].image_path is None:
-                raise FileNotFoundError(f"{self.path}: the first training image must exist, found none; restore it")
+            train = self.dataset.split(self.test_every)[0]
+            if not train:
+                raise FileNotFoundError(
+                    f"{self.dataset.path}: the first training image must exist, found none; restore it"
+                )
             self._size = image_size(train[0].image_path)
         return self._size
 
 
-def _view(
+def _fill(
+    view: View,
     folder: Path,
     where: str,
     data: dict,
     frame: dict,
     background: tuple[float, float, float],
     first: _FirstImage | None,
-) -> tuple[View, bool]:
-    """One view, and whether its frame carries its own intrinsics; `first` where no other image may be opened."""
-    image = _image_file(folder, frame["file_path"])
-    if image is None:
-        raise FileNotFoundError(
-            f"{where}: the image {folder / frame['file_path']} must exist, found none; restore it or drop the frame"
-        )
+) -> bool:
+    """Complete a view whose image is there; whether its frame carries its own intrinsics.
+
+    `first` where no other image may be opened.
+    """
     own = any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
     merged = {**{key: value for key, value in data.items() if key != "frames"}, **frame}
-    camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), image, first)
+    camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), view.image_path, first)
     depth = _optional_file(folder, where, frame, "depth_file_path")
     unit = 1.0 if depth is not None and depth.suffix == ".npy" else _MILLIMETER
-    view = View(
-        camera=fit_to_image(camera, image, where, lazy=first is not None),
-        name=_view_name(frame["file_path"]),
-        image_path=image,
-        mask_path=_optional_file(folder, where, frame, "mask_path"),
-        depth_path=depth,
-        depth_scale=_number(where, merged, "depth_unit_scale_factor", unit),
-        background=background,
-        is_checked=first is None,
-    )
-    return view, own
+    view.camera = fit_to_image(camera, view.image_path, where, lazy=first is not None)
+    view.mask_path = _optional_file(folder, where, frame, "mask_path")
+    view.depth_path = depth
+    view.depth_scale = _number(where, merged, "depth_unit_scale_factor", unit)
+    view.background, view.is_checked = background, first is None
+    return own
 
 
 def _view_name(file_path: str) -> str:
@@ -288,12 +301,3 @@ def _named_splits(data: dict) -> dict[str, str]:
         if isinstance(names, list):
             named.update({name: split for name in names if isinstance(name, str)})
     return named
-
-
-def _make_unique(views: list[View]) -> None:
-    """Names become file names of renders: a repeated one gets its number."""
-    seen: dict[str, int] = {}
-    for view in views:
-        count = seen[view.name] = seen.get(view.name, 0) + 1
-        if count > 1:
-            view.name = f"{view.name}_{count}"

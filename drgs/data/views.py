@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +13,15 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import image_size, read_image, read_npy
 
-__all__ = ["Dataset", "View", "fit_to_image"]
+__all__ = ["Dataset", "View", "fit_to_image", "go_on_without", "make_unique"]
 
 _ASPECT_TOLERANCE = 0.01
 # An undistorted border pixel may look this many pixels past the photo before it counts as unseen.
 _BORDER = 1.0
+_FEWEST = 3  # images that a data set must have where others are missing
+_SHOWN = 5  # of those are named at once
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -172,6 +177,8 @@ class Dataset:
         colors: (P,3) float32 in [0,1], or None.
         point_source: where the points come from, one line, empty without points.
         test_every: every how many views one is held out.
+        absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
+            alone, which therefore stays the same whatever is missing.
     """
 
     path: Path
@@ -181,6 +188,7 @@ class Dataset:
     colors: np.ndarray | None = None
     point_source: str = ""
     test_every: int = 8
+    absent: list[View] = dataclasses.field(default_factory=list)
 
     def split(self, test_every: int | None = None) -> tuple[list[View], list[View]]:
         """(train, test) views, both sorted by name, by the rule that `split_rule` names.
@@ -188,16 +196,17 @@ class Dataset:
         Args:
             test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
         """
-        views = sorted(self.views, key=lambda view: view.name)
-        if any(view.split for view in views):
-            held_out = "test" if any(view.split == "test" for view in views) else "val"
-            train = [view for view in views if view.split not in ("val", "test")]
-            return train, [view for view in views if view.split == held_out]
-        every = self._every(test_every)
-        if every == 0:
-            return views, []
-        train = [view for index, view in enumerate(views) if index % every != 0]
-        return train, views[::every]
+        listed = sorted([*self.views, *self.absent], key=lambda view: view.name)
+        if any(view.split for view in listed):
+            held_out = "test" if any(view.split == "test" for view in listed) else "val"
+            train = [view for view in listed if view.split not in ("val", "test")]
+            test = [view for view in listed if view.split == held_out]
+        else:
+            every = self._every(test_every)
+            train = [view for index, view in enumerate(listed) if every == 0 or index % every != 0]
+            test = listed[::every] if every else []
+        there = {id(view) for view in self.views}
+        return [view for view in train if id(view) in there], [view for view in test if id(view) in there]
 
     def split_rule(self, test_every: int | None = None) -> str:
         """The rule of `split` in words, to be recorded with results."""
@@ -213,6 +222,44 @@ class Dataset:
         if every < 0 or every == 1:
             raise ValueError(f"split: test_every must be 0 (none) or >= 2, got {every}; correct it")
         return 0 if len(self.views) < 2 else every
+
+
+def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> None:
+    """Say which images of a data set are not there, or refuse the data set.
+
+    Args:
+        where: The file that lists them.
+        missing: The images that are not there; nothing is done if there are none.
+        left: How many are there.
+        strict: Refuse whatever is left.
+
+    Raises:
+        FileNotFoundError: `strict`, or fewer than 3 are left.
+    """
+    if not missing:
+        return
+    names, count = [str(path) for path in missing], len(missing) + left
+    shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+    told = f"{where}: {len(names)} of the {count} images that it lists are not there ({shown})"
+    if strict or left < _FEWEST:
+        rule = "all must be there" if strict else f"at least {_FEWEST} must be there"
+        hint = ", or drop --strict (strict=True) to go on without them" if strict and left >= _FEWEST else ""
+        raise FileNotFoundError(f"{told}; {rule}: restore them{hint}")
+    _log.warning("%s; going on with the other %d (--strict refuses that)", told, left)
+    if len(names) > _SHOWN:
+        _log.info("also not there: %s", ", ".join(names[_SHOWN:]))
+
+
+def make_unique(views: list[View]) -> None:
+    """Views are told apart by their names, in splits, picks and file names: a repeated one gets a number."""
+    taken = {view.name for view in views}
+    seen: set[str] = set()
+    for view in views:
+        name, number = view.name, 1
+        while view.name in seen or (number > 1 and view.name in taken):
+            number += 1
+            view.name = f"{name}_{number}"
+        seen.add(view.name)
 
 
 def fit_to_image(camera: Camera, path: Path, where: str, lazy: bool = False) -> Camera:
