@@ -66,7 +66,7 @@ class ActiveConfig:
     """
 
     policy: str = "fisher"
-    criterion: str = "logdet"
+    criterion: str = "eig"
     method: str = "exact"
     initial: int = 2
     add: int = 10

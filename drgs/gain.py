@@ -36,7 +36,7 @@ __all__ = [
 
 Information = Mapping[str, torch.Tensor]
 
-CRITERIA = ("logdet", "eig", "trace_cov", "block_logdet")
+CRITERIA = ("eig", "logdet", "trace_cov", "block_logdet")  # the first is the default everywhere
 
 BLOCK_LAYOUT = {
     "means": slice(0, 3),
@@ -116,7 +116,7 @@ class Gain:
 def information_gain(
     candidate: Information,
     train: Information,
-    criterion: str = "logdet",
+    criterion: str = "eig",
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
 ) -> Gain:
@@ -140,7 +140,7 @@ def information_gain(
 
 def scorer(
     train: Information,
-    criterion: str = "logdet",
+    criterion: str = "eig",
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
 ) -> Callable[[Information], Gain]:
@@ -174,7 +174,7 @@ def variances(train: Information, prior: Prior | None = None) -> dict[str, torch
     return result
 
 
-def check(where: str, information: Information, criterion: str = "logdet") -> None:
+def check(where: str, information: Information, criterion: str = "eig") -> None:
     """Raise ValueError, naming group and index, unless every entry is finite and, off blocks, >= 0."""
     lowest = -math.inf if criterion == "block_logdet" else 0.0
     for name, x in information.items():

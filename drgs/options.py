@@ -122,8 +122,8 @@ class _Policy(_Information):
 
     policy: Literal["fisher", "fisherrf", "coverage", "farthest", "uniform", "random"] = "fisher"
     """How the next view is chosen."""
-    criterion: Literal["logdet", "eig", "trace_cov", "block_logdet"] = "logdet"
-    """Score of policy fisher; eig chose better views than logdet where they were few (docs/active-static.md)."""
+    criterion: Literal["eig", "logdet", "trace_cov", "block_logdet"] = "eig"
+    """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
     seed: int = 0
     """Seed of everything random."""
 

@@ -69,7 +69,7 @@ def select(
     k: int = 1,
     policy: str = "fisher",
     *,
-    criterion: str = "logdet",
+    criterion: str = "eig",
     settings: RenderSettings | None = None,
     method: str = "exact",
     prior: Prior | None = None,

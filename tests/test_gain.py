@@ -241,9 +241,9 @@ def test_errors(rng):
     bad["means"][7, 2] = math.inf
     with pytest.raises(ValueError, match=r"got inf in means at \(7, 2\) \(1 of 120 entries\)"):
         check("here", bad)
-    with pytest.raises(ValueError, match=r"logdet must be finite, got .*means.*inf"):
+    with pytest.raises(ValueError, match=r"eig must be finite, got .*means.*inf"):
         scorer(H)(bad)
-    with pytest.raises(ValueError, match="criterion must be one of logdet, eig"):
+    with pytest.raises(ValueError, match="criterion must be one of eig, logdet"):
         information_gain(Hc, H, "D-opt")
     with pytest.raises(ValueError, match="candidate must have the groups of train"):
         information_gain({"means": Hc["means"]}, H)
@@ -337,3 +337,16 @@ def test_independent_parameters_are_exact(rng):
     assert chain.logdet == pytest.approx(chain.mutual_information, rel=1e-12)
     assert chain.block_logdet == pytest.approx(chain.mutual_information, rel=1e-12)
     assert chain.eig == pytest.approx(chain.trace_bound, rel=1e-12)
+
+
+def test_one_default_criterion():
+    """Everything that scores views does so by `eig` unless asked otherwise, from Python and on the command line."""
+    import inspect
+
+    from drgs.active import ActiveConfig
+    from drgs.gain import check
+    from drgs.options import Fit, Select
+    from drgs.select import select
+
+    functions = [inspect.signature(f).parameters["criterion"].default for f in (information_gain, scorer, check, select)]
+    assert {*functions, ActiveConfig().criterion, Fit.criterion, Select.criterion} == {CRITERIA[0]} == {"eig"}

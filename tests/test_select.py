@@ -491,7 +491,7 @@ def test_errors():
                 select(g, cameras, [], k, policy)
     with pytest.raises(ValueError, match="select: policy must be one of fisher, .*, got 'oracle'"):
         select(g, cameras, [], policy="oracle")
-    with pytest.raises(ValueError, match="select: criterion must be one of logdet, .*, got 'D-opt'"):
+    with pytest.raises(ValueError, match="select: criterion must be one of eig, .*, got 'D-opt'"):
         select(g, cameras, [], criterion="D-opt")
     with pytest.raises(ValueError, match="select: rng must be a torch.Generator that is kept between calls, got 3"):
         select(g, cameras, [], policy="random", rng=3)

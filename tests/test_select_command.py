@@ -45,14 +45,14 @@ def test_unused_views_of_a_run(place, monkeypatch, capsys):
     g, settings = load_ply(place / "run/point_cloud.ply"), drgs.RenderSettings.preset("fast")
     H = fisher.diagonal(g, [views[name] for name in seen], settings)
     for row in report["candidates"]:
-        gain = information_gain(fisher.diagonal(g, views[row["name"]], settings), H, "logdet", Prior())
+        gain = information_gain(fisher.diagonal(g, views[row["name"]], settings), H, "eig", Prior())
         assert row["score"] == pytest.approx(gain.total, rel=1e-4)
     first, second = report["picks"]
     assert first["score"] == max(row["score"] for row in report["candidates"])
     assert sum(first["parts"].values()) == pytest.approx(first["score"])
     assert second["name"] != first["name"]
     np.testing.assert_allclose(np.linalg.inv(first["camera"]["c2w"]), views[first["name"]].w2c, atol=1e-9)
-    assert "fisher (logdet): 2 of 5 views" in text
+    assert "fisher (eig): 2 of 5 views" in text
     assert all(word in text for word in ("means", "rot.", "scales", "opac.", "sh", "margin"))
 
 
