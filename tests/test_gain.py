@@ -348,5 +348,6 @@ def test_one_default_criterion():
     from drgs.options import Fit, Select
     from drgs.select import select
 
-    functions = [inspect.signature(f).parameters["criterion"].default for f in (information_gain, scorer, check, select)]
-    assert {*functions, ActiveConfig().criterion, Fit.criterion, Select.criterion} == {CRITERIA[0]} == {"eig"}
+    scoring = (information_gain, scorer, check, select)
+    defaults = {inspect.signature(function).parameters["criterion"].default for function in scoring}
+    assert {*defaults, ActiveConfig().criterion, Fit.criterion, Select.criterion} == {CRITERIA[0]} == {"eig"}
