@@ -21,6 +21,7 @@ import torch
 
 from drgs.files import SCHEMA, Run, write_json
 from drgs.frames import Frame, load_frames, reduced_size
+from drgs.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -176,9 +177,10 @@ class ActiveViews:
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None
         wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share) if dense else self._share
-        points, colors, _ = initial_points(
-            seen[-1:] if dense else seen, seed=self._config.seed + len(self.picks), max_points=wanted
-        )
+        with Bar("points of the new view") as bar:
+            points, colors, _ = initial_points(
+                seen[-1:] if dense else seen, self._config.seed + len(self.picks), wanted, bar.stage
+            )
         pixels, depth = frame.camera.project(points)
         inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (frame.camera.width, frame.camera.height)).all(1)
         columns, rows = pixels[inside].astype(int).T
@@ -211,18 +213,20 @@ class ActiveViews:
         active, settings = self.active, self._config.settings
         left = [i for i in range(len(self.views)) if i not in self.chosen]
         pixels = active.info_pixels or self._config.max_pixels
-        selection = select(
-            gaussians,
-            [at_most(self._camera(i), pixels) for i in left],
-            [at_most(frame.camera, pixels) for frame in frames],
-            1,
-            active.policy,
-            criterion=active.criterion,
-            settings=settings,
-            method=active.method,
-            prior=active.make_prior(),
-            rng=self._generator,
-        )
+        with Bar("choosing a view", len(left) + len(frames)) as bar:
+            selection = select(
+                gaussians,
+                [at_most(self._camera(i), pixels) for i in left],
+                [at_most(frame.camera, pixels) for frame in frames],
+                1,
+                active.policy,
+                criterion=active.criterion,
+                settings=settings,
+                method=active.method,
+                prior=active.make_prior(),
+                rng=self._generator,
+                progress=bar.update,
+            )
         best = selection.picks[0]
         extra = zip(selection.parts or [{}] * len(left), selection.unseen or [None] * len(left), strict=True)
         record = {

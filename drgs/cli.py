@@ -24,6 +24,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 from drgs.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Select, Sfm, Stress, Tradeoff
+from drgs.progress import Bar
 
 __all__ = ["main"]
 
@@ -57,15 +58,19 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else list(argv)
     args = _parse_arguments(argv)
     name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)
-    logging.basicConfig(format="%(message)s")
+    logging.basicConfig(format="%(message)s", handlers=[_Stderr()])
     logging.getLogger("drgs").setLevel(logging.WARNING if args.quiet else logging.INFO)
     try:
-        if args.variant != "auto" or args.threads is not None:
-            # Only when asked for: a command that needs no backend shall not load one.
-            from drgs import runtime
+        # Whatever a command does without a bar of its own is not silent either.
+        with Bar(f"drgs {name}", show=not args.quiet, lines_only=True):
+            with Bar("loading libraries"):
+                if args.variant != "auto" or args.threads is not None:
+                    # Only when asked for: a command that needs no backend shall not load one.
+                    from drgs import runtime
 
-            runtime.setup(args.variant, args.threads)
-        return getattr(importlib.import_module(module), function)(args) or 0
+                    runtime.setup(args.variant, args.threads)
+                run = getattr(importlib.import_module(module), function)
+            return run(args) or 0
     except (ValueError, NotImplementedError, OSError) as error:
         if args.debug:
             raise
@@ -76,6 +81,18 @@ def main(argv: list[str] | None = None) -> int:
             raise
         _complain(name, "interrupted")
         return 130
+
+
+class _Stderr(logging.StreamHandler):
+    """Writes to what sys.stderr is now: a bar that is being drawn puts itself there, and keeps below other lines."""
+
+    @property
+    def stream(self):
+        return sys.stderr
+
+    @stream.setter
+    def stream(self, _):
+        pass
 
 
 def _parse_arguments(argv: list[str]):

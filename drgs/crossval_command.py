@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING
 
 from drgs import rasterizers, runtime
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from drgs.options import Crossval
 
 __all__ = ["run"]
-
-_STAGES = 6
 
 
 def run(args: Crossval) -> int:
@@ -34,11 +31,10 @@ def run(args: Crossval) -> int:
         return 0
     rasterizer = rasterizers.load(args.rasterizer, g, cameras, fields)
     make_folder(args.output)
-    with Bar("crossval", _STAGES, not args.quiet) as bar:
-        done = itertools.count()
+    with Bar("crossval", show=not args.quiet) as bar:
 
         def advance(stage: str) -> None:
-            bar.update(next(done), _STAGES, stage)
+            bar.update(0, label=f"crossval, {stage}")
 
         result = crossval(rasterizer, g, cameras, args.preset, fields, seed=args.seed, advance=advance)
         report = {"schema": SCHEMA, "command": "crossval", "scene": str(args.scene), "source": source} | result.report

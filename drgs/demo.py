@@ -124,13 +124,15 @@ def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) 
     )
 
     start = time.perf_counter()
-    images, rows = _compare(g, frames, plan.repeats)
+    with Bar("presets compared", show=progress):
+        images, rows = _compare(g, frames, plan.repeats)
     lap("comparison", start)
     say(f"3. The same Gaussians by the rules of other renderers ({len(frames)} held-out views)")
     say(_table(rows))
 
     start = time.perf_counter()
-    oracle = _check(g, frames[0], images["exact"][0], plan.crop)
+    with Bar("float64 oracle", show=progress):
+        oracle = _check(g, frames[0], images["exact"][0], plan.crop)
     lap("oracle", start)
     say(
         f"4. Float64 oracle, {oracle['width']}x{oracle['height']} pixels of view {oracle['view']}: `exact` is off by "
@@ -139,7 +141,8 @@ def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) 
     )
 
     start = time.perf_counter()
-    peer = _race(g, frames[0].camera, plan.repeats)
+    with Bar("Mitsuba's integrator", show=progress):
+        peer = _race(g, frames[0].camera, plan.repeats)
     lap("peer", start)
     say(
         f"5. Mitsuba's own volprim_rf_basic: {1e3 * peer['volprim_rf_basic']:.0f} ms a view, `fast`: "

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.progress import Bar
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
@@ -53,6 +55,11 @@ def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[
         max_pixels: Of one image; smaller ones keep their size.
         mask: As in `FitConfig`.
     """
+    with Bar("photographs", len(views)) as bar:
+        return _frames(views, max_pixels, mask, bar)
+
+
+def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Frame]:
     views = [view.checked() for view in views]
     sizes = [reduced_size(view.camera, max_pixels) for view in views]
     is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_CACHE
@@ -69,6 +76,7 @@ def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[
                 is_object=mask == "object" or (mask == "auto" and view.mask_path is not None),
             )
         )
+        bar.advance()
     return frames
 
 

@@ -15,6 +15,7 @@ import torch
 import drgs
 from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.pictures import file_names, write_png
+from drgs.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -168,6 +169,13 @@ def evaluate(
     Returns:
         JSON-serializable: `views` (a list of name, size and metrics), `mean`, `variants`, `reasons` of what is None.
     """
+    with Bar("measuring views", len(frames)) as bar:
+        return _evaluated(g, frames, settings, lpips, pictures, bar)
+
+
+def _evaluated(
+    g: Gaussians, frames: list[Frame], settings: RenderSettings, lpips: Lpips | None, pictures: Path | None, bar: Bar
+) -> dict:
     views, reasons = [], {}
     if lpips is None:
         reasons["lpips"] = _NO_LPIPS
@@ -193,6 +201,7 @@ def evaluate(
         if pictures is not None:
             error = (4 * (shown - target).abs()).clamp(0, 1)
             write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
+        bar.advance()
     mean = {}
     for name in METRICS:
         values = [row[name] for row in views if row[name] is not None]
@@ -226,11 +235,15 @@ def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings,
         return None
     frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
     values = {"psnr": viewers, "own_psnr": settings}
-    for name, model in values.items():
-        with torch.no_grad():
-            images = (drgs.render(g, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1) for frame in frames)
-            pairs = zip(images, frames, strict=True)
-            values[name] = float(np.mean([psnr(image, frame.image(), frame.mask) for image, frame in pairs]))
+    with Bar("held-out views as viewers draw them", len(values) * len(frames)) as bar:
+        for name, model in values.items():
+            found = []
+            for frame in frames:
+                with torch.no_grad():
+                    image = drgs.render(g, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1)
+                found.append(psnr(image, frame.image(), frame.mask))
+                bar.advance()
+            values[name] = float(np.mean(found))
     size = {"width": frames[0].camera.width, "height": frames[0].camera.height}
     return {"preset": _VIEWERS, **values, "split": split, "views": [frame.name for frame in frames], **size}
 

@@ -1,53 +1,192 @@
-"""A progress bar on a terminal, and nothing where stderr is a file or a pipe."""
+"""What is going on, on stderr: a bar on a terminal, and where stderr is a file or a pipe a line now and then.
+
+Bars nest; the innermost one is shown. A thread writes the lines, so that work which stays away from Python for minutes
+(COLMAP, a kernel that is compiled, a slow view) is reported as well.
+"""
 
 from __future__ import annotations
 
 import sys
+import threading
+import time
 
 __all__ = ["Bar"]
 
+FIRST = 1.0  # seconds after which a stage is worth its first line
+EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
+LEAST_OFTEN = 60.0
+_bars: list[Bar] = []  # that are open, the innermost last
+_output: _Lines | _Terminal | None = None  # there is one while one of them is shown
+
 
 class Bar:
-    """A bar on stderr for the length of a `with` block.
+    """How far something is, for the length of a `with` block.
 
     Args:
         label: What is going on.
-        total: How many steps.
-        show: False for none at all.
+        total: How many steps; None: nobody knows.
+        show: Whether it is shown; None: if the bar around it is, so that library functions may have bars.
+        done: Steps done before, which took no time.
+        lines_only: Not drawn on a terminal.
     """
 
-    def __init__(self, label: str, total: int, show: bool = True):
-        self._label, self._total, self._bar = label, total, None
-        self._show = show and sys.stderr.isatty()
+    def __init__(
+        self, label: str, total: int | None = None, show: bool | None = None, done: int = 0, lines_only: bool = False
+    ):
+        self.label, self.total, self.done, self.text = label, total, done, ""
+        self.is_drawn, self.is_told = not lines_only, False
+        self._show, self._before = show, done
 
     def __enter__(self) -> Bar:
-        if self._show:
-            from rich import progress
-            from rich.console import Console
-
-            self._bar = progress.Progress(
-                progress.TextColumn("{task.description}"),
-                progress.BarColumn(),
-                progress.MofNCompleteColumn(),
-                progress.TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task(self._label, total=self._total)
+        self.began = time.monotonic()
+        self.is_shown = bool(_bars and _bars[-1].is_shown) if self._show is None else self._show
+        _open(self)
         return self
 
-    def __exit__(self, *_) -> None:
-        if self._bar:
-            self._bar.stop()
+    def __exit__(self, error, *_) -> None:
+        if error is None and self.is_told and self.total is not None:
+            self.note(self.line())
+        _close(self)
 
     def advance(self) -> None:
         """One step more."""
-        if self._bar:
-            self._bar.advance(self._task)
+        self.update(self.done + 1)
 
-    def update(self, done: int, total: int, label: str | None = None) -> None:
-        """Set everything at once."""
-        if self._bar:
-            text = {} if label is None else {"description": label}
-            self._bar.update(self._task, completed=done, total=total, **text)
+    def update(self, done: int, total: int | None = None, label: str | None = None, text: str | None = None) -> None:
+        """Set what is given.
+
+        Args:
+            done, total, label: As at the start. Another label is another stage, whose time starts now.
+            text: What else to say, e.g. how good the result is so far.
+        """
+        if label is not None and label != self.label:
+            if self.is_told and self.total is not None:
+                self.note(self.line())
+            self.label, self.began, self.is_told, self._before = label, time.monotonic(), False, done
+        self.done = done
+        self.total = self.total if total is None else total
+        self.text = self.text if text is None else text
+        if self.is_shown:
+            _output.draw(self)
+
+    def stage(self, label: str, done: int, total: int) -> None:
+        """`update` as functions call it that report several stages."""
+        self.update(done, total, label)
+
+    def note(self, text: str) -> None:
+        """A line that stays: above the bar, or by itself."""
+        if self.is_shown:
+            _output.note(text)
+
+    def line(self) -> str:
+        """The bar in words."""
+        seconds = time.monotonic() - self.began
+        parts = [f"{self.done} of {self.total}"] if self.total else []
+        parts += [self.text] if self.text else []
+        parts.append(f"{seconds:.0f} s")
+        steps = self.done - self._before
+        if self.total and steps > 0 and self.done < self.total:
+            parts.append(f"about {seconds * (self.total - self.done) / steps:.0f} s left")
+        return f"{self.label}: {', '.join(parts)}"
+
+
+def _open(bar: Bar) -> None:
+    global _output
+    _bars.append(bar)
+    if bar.is_shown:
+        if _output is None:
+            _output = _Terminal() if sys.stderr.isatty() else _Lines()
+        _output.draw(bar)
+
+
+def _close(bar: Bar) -> None:
+    global _output
+    _bars.remove(bar)
+    if bar.is_shown:
+        _output.erase(bar)
+        if not any(other.is_shown for other in _bars):
+            _output.end()
+            _output = None
+
+
+class _Lines:
+    """Lines of the innermost bar, from a thread."""
+
+    def __init__(self):
+        self._began = self._last = time.monotonic()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="drgs progress", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._is_over.wait(min(0.25, FIRST)):
+            now = time.monotonic()
+            pause = min(LEAST_OFTEN, max(EVERY, 0.05 * (now - self._began)))
+            for bar in [bar for bar in _bars if bar.is_shown][-1:]:
+                if now - self._last >= pause or (not bar.is_told and now - bar.began >= FIRST):
+                    bar.is_told = True
+                    self.note(bar.line())
+
+    def draw(self, bar: Bar) -> None:
+        """The thread does."""
+
+    def erase(self, bar: Bar) -> None:
+        """Lines stay."""
+
+    def note(self, text: str) -> None:
+        self._last = time.monotonic()
+        sys.stderr.write(text + "\n")  # one call: lines of two threads do not mix
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        self._is_over.set()
+        self._thread.join()
+
+
+class _Terminal:
+    """The innermost bar, drawn by rich."""
+
+    def __init__(self):
+        from rich import progress
+        from rich.console import Console
+
+        self._bars = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(bar_width=20),
+            progress.TextColumn("{task.fields[count]}", markup=False),
+            progress.TextColumn("{task.fields[text]}", markup=False),
+            progress.TimeRemainingColumn(elapsed_when_finished=True),
+            console=Console(stderr=True),
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),  # what goes to a file stays there
+        )
+        self._tasks: dict[Bar, int] = {}
+
+    def draw(self, bar: Bar) -> None:
+        if not bar.is_drawn:
+            return
+        if bar not in self._tasks:
+            self._tasks[bar] = self._bars.add_task(bar.label, total=bar.total, completed=bar.done, count="", text="")
+            self._bars.start()
+        count = "" if bar.total is None else f"{bar.done}/{bar.total}"
+        shown = {"description": bar.label, "count": count, "text": bar.text}
+        self._bars.update(self._tasks[bar], completed=bar.done, total=bar.total, **shown)
+        self._show_innermost()
+
+    def erase(self, bar: Bar) -> None:
+        if bar in self._tasks:
+            self._bars.remove_task(self._tasks.pop(bar))
+            self._show_innermost()
+            if not self._tasks:
+                self._bars.stop()
+
+    def note(self, text: str) -> None:
+        self._bars.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def end(self) -> None:
+        self._bars.stop()
+
+    def _show_innermost(self) -> None:
+        drawn = [bar for bar in _bars if bar in self._tasks]
+        for bar in drawn:
+            self._bars.update(self._tasks[bar], visible=bar is drawn[-1])

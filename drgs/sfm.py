@@ -226,7 +226,7 @@ def run_command(args: Sfm) -> None:
         summary = run_sfm(
             args.images,
             args.output,
-            lambda stage, done, total: bar.update(done, total, stage),
+            bar.stage,
             camera_model=args.camera_model,
             matching=args.matcher,
             seed=args.seed,

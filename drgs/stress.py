@@ -94,7 +94,7 @@ def run(args: Stress) -> int:
         print(_line(width, "case", "on", *_SHORT, "finite", "verdict"))
     with Bar("stress", len(chosen), not args.quiet) as bar:
         for number, case in enumerate(chosen):
-            bar.update(number, len(chosen), case.name)
+            bar.update(number, text=case.name)
             for row in rows(case):
                 found.append(row)
                 if not args.quiet or row.verdict == "FAILS":

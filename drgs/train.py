@@ -10,7 +10,6 @@ import dataclasses
 import logging
 import math
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
@@ -26,6 +25,7 @@ from drgs.density import Model
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.frames import Frame, load_frames
 from drgs.pictures import write_png
+from drgs.progress import Bar
 from drgs.trainer import FitConfig, Trainer
 
 if TYPE_CHECKING:
@@ -76,18 +76,18 @@ def fit(
         active: Start with a few views and choose more on the way; the data set is best loaded with `lazy=True` and
             without points, so that nothing of views that are not chosen is read.
         resume: Continue from the last checkpoint, or from the start if there is none yet.
-        progress: Show it on stderr: a bar on a terminal, a line for each preview elsewhere.
+        progress: Show it on stderr: a bar on a terminal, lines elsewhere.
     Raises:
         ValueError: On a bad config, data set or run folder, and when losses stay not finite.
         KeyboardInterrupt: Passed on after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
     drgs.runtime.backend()  # sets torch's threads too, at first use
-    with _one_thread() if config.deterministic else contextlib.nullcontext():
-        return _fit(dataset, out_dir, config, active, resume, progress)
+    with _one_thread() if config.deterministic else contextlib.nullcontext(), Bar("fit", show=progress):
+        return _fit(dataset, out_dir, config, active, resume)
 
 
-def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resume: bool, progress: bool) -> FitResult:
+def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resume: bool) -> FitResult:
     train, test = dataset.split(config.test_every)
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
@@ -130,7 +130,7 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
         plan.write(run)  # forgets picks that no checkpoint knows of
     run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.model))
     loop = _Loop(run, trainer, held_out, source, seconds, plan)
-    with _fewer_torch_threads(), _Progress(config.max_steps, trainer.step_index, progress) as bar:
+    with _fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
     g = trainer.gaussians()
     result = metrics.evaluate(g, held_out, config.settings, pictures=run.renders / "test")
@@ -189,9 +189,10 @@ def _start(
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
     given = config.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
-    points, colors, source = initial_points(
-        dataset if given else views, seed=config.seed, max_points=config.max_gaussians - reserved
-    )
+    with Bar("initial points") as bar:
+        points, colors, source = initial_points(
+            dataset if given else views, config.seed, config.max_gaussians - reserved, bar.stage
+        )
     extent = scene_extent([frame.camera for frame in frames], points)
     dense = not given and any(view.depth_path is not None for view in views)
     model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))
@@ -214,8 +215,9 @@ class _Loop:
         self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
         self.seconds, self.plan = seconds, plan
         self._recent: list[dict] = []
+        self._psnr: float | None = None  # of the last steps
 
-    def run(self, bar: _Progress) -> None:
+    def run(self, bar: Bar) -> None:
         trainer, config = self.trainer, self.trainer.config
         preview_every = max(1, config.max_steps // _PREVIEWS)
         if self.plan:
@@ -233,7 +235,10 @@ class _Loop:
                 self.seconds += time.perf_counter() - began
                 done = trainer.step_index
                 self._log(row)
-                bar.update(done, row["psnr"], len(trainer.model))
+                if row["psnr"] is not None:
+                    self._psnr = 0.98 * (self._psnr or row["psnr"]) + 0.02 * row["psnr"]
+                shown = "" if self._psnr is None else f"{self._psnr:.2f} dB, "
+                bar.update(done, text=f"{shown}{len(trainer.model)} Gaussians")
                 if done % preview_every == 0:
                     self._preview(bar)
                 if done % config.save_every == 0 and done < config.max_steps:
@@ -251,7 +256,7 @@ class _Loop:
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index)
 
-    def _pick(self, bar: _Progress) -> None:
+    def _pick(self, bar: Bar) -> None:
         """One more view."""
         trainer, plan = self.trainer, self.plan
         frame, record = plan.pick(trainer.gaussians(), trainer.frames, trainer.step_index)
@@ -288,7 +293,7 @@ class _Loop:
             )
             self._recent = []
 
-    def _preview(self, bar: _Progress) -> None:
+    def _preview(self, bar: Bar) -> None:
         """One picture, and the PSNR of all held-out views."""
         trainer, done = self.trainer, self.trainer.step_index
         frames = self.held_out or trainer.frames[:1]
@@ -302,59 +307,9 @@ class _Loop:
                 write_png(self.run_folder.renders / f"preview_{done:06d}.png", pair.numpy())
         psnr = float(np.mean(values)) if self.held_out else None
         self.run_folder.log("preview", step=done, test_psnr=psnr, gaussians=len(trainer.model), seconds=self.seconds)
-        bar.report(done, psnr, len(trainer.model), self.seconds)
-
-
-class _Progress:
-    """A bar on a terminal, lines elsewhere, nothing when not asked for; always on stderr."""
-
-    def __init__(self, total: int, done: int, show: bool):
-        self._show, self._total, self._done = show, total, done
-        self._bar = self._psnr = None
-
-    def __enter__(self) -> _Progress:
-        if self._show and sys.stderr.isatty():
-            from rich import progress
-            from rich.console import Console
-
-            self._bar = progress.Progress(
-                progress.TextColumn("fit"),
-                progress.BarColumn(),
-                progress.MofNCompleteColumn(),
-                progress.TextColumn("{task.fields[psnr]} dB  {task.fields[count]} Gaussians  {task.fields[rate]} it/s"),
-                progress.TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task("fit", total=self._total, completed=self._done, psnr="", count="", rate="")
-        self._began = time.perf_counter()
-        return self
-
-    def __exit__(self, *_) -> None:
-        if self._bar:
-            self._bar.stop()
-
-    def update(self, done: int, psnr: float | None, count: int) -> None:
-        if not self._bar:
-            return
-        if psnr is not None:
-            self._psnr = psnr if self._psnr is None else 0.98 * self._psnr + 0.02 * psnr
-        rate = (done - self._done) / (time.perf_counter() - self._began)
-        shown = "" if self._psnr is None else f"{self._psnr:.2f}"
-        self._bar.update(self._task, completed=done, psnr=shown, count=count, rate=f"{rate:.1f}")
-
-    def note(self, text: str) -> None:
-        """A line above the bar, or by itself."""
-        if self._bar:
-            self._bar.console.print(text, markup=False, highlight=False)
-        elif self._show:
-            print(text, file=sys.stderr, flush=True)
-
-    def report(self, done: int, psnr: float | None, count: int, seconds: float) -> None:
-        if not self._bar:
-            held_out = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
-            self.note(f"step {done} of {self._total}: {count} Gaussians{held_out}, {seconds:.0f} s")
+        shown = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
+        total = trainer.config.max_steps
+        bar.note(f"step {done} of {total}: {len(trainer.model)} Gaussians{shown}, {self.seconds:.0f} s")
 
 
 @contextlib.contextmanager

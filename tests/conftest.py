@@ -66,6 +66,15 @@ def _isolated(request):
         torch.use_deterministic_algorithms(False)
 
 
+@pytest.fixture(autouse=True)
+def _no_lines_of_progress(monkeypatch):
+    """They come with time: on a busy machine they would get in between what tests expect on stderr."""
+    from drgs import progress
+
+    for name in ("FIRST", "EVERY", "LEAST_OFTEN"):
+        monkeypatch.setattr(progress, name, 3600.0)
+
+
 def _flags() -> dict:
     """Dr.Jit's settings that a test may switch; empty while Dr.Jit is not imported."""
     if "drjit" not in sys.modules:

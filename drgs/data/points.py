@@ -14,6 +14,7 @@ from drgs.cameras import Camera
 from drgs.data.matching import extract, match, nearby_pairs, quiet
 from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
+from drgs.progress import Bar
 
 __all__ = ["initial_points", "read_point_ply", "scene_extent"]
 
@@ -234,6 +235,8 @@ def _triangulated(
         names, cameras = [], []
         masked = any(view.mask_path is not None or view.mask(1, 1) is not None for view in views)
         for index, view in enumerate(views):
+            if progress:
+                progress("photographs for features", index, len(views))
             camera = view.camera.undistorted()
             scale = min(1.0, _FEATURE_SIZE / max(camera.width, camera.height))
             camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
@@ -270,7 +273,10 @@ def _triangulated(
         match(database, pairs, seed=seed, progress=progress)
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = seed
-        result = pycolmap.triangulate_points(reconstruction, database, base / "images", base / "model", options=options)
+        with Bar("triangulation"):
+            result = pycolmap.triangulate_points(
+                reconstruction, database, base / "images", base / "model", options=options
+            )
         entries = [result.points3D[key] for key in sorted(result.point3D_ids())]
     points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
     colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(-1, 3) / np.float32(255)
