@@ -53,10 +53,10 @@ def rotation(vector) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def random_camera(rng, size=(24, 22), distance=4.0, focal=None, turn=0.2, center=None) -> Camera:
+def random_camera(rng, size=(24, 22), distance=4.0, focal=None, turn=0.2, center=None, skew=0.0) -> Camera:
     """Looks at the origin from `distance` away, off its axis, with an off-center principal point.
 
-    The focal length keeps 2 world units around the origin in the image unless it is given.
+    The focal length keeps 2 world units around the origin in the image unless it is given; `skew` is a multiple of it.
     """
     width, height = size
     focal = focal or 0.5 * max(width, height, 6) * distance / 2
@@ -64,7 +64,7 @@ def random_camera(rng, size=(24, 22), distance=4.0, focal=None, turn=0.2, center
     w2c[:3, :3] = rotation(turn * rng.normal(size=3))
     w2c[:3, 3] = [0.1, -0.1, distance]
     cx, cy = center or (width * rng.uniform(0.3, 0.7), height * rng.uniform(0.3, 0.7))
-    K = np.array([[focal, 0, cx], [0, 1.04 * focal, cy], [0, 0, 1]])
+    K = np.array([[focal, skew * focal, cx], [0, 1.04 * focal, cy], [0, 0, 1]])
     pose = torch.tensor(w2c, dtype=torch.float64).requires_grad_()
     return Camera(K=K, w2c=pose, width=width, height=height)
 

@@ -43,10 +43,12 @@ __all__ = [
     "intrinsics_from_fov",
     "look_at",
     "orbit",
+    "rigid",
 ]
 
 _OPENCV_LENGTHS = (4, 5, 8)
 _ROTATION_TOLERANCE = 1e-4
+_ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded in a file or an optimizer
 # An undistorted pixel must come back to itself; beyond this many pixels the lens model has no
 # inverse there.
 _INVERSE_TOLERANCE = 1e-3
@@ -59,7 +61,8 @@ class Camera:
     Attributes:
         K: (3,3) float64 intrinsics in pixels.
         w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that
-            gradients reach it.
+            gradients reach it. A rotation that rounding has left not quite orthonormal is read as
+            the nearest one, and the camera stays where it is; see `rigid`.
         width, height: image size in pixels.
         model: ``pinhole``, ``opencv`` or ``opencv_fisheye``.
         distortion: coefficients in OpenCV's order; empty for ``pinhole``.
@@ -83,7 +86,10 @@ class Camera:
         put("K", _checked_intrinsics(where, self.K))
         pose = _checked_pose(where, _as_numpy(self.w2c))
         if not _is_tensor(self.w2c):
-            put("w2c", pose)
+            if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > _ROUNDING:
+                pose = pose.copy()
+                pose[:3, :3], pose[:3, 3] = rigid(pose)
+            put("w2c", _read_only(pose))
         for axis in ("width", "height"):
             value = getattr(self, axis)
             if not (np.isfinite(value) and value >= 1 and int(value) == value):
@@ -94,10 +100,10 @@ class Camera:
     @property
     def c2w(self) -> np.ndarray:
         """(4,4) float64 camera to world (detached)."""
-        w2c = _as_numpy(self.w2c).astype(np.float64)
+        rotation, translation = self._rigid()
         c2w = np.eye(4)
-        c2w[:3, :3] = w2c[:3, :3].T
-        c2w[:3, 3] = -w2c[:3, :3].T @ w2c[:3, 3]
+        c2w[:3, :3] = rotation.T
+        c2w[:3, 3] = -rotation.T @ translation
         return c2w
 
     @property
@@ -139,8 +145,8 @@ class Camera:
             pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye
             lenses, which may see behind themselves.
         """
-        w2c = _as_numpy(self.w2c).astype(np.float64)
-        local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ w2c[:3, :3].T + w2c[:3, 3]
+        rotation, translation = self._rigid()
+        local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ rotation.T + translation
         return self._project_local(local), local[:, 2]
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
@@ -189,6 +195,11 @@ class Camera:
             "sampler": {"type": "independent", "sample_count": 1},
         }
 
+    def _rigid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3,3) and translation (3,) of w2c in float64 (detached)."""
+        w2c = _as_numpy(self.w2c).astype(np.float64)
+        return rigid(w2c) if _is_tensor(self.w2c) else (w2c[:3, :3], w2c[:3, 3])
+
     def _camera_directions(self, pixels: np.ndarray) -> np.ndarray:
         """(P,3) unit directions in the camera's frame through pixels (P,2)."""
         if self.model == "opencv_fisheye":
@@ -232,6 +243,27 @@ class Camera:
         y = (pixels[:, 1] - self.K[1, 2]) / self.K[1, 1]
         x = (pixels[:, 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
         return np.stack([x, y], axis=-1)
+
+
+# -------------------------------------------------- poses
+
+
+def rigid(w2c: Any) -> tuple[Any, Any]:
+    """The rigid motion that a world-to-camera matrix means: nearest rotation (3,3) and translation (3,).
+
+    Files and float32 leave rotations orthonormal to 1e-5 or 1e-7 only. Then R^-1 and R^T are two things, and whoever
+    takes rays from one and projections from the other sees two pictures: of a camera 100 units from the origin they
+    differ by tenths of a pixel. The camera stays where it is, at the point that w2c maps to 0.
+
+    Args:
+        w2c: (4,4) or (3,4), NumPy or torch; gradients pass, and what they have across rigid motions is gone.
+    """
+    R, t = w2c[:3, :3], w2c[:3, 3]
+    inverse, rotation = R.T, R
+    for _ in range(3):  # Newton's iterations: an error e becomes e^2
+        inverse = 2 * inverse - inverse @ R @ inverse
+        rotation = 1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation
+    return rotation, rotation @ (inverse @ t)
 
 
 # -------------------------------------------------- frames

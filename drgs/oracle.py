@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from drgs.cameras import rigid
+
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
@@ -88,9 +90,16 @@ def activate(g, s: RenderSettings) -> SimpleNamespace:
     )
 
 
-def intrinsics(cam) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels."""
-    return float(cam.K[0][0]), float(cam.K[1][1]), float(cam.K[0][2]), float(cam.K[1][2])
+def intrinsics(cam) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of K, in pixels: the (2, 2) that acts on x/z and y/z, skew included, and the principal point (2,).
+
+    Raises:
+        ValueError: If the last row of K is not 0 0 1: that is no camera with its axis along z.
+    """
+    K = float64(cam.K).detach()
+    if tuple(K.shape) != (3, 3) or K[2].tolist() != [0, 0, 1]:
+        raise ValueError(f"reference: K must be (3, 3) with last row 0 0 1, got {K.tolist()}; see drgs.Camera")
+    return K[:2, :2], K[:2, 2]
 
 
 def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -98,8 +107,9 @@ def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
     u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
     if getattr(cam, "model", "pinhole") == "pinhole":
-        fx, fy, cx, cy = intrinsics(cam)
-        local = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], dim=-1)
+        scale, shift = intrinsics(cam)
+        plane = torch.linalg.solve(scale, (torch.stack([u, v], dim=-1) - shift).T).T
+        local = torch.cat([plane, torch.ones_like(u)[:, None]], dim=-1)
     else:
         # The lens acts in the camera frame: only the rotation out of it carries the pose gradient.
         local = float64(cam.pixel_directions()).reshape(-1, 3) @ rotation.detach().T
@@ -127,17 +137,18 @@ def screen_rows(x, y, z, cam, fov_clamp: str, rotation: torch.Tensor, axes: torc
         fov_clamp: Of `RenderSettings`.
         rotation: (3, 3) of w2c.
     """
-    fx, fy, cx, cy = intrinsics(cam)
+    scale, shift = intrinsics(cam)
     slopes = []
-    for slope, f, c, size in ((x / z, fx, cx, cam.width), (y / z, fy, cy, cam.height)):
+    axes_of = zip((x / z, y / z), scale.diagonal(), shift, (cam.width, cam.height), strict=True)
+    for slope, f, c, size in axes_of:  # no rasterizer's clamp knows of skew
         tan = size / (2 * f)
         if fov_clamp == "inria":
             slope = slope.clamp(-1.3 * tan, 1.3 * tan)
         elif fov_clamp == "gsplat":
             slope = slope.clamp(-(c / f + 0.3 * tan), (size - c) / f + 0.3 * tan)
         slopes.append(slope)
-    jacobian = [fx / z, 0 * z, -fx * slopes[0] / z, 0 * z, fy / z, -fy * slopes[1] / z]
-    return torch.stack(jacobian, dim=-1).reshape(-1, 2, 3) @ rotation @ axes
+    jacobian = [1 / z, 0 * z, -slopes[0] / z, 0 * z, 1 / z, -slopes[1] / z]
+    return scale @ torch.stack(jacobian, dim=-1).reshape(-1, 2, 3) @ rotation @ axes
 
 
 def sh_colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
@@ -163,8 +174,8 @@ def view_rays(g, cam, rays, window=None) -> SimpleNamespace:
     offset = float64(getattr(g, "origin", (0, 0, 0)))
     rotation = center = None
     if cam is not None:
-        w2c = float64(cam.w2c)
-        rotation, center = w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3] - offset
+        rotation, translation = rigid(float64(cam.w2c))
+        center = -rotation.T @ translation - offset
     if rays is None:
         pixels, directions = camera_rays(cam, rotation)
         shape = (cam.height, cam.width)

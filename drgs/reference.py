@@ -84,9 +84,9 @@ def render(
             (N,), `sh` (N,K,3), `features` (N,D) or None, and maybe `origin` (3,). Gradients reach
             these tensors.
         cam: Anything with `K`, `w2c`, `width`, `height` as `drgs.Camera`. A torch `w2c` (4,4) gets
-            a gradient; its part tangent to rigid motions is the meaningful one, as R^-1 is taken
-            to be R^T. With `rays` it only gives the center for `order="center"` and SH directions
-            and may be None: then that center is each ray's own origin.
+            a gradient along rigid motions, as it is read as one (`cameras.rigid`). With `rays` it
+            only gives the center for `order="center"` and SH directions and may be None: then that
+            center is each ray's own origin.
         settings: The `RenderSettings`; `traversal` plays no role here.
         rays: Origins and directions, (..., 3) each, in place of the camera's; not for `ewa`.
         tolerance: A pixel is `ambiguous` when rounding could move a weight by more than 1e-7:
@@ -144,9 +144,9 @@ def _project(scene: SimpleNamespace, cam, rotation, center, s: RenderSettings, t
     Tile bounds: three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by
     the tolerance, exact, grown by it. None without tile culling.
     """
-    fx, fy, cx, cy = intrinsics(cam)
+    scale, shift = intrinsics(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
-    mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    mean2d = torch.stack([x / z, y / z], dim=-1) @ scale.T + shift
     rows = screen_rows(x, y, z, cam, s.fov_clamp, rotation, scene.axes)
     diagonal = rows.square().sum(-1) + s.dilation
     if s.culling == "extent":

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from drgs import runtime
-from drgs.cameras import Camera
+from drgs.cameras import Camera, rigid
 
 runtime.backend()  # chooses libLLVM, which has to happen before drjit is imported
 import drjit as dr  # noqa: E402
@@ -97,10 +97,10 @@ class Scene:
         self.view = None
 
     def _pose(self):
-        """w2c in float64; a copy of an array, which may be read-only."""
+        """(3, 4) of w2c in float64, as the rigid motion that it means; a copy of an array, which may be read-only."""
         w2c = self.camera.w2c
         if not isinstance(w2c, torch.Tensor):
-            return torch.tensor(w2c).to(torch.float64)
+            return torch.tensor(w2c).to(torch.float64)[:3]
         # The camera has checked it, but an optimizer may have moved it since.
         bad = ~torch.isfinite(w2c.detach())
         if bool(bad.any()):
@@ -108,7 +108,8 @@ class Scene:
             raise ValueError(
                 f"render: the pose must be finite, got {float(w2c[tuple(at)]):g} at {at}; go back to the last good one"
             )
-        return w2c.to(torch.float64)
+        rotation, translation = rigid(w2c.to(torch.float64))
+        return torch.cat([rotation, translation[:, None]], 1)
 
     def _set_rays(self, o, d):
         if self.settings.traversal == "bvh":

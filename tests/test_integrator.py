@@ -81,9 +81,9 @@ def traversals(response, order):
 
 
 def scene(rng, kind, **options):
-    """Gaussians and camera of a kind, some Gaussians around the camera, of mixed anisotropy and opacity."""
+    """Gaussians and skewed camera of a kind, some Gaussians around the camera, of mixed anisotropy and opacity."""
     size, n, K, D, _ = kind
-    cam = camera(rng, size)
+    cam = camera(rng, size, skew=0.2)
     shape = {"anisotropy": rng.choice([0.1, 0.5, 1.2]), "opacity": rng.choice([1.0, 3.0])}
     return around_camera(gaussians(rng, n, K, D, **{**shape, **options}), cam), cam
 
