@@ -104,8 +104,8 @@ def rasterization(
         NotImplementedError: If an option of gsplat's is asked for that does not exist here; the way round is named.
     Gradients:
         With respect to means, quats, scales, opacities, colors, viewmats and backgrounds, in reverse and forward mode;
-        with respect to viewmats as rigid motions (SH see the camera's center at -R^T t, gsplat's at -R^-1 t: no
-        difference along any motion of a camera).
+        with respect to viewmats along rigid motions only (`drgs.cameras.rigid`): what a 4x4 matrix can do besides, and
+        gsplat differentiates too, is no motion of a camera.
         No gradient passes through `means2d`: density control that needs its norm (gsplat's DefaultStrategy) has none,
         gsplat's MCMCStrategy works.
     Reference:
