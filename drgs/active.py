@@ -12,13 +12,13 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from drgs.arguments import check_fields
 from drgs.files import SCHEMA, Run, write_json
 from drgs.frames import Frame, load_frames, reduced_size
 from drgs.progress import Bar
@@ -34,7 +34,6 @@ __all__ = [
     "ActiveConfig",
     "ActiveViews",
     "at_most",
-    "fitted_views",
     "initial_views",
     "resized_alike",
 ]
@@ -82,17 +81,12 @@ class ActiveConfig:
         from drgs.gain import CRITERIA
         from drgs.select import POLICIES
 
-        for name, low in (("initial", 1), ("add", 1), ("every", 1), ("info_pixels", 1)):
-            value = getattr(self, name)
-            if value is None and name == "info_pixels":
-                continue
-            if not (isinstance(value, int) and value >= low):
-                hint = "; without --views active all views are used" if name == "add" else ""
-                raise ValueError(f"active: {name} must be a whole number >= {low}, got {value!r}{hint}")
+        if self.add == 0:
+            raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
+        count = (1, 10**9)
+        ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
         choices = {"policy": POLICIES, "criterion": CRITERIA, "method": METHODS, "pick_points": PICK_POINTS}
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise ValueError(f"active: {name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+        check_fields("active", self, ranges, choices)
         self.make_prior()
 
     def make_prior(self):
@@ -344,24 +338,3 @@ def initial_views(cameras: list[Camera], count: int) -> list[int]:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(centers - centers[chosen[-1]], axis=1))
     return chosen
-
-
-def fitted_views(run: Run) -> list[str]:
-    """Names of the views that a run was fitted to: all of its training split, or those chosen so far.
-
-    Raises:
-        FileNotFoundError: If it is no run folder, or an active run without selection.json.
-        ValueError: If a file is damaged.
-    """
-    config = run.config()
-    if not config.get("active"):
-        return config["train"]
-    path = run.path / SELECTION
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must record the chosen views, found none; resume the fit")
-    try:
-        selection = json.loads(path.read_text(encoding="utf-8"))
-        return [view["name"] for view in (*selection["start"], *selection["picks"])]
-    except (ValueError, KeyError, TypeError) as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"{path}: must be a selection.json, got {text}; resume the fit") from None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras import Camera, intrinsics
+from drgs.cameras import Camera, intrinsics, inverse_pose
 from drgs.files import atomic_write
 from drgs.json_files import check_json, read_json
 
@@ -74,10 +74,7 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
         sizes = len(entry["position"]), [len(row) for row in entry["rotation"]]
         if sizes != (3, [3, 3, 3]):
             raise ValueError(f"{where}: position must hold 3 numbers and rotation 3x3, got other sizes; correct them")
-        rotation = np.array(entry["rotation"], np.float64)
-        # The rotation's transpose stands for its inverse; Camera refuses what is not a rotation.
-        w2c = np.eye(4)
-        w2c[:3, :3], w2c[:3, 3] = rotation.T, -rotation.T @ np.array(entry["position"], np.float64)
+        w2c = inverse_pose(where, np.column_stack([entry["rotation"], entry["position"]]))
         name = str(entry.get("img_name", entry.get("id", index)))
         try:
             K = intrinsics(entry["fx"], entry["fy"], center["cx"], center["cy"])

@@ -20,12 +20,24 @@ Conventions, stated once for the whole project:
 from __future__ import annotations
 
 import dataclasses
+import numbers
 import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from drgs.camera_checks import (
+    IMAGE_MAX,
+    as_numpy,
+    check_distance,
+    check_proportions,
+    checked_distortion,
+    checked_intrinsics,
+    checked_pose,
+    is_tensor,
+    read_only,
+)
 from drgs.lenses import (
     distort_opencv,
     fisheye_directions,
@@ -41,13 +53,12 @@ __all__ = [
     "c2w_to_opengl",
     "intrinsics",
     "intrinsics_from_fov",
+    "inverse_pose",
     "look_at",
     "orbit",
     "rigid",
 ]
 
-_OPENCV_LENGTHS = (4, 5, 8)
-_ROTATION_TOLERANCE = 1e-4
 _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded in a file or an optimizer
 # An undistorted pixel must come back to itself; beyond this many pixels the lens model has no
 # inverse there.
@@ -83,19 +94,24 @@ class Camera:
     def __post_init__(self) -> None:
         where = f"Camera {self.name!r}" if self.name else "Camera"
         put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 (the dataclass is frozen)
-        put("K", _checked_intrinsics(where, self.K))
-        pose = _checked_pose(where, _as_numpy(self.w2c))
-        if not _is_tensor(self.w2c):
+        put("K", checked_intrinsics(where, self.K))
+        pose = checked_pose(where, as_numpy(self.w2c))
+        if not is_tensor(self.w2c):
             if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > _ROUNDING:
                 pose = pose.copy()
                 pose[:3, :3], pose[:3, 3] = rigid(pose)
-            put("w2c", _read_only(pose))
+            put("w2c", read_only(pose))
         for axis in ("width", "height"):
             value = getattr(self, axis)
-            if not (np.isfinite(value) and value >= 1 and int(value) == value):
-                raise ValueError(f"{where}: {axis} must be a whole number of pixels >= 1, got {value}; correct it")
+            is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+            if not (is_number and 1 <= value < np.inf and int(value) == value):
+                raise ValueError(f"{where}: {axis} must be a whole number of pixels >= 1, got {value!r}; correct it")
             put(axis, int(value))
-        put("distortion", _checked_distortion(where, self.model, self.distortion))
+        if self.width * self.height > IMAGE_MAX:
+            shown = "x".join(str(side) if side <= 10**12 else "10^12 or more" for side in (self.width, self.height))
+            raise ValueError(f"{where}: an image must have at most 2^31 pixels, got {shown}; correct its size")
+        check_proportions(where, self.K, (self.width, self.height))
+        put("distortion", checked_distortion(where, self.model, self.distortion))
 
     @property
     def c2w(self) -> np.ndarray:
@@ -197,8 +213,8 @@ class Camera:
 
     def _rigid(self) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (3,3) and translation (3,) of w2c in float64 (detached)."""
-        w2c = _as_numpy(self.w2c).astype(np.float64)
-        return rigid(w2c) if _is_tensor(self.w2c) else (w2c[:3, :3], w2c[:3, 3])
+        w2c = as_numpy(self.w2c).astype(np.float64)
+        return rigid(w2c) if is_tensor(self.w2c) else (w2c[:3, :3], w2c[:3, 3])
 
     def _camera_directions(self, pixels: np.ndarray) -> np.ndarray:
         """(P,3) unit directions in the camera's frame through pixels (P,2)."""
@@ -383,73 +399,18 @@ def orbit(
     return cameras
 
 
-# -------------------------------------------------- checks
+def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
+    """(4,4) w2c of a c2w (3 or 4 rows) that a file states; a rotation's transpose stands for its inverse.
 
+    `Camera` then refuses what is no rotation.
 
-def _is_tensor(value: Any) -> bool:
-    """Whether a value is a torch tensor, told without importing torch."""
-    return hasattr(value, "detach")
-
-
-def _as_numpy(value: Any) -> np.ndarray:
-    if not _is_tensor(value):
-        return np.asarray(value)
-    from drgs.runtime import unwrapped
-
-    return unwrapped(value, lambda values: values.cpu().numpy())
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-    array = np.array(array, dtype=np.float64)
-    array.setflags(write=False)
-    return array
-
-
-def _checked_intrinsics(where: str, K: Any) -> np.ndarray:
-    K = _read_only(_as_numpy(K))
-    if K.shape != (3, 3):
-        raise ValueError(f"{where}: K must have shape (3, 3), got {K.shape}; see drgs.cameras.intrinsics")
-    if not np.isfinite(K).all():
-        raise ValueError(f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct it")
-    if not (K[0, 0] > 0 and K[1, 1] > 0):
-        raise ValueError(f"{where}: focal lengths must be positive, got {K[0, 0]:g} and {K[1, 1]:g}; correct K")
-    if K[1, 0] != 0 or tuple(K[2]) != (0.0, 0.0, 1.0):
-        raise ValueError(f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct it")
-    return K
-
-
-def _checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
-    w2c = _read_only(w2c)
-    if w2c.shape != (4, 4):
-        raise ValueError(f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1")
-    if not np.isfinite(w2c).all():
-        row, column = np.argwhere(~np.isfinite(w2c))[0]
-        raise ValueError(
-            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop this view"
-        )
-    if np.abs(w2c[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise ValueError(f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
-    rotation = w2c[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        got = f"an error of {error:.2g}" if error > _ROTATION_TOLERANCE else "a reflection"
-        raise ValueError(
-            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove scale and flips"
-        )
+    Raises:
+        ValueError: a number is not finite or beyond reason.
+    """
+    c2w = np.asarray(c2w, np.float64)
+    if not np.isfinite(c2w).all():
+        raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; drop this view")
+    check_distance(where, c2w)
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
     return w2c
-
-
-def _checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, ...]:
-    values = tuple(float(v) for v in distortion)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{where}: distortion must be finite, got {values}; correct it")
-    lengths = {"pinhole": (0,), "opencv": _OPENCV_LENGTHS, "opencv_fisheye": (4,)}.get(model)
-    if lengths is None:
-        raise ValueError(f"{where}: model must be pinhole, opencv or opencv_fisheye, got {model!r}; choose one")
-    if len(values) not in lengths:
-        raise ValueError(
-            f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion "
-            f"coefficients, got {len(values)}; "
-            "pad with zeros"
-        )
-    return values

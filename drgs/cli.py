@@ -61,6 +61,8 @@ def main(argv: list[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])
     logging.getLogger("drgs").setLevel(logging.WARNING if args.quiet else logging.INFO)
     try:
+        if not 0 <= getattr(args, "seed", 0) < 1 << 31:
+            raise ValueError(f"--seed must be in [0, {(1 << 31) - 1}], got {args.seed}; choose another")
         # Whatever a command does without a bar of its own is not silent either.
         with Bar(f"drgs {name}", show=not args.quiet, lines_only=True):
             with Bar("loading libraries"):

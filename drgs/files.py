@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from drgs.foreign import refuse_foreign
+from drgs.json_files import parse_json, read_json
 
 if TYPE_CHECKING:
     import torch
@@ -279,11 +280,12 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
     refuse_foreign(path, "a checkpoint")
     try:
         with safe_open(str(path), "pt") as file:
-            header = json.loads((file.metadata() or {}).get("drgs", "{}"))
-            if header.get("schema") != SCHEMA:
-                raise ValueError(f"{path}: checkpoint schema must be {SCHEMA}, got {header.get('schema')}; fit again")
+            header = parse_json((file.metadata() or {}).get("drgs", "{}"), str(path))
+            schema = header.get("schema") if isinstance(header, dict) else None
+            if schema != SCHEMA:
+                raise ValueError(f"{path}: checkpoint schema must be {SCHEMA}, got {schema!r}; fit again")
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
-    except (SafetensorError, json.JSONDecodeError, struct.error) as error:
+    except (SafetensorError, struct.error) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: must be a checkpoint, got {text}; start without --resume") from None
 
@@ -345,13 +347,10 @@ class Run:
         path = self.path / "config.json"
         if not path.is_file():
             raise FileNotFoundError(f"{self.path}: must be a run folder, found no config.json; run `drgs fit` first")
-        try:
-            config = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{path}: must be valid JSON, got {error}; fit again") from None
+        config = read_json(path, "a run's config.json", "fit again")
         if not isinstance(config, dict) or config.get("schema") != SCHEMA:
             got = config.get("schema") if isinstance(config, dict) else type(config).__name__
-            raise ValueError(f"{path}: schema must be {SCHEMA}, got {got}; fit again")
+            raise ValueError(f"{path}: schema must be {SCHEMA}, got {got!r}; fit again")
         return config
 
     def log(self, event: str, **fields: Any) -> None:

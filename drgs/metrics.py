@@ -257,27 +257,26 @@ def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fie
 
 def run_eval(args: Eval) -> None:
     """`drgs eval RUN`."""
-    from drgs.active import fitted_views
     from drgs.data import load
     from drgs.frames import load_frames
-    from drgs.trainer import FitConfig
+    from drgs.run_records import fit_record, fitted_views
 
     run = Run(args.run)
-    recorded = run.config()
-    config = FitConfig.from_json(recorded["fit"])
+    recorded = fit_record(run)
+    config = recorded.config
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
     g = load_ply(run.point_cloud)
     # Of an active run, images may be missing that were never picked.
     dataset = load(
-        recorded["data"],
+        recorded.data,
         test_every=config.test_every,
         background=config.settings.background,
-        lazy=bool(recorded.get("active")),
+        lazy=recorded.is_active,
         points=False,
         strict=args.strict,
     )
     train, test = dataset.split()
-    if recorded.get("active"):  # the rest of the training split was never seen
+    if recorded.is_active:  # the rest of the training split was never seen
         fitted = fitted_views(run)
         train = [view for view in train if view.name in fitted]
     views = {"test": test, "train": train, "all": train + test}[args.split]

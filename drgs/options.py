@@ -81,6 +81,8 @@ class _Settings(_Common):
                 what = "KEY=VALUE" if not equals else "a render setting"
                 raise ValueError(f"--set: must be {what}, got {text!r}; known: {', '.join(hints)}")
             values[key] = _parse(key, hints[key], value)
+        if "background" in values:
+            check_color("--set background", values["background"])
         return values
 
 
@@ -214,6 +216,7 @@ class Fit(_Policy, _Data):
         """As for every command, with the background that the photographs are composited on."""
         if any(text.startswith("background=") for text in self.overrides):
             raise ValueError("--set background: must be --background here, which photographs are composited on as well")
+        check_color("--background", self.background)
         return super().settings().replace(background=self.background)
 
     def active(self):
@@ -374,6 +377,13 @@ class Demo(_Common):
     """Folder for pictures and tables."""
     quick: bool = False
     """Half a minute with poor pictures, to see that everything runs."""
+
+
+def check_color(option: str, color: tuple[float, ...]) -> None:
+    """Raise ValueError unless a color of an option is one that a photograph can have: R, G, B in [0, 1]."""
+    if len(color) != 3 or not all(0 <= x <= 1 for x in color):
+        got = " ".join(f"{x:g}" for x in color)
+        raise ValueError(f"{option} must be R, G and B in [0, 1], got {got}; 255 is 1.0 here")
 
 
 def _parse(key: str, hint, text: str):

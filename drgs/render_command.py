@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import statistics
 import time
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.foreign import refuse_foreign
 from drgs.orbits import UP, capture_orbit, scene_orbit
 from drgs.progress import Bar
+from drgs.run_records import fit_record
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -38,8 +40,9 @@ __all__ = [
     "make_folder",
     "render_views",
     "run",
-    "run_background",
 ]
+
+_log = logging.getLogger(__name__)
 
 _FORMATS = ("png", "exr", "webm")
 _MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
@@ -53,7 +56,7 @@ def run(args: Render) -> None:
     gaussians, folder = load_scene(args.scene)
     if folder is not None and not any(text.startswith("background=") for text in args.overrides):
         # A run was fitted over its background; over another one its edges show a halo.
-        settings = settings.replace(background=run_background(folder))
+        settings = settings.replace(background=fit_record(folder).config.settings.background)
     size = args.width or 640, args.height or round((args.width or 640) * 0.75)
     cameras, source = cameras_of(args, args.cameras, gaussians, folder, args.frames, size)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
@@ -111,7 +114,7 @@ def render_views(
         and views (camera, files, seconds, rays, redone).
     """
     outputs = ("depth",) if depth or "exr" in formats else ()
-    views = []
+    views, seen = [], False
     movie = pictures.Video(out_dir / video, fps) if "webm" in formats else None
     with movie or contextlib.nullcontext():
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
@@ -134,10 +137,18 @@ def render_views(
                 files.append(f"{name}.depth.png")
             if movie is not None:
                 movie.write(rgb)
+            seen = seen or bool(alpha.any())
             made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
             views.append({"camera": described(camera), "files": files, "seconds": seconds, **made})
             if advance:
                 advance()
+    if not seen:
+        _log.warning(
+            "none of the %d views shows anything of the scene: do the cameras belong to it? (near is %g, extent %s)",
+            len(views),
+            settings.near,
+            settings.extent,
+        )
     times = [view["seconds"] for view in views]
     total = {key: _total(view[key] for view in views) for key in ("rays", "redone")}
     return {
@@ -186,20 +197,12 @@ def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
         return load_ply(path), None
     folder = Run(path)
     refuse_foreign(path, "a run folder or a 3DGS PLY file")
-    folder.config()  # says that it is no run folder, or of another version
+    fit_record(folder)  # says that it is no run folder, or of another version
     if not folder.point_cloud.is_file():
         raise FileNotFoundError(
             f"{path}: must hold point_cloud.ply, found none; the fit has not reached its first checkpoint"
         )
     return load_ply(folder.point_cloud), folder
-
-
-def run_background(folder: Run) -> tuple[float, ...]:
-    """The RGB that a run was fitted over."""
-    try:
-        return tuple(folder.config()["fit"]["settings"]["background"])
-    except (KeyError, TypeError):
-        raise ValueError(f"{folder.path}/config.json: must record the fit's settings, does not; fit again") from None
 
 
 def cameras_of(
@@ -257,8 +260,8 @@ def _dataset(path: Path, strict: bool) -> tuple[Dataset, int | None]:
     from drgs.data import load
 
     if (path / "config.json").is_file() and (path / "log.jsonl").is_file():
-        config = Run(path).config()
-        return load(config["data"], strict=strict), config["fit"]["test_every"]
+        record = fit_record(Run(path))
+        return load(record.data, strict=strict), record.config.test_every
     return load(path, strict=strict), None
 
 

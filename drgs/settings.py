@@ -8,7 +8,8 @@ changes an image lives anywhere else. Symbols: ``a`` opacity of one hit, ``alpha
 from __future__ import annotations
 
 import dataclasses
-import math
+
+from drgs.arguments import check_fields, must_be
 
 __all__ = ["PRESETS", "RenderSettings", "legal"]
 
@@ -24,6 +25,15 @@ _CHOICES = {
     "fov_clamp": ("none", "inria", "gsplat"),
     "culling": ("extent", "inria", "gsplat"),
     "sh_direction": ("gaussian", "ray"),
+}
+_RANGES = {
+    "extent": (0.0, 1e3),
+    "alpha_min": (0.0, 1.0),
+    "alpha_max": (0.0, 1.0),
+    "transmittance_min": (0.0, 1.0),
+    "dilation": (0.0, 1e3),
+    "near": (0.0, 1e30),  # float32 holds it
+    "background": (-1e30, 1e30),
 }
 
 
@@ -73,28 +83,10 @@ class RenderSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        for name, allowed in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in allowed:
-                raise ValueError(f"RenderSettings: {name} must be one of {', '.join(allowed)}, got {value!r}")
-        if self.extent is not None and not (0 < self.extent < 1e3):
-            raise ValueError(f"RenderSettings: extent must be in (0, 1000) sigma or None, got {self.extent!r}")
-        for name, low, high in (
-            ("alpha_min", 0.0, 1.0),
-            ("alpha_max", 0.0, 1.0),
-            ("transmittance_min", 0.0, 1.0),
-            ("dilation", 0.0, 1e3),
-            ("near", 0.0, math.inf),
-        ):
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and low <= value <= high):
-                raise ValueError(f"RenderSettings: {name} must be in [{low}, {high}], got {value!r}")
-        if self.alpha_max == 0:
-            raise ValueError("RenderSettings: alpha_max must be > 0, got 0")
-        background = tuple(float(x) for x in self.background)
-        if len(background) != 3 or not all(map(math.isfinite, background)):
-            raise ValueError(f"RenderSettings: background must be 3 finite numbers, got {self.background!r}")
-        object.__setattr__(self, "background", background)
+        check_fields("RenderSettings", self, _RANGES, _CHOICES)
+        for name in ("extent", "alpha_max"):
+            if getattr(self, name) == 0:
+                raise ValueError(f"RenderSettings: {name} must be > 0, got 0")
         problem = legal(self)
         if problem:
             raise NotImplementedError(f"RenderSettings: {problem}")
@@ -150,6 +142,7 @@ class RenderSettings:
                 "culling": "gsplat",
             },
         }
+        must_be("RenderSettings.preset", "name", name, str, 'e.g. RenderSettings.preset("fast", extent=4.0)')
         if name not in table:
             raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
         return cls().replace(**{**table[name], **overrides})

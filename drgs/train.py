@@ -21,11 +21,13 @@ import torch
 import drgs
 from drgs import metrics
 from drgs.active import ActiveConfig, ActiveViews
+from drgs.data.views import check_parallax
 from drgs.density import Model
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.frames import Frame, load_frames
 from drgs.pictures import write_png
 from drgs.progress import Bar
+from drgs.run_records import check_checkpoint
 from drgs.trainer import FitConfig, Trainer
 
 if TYPE_CHECKING:
@@ -89,10 +91,13 @@ def fit(
 
 def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resume: bool) -> FitResult:
     train, test = dataset.split(config.test_every)
+    if train:
+        check_parallax(train)
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
     tensors, header = load_state(run.state) if resume and run.state.is_file() else (None, None)
     if header:
+        check_checkpoint(run.state, tensors, header)
         was, now = ("active" if x else "all" for x in (header.get("active"), plan))
         if was != now:
             raise ValueError(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 
 import drgs
+from drgs.arguments import check_fields, must_be
 from drgs.density import Model, add_gaussians, explore, relocate
 from drgs.losses import photometric_loss
 from drgs.settings import RenderSettings
@@ -25,6 +26,26 @@ if TYPE_CHECKING:
 __all__ = ["FitConfig", "Trainer"]
 
 _MAX_BAD_STEPS = 10
+
+_COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
+_RANGES = {
+    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
+    "test_every": (0, 10**9),
+    "seed": (0, 2**31 - 1),  # what COLMAP takes
+    "means_rate": (1e-30, 1e6),  # their logarithms are interpolated
+    **dict.fromkeys(("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate"), _RATE),
+    **dict.fromkeys(("outside_weight", "opacity_weight", "scale_weight", "noise"), _WEIGHT),
+    **dict.fromkeys(("initial_opacity", "dense_opacity"), (1e-6, 1 - 1e-6)),
+    **dict.fromkeys(("ssim_weight", "sh_every", "refine_start", "refine_stop", "refine_every"), _SHARE),
+    **dict.fromkeys(("min_opacity", "grow_until"), _SHARE),
+    "dense_scale": (1e-6, 1e6),
+    "jitter": (0.0, 1e3),
+}
+_CHOICES = {
+    "mask": ("auto", "object", "valid", "ignore"),
+    "init_points": ("auto", "views", "all"),
+    "sh_degree": (0, 1, 2, 3),
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,18 +118,9 @@ class FitConfig:
     jitter: float = 0.1
 
     def __post_init__(self):
-        for name, low in (("max_steps", 1), ("max_pixels", 1), ("max_gaussians", 1), ("save_every", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if not (isinstance(value, int) and value >= low):
-                raise ValueError(f"fit: {name} must be a whole number >= {low}, got {value!r}")
-        for name, allowed in {
-            "mask": ("auto", "object", "valid", "ignore"),
-            "init_points": ("auto", "views", "all"),
-            "sh_degree": (0, 1, 2, 3),
-        }.items():
-            value = getattr(self, name)
-            if value not in allowed:
-                raise ValueError(f"fit: {name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
+        check_fields("fit", self, _RANGES, _CHOICES)
+        if self.test_every == 1:
+            raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
 
     def start_of(self, dense: bool) -> tuple[float, float]:
         """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
@@ -122,6 +134,8 @@ class FitConfig:
     def from_json(cls, value: dict) -> FitConfig:
         """The inverse of `to_json`; unknown fields raise ValueError."""
         known = {field.name for field in dataclasses.fields(cls)}
+        must_be("fit", "config", value, dict, "as FitConfig.to_json() makes it")
+        must_be("fit", "settings", value.get("settings", {}), dict, "the fields of a RenderSettings")
         if unknown := sorted(set(value) - known):
             raise ValueError(f"fit: config must hold known fields, got {unknown[0]!r}; was it written by a newer drgs?")
         settings = RenderSettings().replace(**value.get("settings", {}))

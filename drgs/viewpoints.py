@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.active import at_most, fitted_views, resized_alike
+from drgs.active import at_most, resized_alike
 from drgs.camera_lists import load_cameras_json
 from drgs.cameras import Camera, orbit
 from drgs.files import Run
 from drgs.orbits import UP, capture_orbit, scene_orbit
-from drgs.render_command import cameras_of, is_camera_list, load_scene, run_background
+from drgs.render_command import cameras_of, is_camera_list, load_scene
+from drgs.run_records import fit_record, fitted_views
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -85,9 +86,9 @@ def scene_of(args: Select | Fisher) -> Scene:
     gaussians, run = load_scene(args.scene)
     pixels = args.info_pixels or _PIXELS
     if run is not None:
-        pixels = args.info_pixels or run.config()["fit"]["max_pixels"]
+        pixels = args.info_pixels or fit_record(run).config.max_pixels
         if not any(text.startswith("background=") for text in args.overrides):
-            settings = settings.replace(background=run_background(run))
+            settings = settings.replace(background=fit_record(run).config.settings.background)
     return Scene(gaussians, run, settings, pixels, args.strict)
 
 
@@ -110,7 +111,7 @@ def known_views(text: str | None, scene: Scene) -> Known:
         views = _load(path, scene).views
         return Known([_camera(view, {}, scene.pixels) for view in views], str(path), path.resolve())
     run = Run(path)
-    data, names = Path(run.config()["data"]), fitted_views(run)
+    data, names = fit_record(run).data, fitted_views(run)
     views = {view.name: view for view in _load(data, scene).views}
     if missing := [name for name in names if name not in views]:
         raise ValueError(
@@ -148,10 +149,10 @@ def other_views(option: str, text: str, args: Select | Fisher, scene: Scene, kno
         return [at_most(camera, scene.pixels) for camera in load_cameras_json(path)], text
     every = 8
     if _is_run(path):
-        config = Run(path).config()
-        path, every = Path(config["data"]), config["fit"]["test_every"]
+        record = fit_record(Run(path))
+        path, every = record.data, record.config.test_every
     elif scene.run is not None:
-        every = scene.run.config()["fit"]["test_every"]
+        every = fit_record(scene.run).config.test_every
     dataset = _load(path, scene)
     train, test = dataset.split(every)
     views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
@@ -217,7 +218,7 @@ def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera]
     gaussians, run = load_scene(args.scene)
     fields = args.replaced()
     if run is not None:
-        fields = {"background": run_background(run)} | fields
+        fields = {"background": fit_record(run).config.settings.background} | fields
     text = args.cameras or ("orbit" if run is None else str(run.path))
     width = max(1, int(math.sqrt(args.max_pixels * 4 / 3)))
     size = width, max(1, args.max_pixels // width)

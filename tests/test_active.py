@@ -14,10 +14,11 @@ from test_data import HEIGHT, WIDTH, gradient, poses, save, write_colmap, write_
 
 import drgs
 from drgs import cli
-from drgs.active import ActiveConfig, ActiveViews, fitted_views, initial_views
+from drgs.active import ActiveConfig, ActiveViews, initial_views
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
+from drgs.run_records import fitted_views
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 24
@@ -360,10 +361,10 @@ def test_fitted_views_of_other_runs(still, tmp_path):
     assert fitted_views(Run(tmp_path / "all")) == ["1", "2", "3", "5", "6", "7"]
     fit(lazily(still), tmp_path / "run", config(), active=plan(), progress=False)
     (tmp_path / "run/selection.json").write_text('{"start": 3}')
-    with pytest.raises(ValueError, match="selection.json: must be a selection.json, got"):
+    with pytest.raises(ValueError, match="selection.json: start must be a list, got 3; resume the fit"):
         fitted_views(Run(tmp_path / "run"))
     (tmp_path / "run/selection.json").unlink()
-    with pytest.raises(FileNotFoundError, match="must record the chosen views, found none"):
+    with pytest.raises(FileNotFoundError, match="must be the record of the chosen views, found none"):
         fitted_views(Run(tmp_path / "run"))
 
 
@@ -450,14 +451,14 @@ def test_command(still, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--views active --add 0", "add must be a whole number >= 1, got 0"),
-        ("--views active --initial 0", "initial must be a whole number >= 1, got 0"),
-        ("--views active --every 0", "every must be a whole number >= 1, got 0"),
+        ("--views active --add 0", "add must be >= 1, got 0; without --views active all views are used"),
+        ("--views active --initial 0", "initial must be a whole number in [1, 1000000000], got 0"),
+        ("--views active --every 0", "every must be a whole number in [1, 1000000000], got 0"),
         ("--views active --initial 7 --add 1", "--initial 7 and --add 1 must be at most the 6 views of the training"),
         ("--views active --initial 2 --add 5 --every 1", "--initial 2 and --add 5 must be at most the 6 views"),
         ("--views active --add 4 --every 5", "must be there before step 20, the last one would come at 20"),
         ("--views active --prior -1", "lambda (value) must be in [0, inf), got -1"),
-        ("--views active --info-pixels 0", "info_pixels must be a whole number >= 1, got 0"),
+        ("--views active --info-pixels 0", "info_pixels must be a whole number in [1, 1000000000], or None, got 0"),
         ("--policy random", "--policy must have --views active, got --views all"),
         ("--views active --policy best", "--policy"),
     ],

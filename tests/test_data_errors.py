@@ -175,7 +175,7 @@ def test_transforms_bad_frames(tmp_path):
     attempt("frame 1: .*orthonormal to 1e-4", transform_matrix=(pose * 2).tolist())
     attempt("frame 1: transform_matrix must be 4x4", transform_matrix=[[1, 2], [3]])
     attempt("frame 1: mask_path names", FileNotFoundError, mask_path="gone.png")
-    attempt("frame 1: must be an object with a file_path", file_path=7)
+    attempt("frame 1: file_path must be a text", file_path=7)
     for text, message in [
         ("{", "must be valid JSON"),
         ("[]", "list `frames`"),

@@ -216,7 +216,7 @@ def test_lens(scene, gaussians, tmp_path, capsys):
         ("{scene} --format ,", "--format must be a list of png, exr, webm"),
         ("{scene} --cameras nowhere", "nowhere: must be a data set, found no such file or folder"),
         ("{scene} --cameras cameras.json", "cameras.json: must be a cameras.json file, found none"),
-        ("{scene} --cameras {nan}", "camera 0: Camera 'x': the pose must be finite"),
+        ("{scene} --cameras {nan}", "camera 0: position[0] must be a finite number, got NaN"),
         ("{scene} --cameras {text}", "broken.json: must be valid JSON"),
         ("{scene} --split test", "an orbit has no split"),
         ("{scene} --cameras {good} --split test", "a cameras.json has no split"),

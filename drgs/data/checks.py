@@ -4,7 +4,13 @@ allocated.
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import os
+import re
 import struct
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +22,13 @@ __all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_np
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
+_MAX_PIXELS = 2**31
+# What OpenCV, libpng, libjpeg and libtiff begin their lines with; OpenCV ends some with an empty one.
+_DECODER = re.compile(
+    rb"^\[ *(WARN|ERROR|INFO)|^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$", re.IGNORECASE
+)
+
+_log = logging.getLogger(__name__)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -42,7 +55,7 @@ def read_npy(path: Path) -> np.ndarray:
                 read = np.lib.format.read_array_header_2_0
             shape, _, dtype = read(file, max_header_size=_MAX_NPY_HEADER)
             start = file.tell()
-    except (ValueError, EOFError, OSError) as error:
+    except Exception as error:  # NumPy's parser of headers raises whatever Python's tokenizer does
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: must be a .npy file, got {text}; save it with numpy.save") from None
     if dtype.hasobject or dtype.kind not in "fiub":
@@ -58,25 +71,34 @@ def read_npy(path: Path) -> np.ndarray:
             "bytes; "
             "it is truncated or damaged, copy it again"
         )
-    return np.load(path, allow_pickle=False)
+    try:
+        return np.load(path, allow_pickle=False)
+    except ValueError as error:
+        raise ValueError(f"{path}: must be a .npy file, got {error}; save it with numpy.save") from None
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of an image; of PNG and JPEG only the header is read.
 
     Raises:
-        ValueError: not an image.
+        ValueError: not an image, or of no or more than 2^31 pixels.
     """
+    width, height = _stated_size(path) or read_image(path).shape[1::-1]
+    if not 1 <= width * height <= _MAX_PIXELS:
+        raise ValueError(
+            f"{path}: an image must have 1 to 2^31 pixels, its header says {width}x{height}; "
+            "it is damaged, copy it again"
+        )
+    return width, height
+
+
+def _stated_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) as the header of a PNG or JPEG says; None for other files."""
     with path.open("rb") as file:
         head = file.read(24)
-        if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR":
+        if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) == 24:
             return struct.unpack(">II", head[16:24])
-        if head[:2] == b"\xff\xd8":
-            size = _jpeg_size(file)
-            if size:
-                return size
-    height, width = read_image(path).shape[:2]
-    return width, height
+        return _jpeg_size(file) if head[:2] == b"\xff\xd8" else None
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -87,19 +109,31 @@ def read_image(path: Path) -> np.ndarray:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not an image that OpenCV decodes.
+        ValueError: not an image that OpenCV decodes, or one whose data end early.
     """
     import cv2
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
-    try:
-        data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        data = None
+    if _stated_size(path):
+        image_size(path)
+    with _native_stderr() as complaints:
+        try:
+            data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            data = None
     if data is None:
         refuse_foreign(path, "an image")
         raise ValueError(f"{path}: must be an image, could not be decoded; copy or convert it again")
+    # The decoder fills with gray what is missing, and goes on.
+    for line in complaints:
+        if "premature end" in line.lower():
+            raise ValueError(
+                f"{path}: must be a whole image, its data end early; it is truncated or damaged, copy it again"
+            )
+        if "corrupt" in line.lower():
+            _log.warning("%s: is damaged, part of it may be wrong (%s); copy it again", path, line.strip())
+            break
     if data.ndim == 3:
         order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(data.shape[2])
         if order is None:
@@ -107,6 +141,33 @@ def read_image(path: Path) -> np.ndarray:
         else:
             data = np.ascontiguousarray(data[..., order])
     return data
+
+
+@contextlib.contextmanager
+def _native_stderr() -> Iterator[list[str]]:
+    """Collect the lines that decoders print on stderr, for one message of ours in their place.
+
+    What others print meanwhile, such as a progress line of another thread, is passed on.
+    """
+    lines: list[str] = []
+    try:
+        saved = os.dup(2)
+    except OSError:  # stderr is closed
+        yield lines
+        return
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            file.seek(0)
+            for raw in file.read().splitlines(keepends=True):
+                if _DECODER.search(raw):
+                    lines.append(raw.decode("utf-8", "replace"))
+                else:
+                    os.write(2, raw)
 
 
 def _jpeg_size(file: Any) -> tuple[int, int] | None:

@@ -247,7 +247,12 @@ class _Walk:
         end = self.data.find(b"\0", self.at)
         self.need(end + 1 - self.at if end >= 0 else len(self.data), what)
         raw, self.at = self.data[self.at : end], end + 1
-        return raw.decode("utf-8", errors="replace")
+        try:
+            return raw.decode("utf-8")
+        except UnicodeDecodeError:
+            raise ValueError(
+                f"{self.path}: {what} must be UTF-8, got {raw[:40]!r}; it is damaged, copy it again"
+            ) from None
 
 
 _COUNT = struct.Struct("<Q")

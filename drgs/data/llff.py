@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras import Camera, c2w_from_llff, intrinsics
+from drgs.cameras import Camera, c2w_from_llff, intrinsics, inverse_pose
 from drgs.data.checks import list_images, read_npy
 from drgs.data.views import Dataset, View, fit_to_image, make_unique
 
@@ -49,9 +49,7 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
         where = f"{file}: row {index} ({image.name})"
         matrix = row[:15].reshape(3, 5)
         height, width, focal = matrix[:, 4]
-        c2w = c2w_from_llff(matrix)
-        w2c = np.eye(4)
-        w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
+        w2c = inverse_pose(where, c2w_from_llff(matrix))
         try:
             K = intrinsics(focal, focal, width / 2, height / 2)
             camera = Camera(K=K, w2c=w2c, width=width, height=height, name=image.stem)

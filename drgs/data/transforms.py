@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from drgs.cameras import Camera, c2w_from_opengl, intrinsics
+from drgs.cameras import Camera, c2w_from_opengl, intrinsics, inverse_pose
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.points import read_point_ply
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
-from drgs.json_files import read_json
+from drgs.json_files import check_json, read_json
 
 __all__ = ["find_transforms", "load_transforms"]
 
@@ -28,6 +28,7 @@ _LENSES = {
     "OPENCV_FISHEYE": "opencv_fisheye",
 }
 _MILLIMETER = 1e-3
+_DEPTH_SCALE_MAX = 1e9
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
 _ROUNDING = 1e-2
 
@@ -130,8 +131,7 @@ def _frames(file: Path) -> dict:
     if not isinstance(frames, list) or not frames:
         raise ValueError(f"{file}: must be an object with a list `frames` of at least one frame; check the file")
     for index, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise ValueError(f"{file}: frame {index}: must be an object with a file_path, got none; add it")
+        check_json(f"{file}: frame {index}", frame, {"file_path": str}, "correct it")
     return data
 
 
@@ -182,6 +182,11 @@ def _fill(
     view.mask_path = _optional_file(folder, where, frame, "mask_path")
     view.depth_path = depth
     view.depth_scale = _number(where, merged, "depth_unit_scale_factor", unit)
+    if not 0 < view.depth_scale < _DEPTH_SCALE_MAX:
+        raise ValueError(
+            f"{where}: depth_unit_scale_factor must be in (0, {_DEPTH_SCALE_MAX:g}), "
+            f"got {view.depth_scale:g}; correct it"
+        )
     view.background, view.is_checked = background, first is None
     return own
 
@@ -216,7 +221,7 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
         raise ValueError(f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; add one")
     K = intrinsics(fx, fy, _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2))
     kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
-    if kind not in _LENSES:
+    if not isinstance(kind, str) or kind not in _LENSES:
         raise ValueError(
             f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort the images"
         )
@@ -249,13 +254,12 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
     pose = np.eye(4)
     pose[:3] = c2w[:3]
     pose = c2w_from_opengl(pose)
-    if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < _ROUNDING and np.linalg.det(pose[:3, :3]) > 0:
-        u, _, vt = np.linalg.svd(pose[:3, :3])
+    rotation = pose[:3, :3]
+    is_close = np.abs(rotation).max() < 2 and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROUNDING
+    if is_close and np.linalg.det(rotation) > 0:
+        u, _, vt = np.linalg.svd(rotation)
         pose[:3, :3] = u @ vt
-    # The transpose stands for the inverse: Camera then reports whatever is no rotation.
-    w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return w2c
+    return inverse_pose(where, pose)
 
 
 def _focal(where: str, values: dict, key: str, size: float) -> float:
@@ -275,20 +279,28 @@ def _number(where: str, values: dict, key: str, default: float | None = None) ->
 def _image_file(folder: Path, name: str) -> Path | None:
     """The image that a file_path names; Blender leaves the suffix out."""
     path = folder / name
-    if path.is_file():
+    if _is_file(path):
         return path
     for suffix in (*IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
         candidate = path.with_name(path.name + suffix)
-        if candidate.is_file():
+        if _is_file(candidate):
             return candidate
     return None
 
 
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that no file can have
+        return False
+
+
 def _optional_file(folder: Path, where: str, frame: dict, key: str) -> Path | None:
-    if not isinstance(frame.get(key), str):
+    if frame.get(key) is None:
         return None
+    check_json(where, frame, {key: str}, "correct it, or remove the key")
     path = folder / frame[key]
-    if not path.is_file():
+    if not _is_file(path):
         raise FileNotFoundError(f"{where}: {key} names {path}, found no such file; restore it or remove the key")
     return path
 

@@ -13,11 +13,13 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import image_size, read_image, read_npy
 
-__all__ = ["Dataset", "View", "fit_to_image", "go_on_without", "make_unique"]
+__all__ = ["Dataset", "View", "check_parallax", "fit_to_image", "go_on_without", "make_unique"]
 
 _ASPECT_TOLERANCE = 0.01
 # An undistorted border pixel may look this many pixels past the photo before it counts as unseen.
 _BORDER = 1.0
+# Of an undistorted image, the share that its photo did not see: ordinary lenses leave below a tenth in the corners.
+_LOST_WARNED, _LOST_MAX = 0.25, 0.9
 _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
 
@@ -250,6 +252,33 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
         _log.info("also not there: %s", ", ".join(names[_SHOWN:]))
 
 
+def check_parallax(views: list[View]) -> None:
+    """Warn about views that stand in one place, from which no depth can be told; refuse poses that are all the same.
+
+    Raises:
+        ValueError: two views or more, all of one pose.
+    """
+    poses = np.stack([view.camera.c2w for view in views])
+    spread = np.abs(poses - poses[0]).max(axis=(1, 2))
+    tiny = 1e-9 * max(1.0, float(np.abs(poses).max()))
+    if len(views) < 2:
+        return
+    if spread.max() <= tiny:
+        raise ValueError(
+            f"the {len(views)} training views must have poses of their own, all have the same one (as view "
+            f"{views[0].name!r}); check the camera file"
+        )
+    if np.abs(poses[:, :3, 3] - poses[0, :3, 3]).max() <= tiny:
+        _log.warning(
+            "all %d training views stand in one place: the photographs tell no depths, other places will look wrong",
+            len(views),
+        )
+    elif same := len(poses) - len(np.unique(np.round(poses / tiny).reshape(len(poses), -1), axis=0)):
+        _log.warning(
+            "%d of the %d training views have the pose of another one; check the camera file", same, len(poses)
+        )
+
+
 def make_unique(views: list[View]) -> None:
     """Views are told apart by their names, in splits, picks and file names: a repeated one gets a number."""
     taken = {view.name for view in views}
@@ -311,14 +340,25 @@ def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
 def _lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the
     photo did not see.
+
+    Raises:
+        ValueError: the photo saw next to nothing of its own undistorted image.
     """
-    return _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
+    *maps, lost = _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
+    if lost > _LOST_MAX:
+        raise ValueError(
+            f"view {camera.name!r}: its lens must show what its undistorted image shows, {lost:.0%} of that lie "
+            f"outside the photo or where the lens folds back, got {camera.model} {camera.distortion}; "
+            "check the coefficients"
+        )
+    return tuple(maps)
 
 
 @functools.lru_cache(maxsize=8)
 def _cached_lens_maps(
     K: bytes, width: int, height: int, model: str, distortion: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, float]:
+    """As `_lens_maps`, and the share of pixels that were not seen."""
     matrix = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
     lens = Camera(K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion)
     rays = lens.undistorted().pixel_directions().reshape(-1, 3)
@@ -333,6 +373,15 @@ def _cached_lens_maps(
     folds = np.flatnonzero(np.diff(spread) <= 0)
     if len(folds):
         unseen |= radius > probe[folds[0]]
-    # OpenCV counts pixel centers at integers.
-    table = (pixels - 0.5).astype(np.float32)
-    return table[..., 0].copy(), table[..., 1].copy(), unseen if unseen.any() else None
+    lost = float(unseen.mean())
+    if lost > _LOST_WARNED:
+        _log.warning(
+            "lens %s %s: %.0f%% of the undistorted image was not seen by the photo%s; check the coefficients",
+            model,
+            distortion,
+            100 * lost,
+            ", the lens folds back inside it" if len(folds) else "",
+        )
+    # OpenCV counts pixel centers at integers; its tables are float32.
+    table = np.clip(np.nan_to_num(pixels - 0.5, nan=-1e6), -1e6, 1e6).astype(np.float32)
+    return table[..., 0].copy(), table[..., 1].copy(), unseen if unseen.any() else None, lost

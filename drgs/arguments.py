@@ -1,0 +1,128 @@
+"""Arguments of the wrong kind, and fields out of range: refused at the door, in one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import numbers
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+__all__ = ["ArgumentError", "check_fields", "kind_of", "must_be"]
+
+
+class ArgumentError(TypeError, ValueError):
+    """An argument of the wrong kind: a TypeError, and a ValueError, which the command line prints as one line."""
+
+
+def must_be(where: str, name: str, value: Any, kinds: type | tuple[type, ...], hint: str) -> None:
+    """Raise `ArgumentError` unless `value` is an instance of one of `kinds`.
+
+    Args:
+        where: The function.
+        name: The argument.
+        value: What was passed.
+        kinds: What it may be.
+        hint: What to pass instead, for the message.
+    """
+    if isinstance(value, kinds):
+        return
+    names = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
+    article = "an" if names[0] in "AEIOUaeiou" else "a"
+    raise ArgumentError(f"{where}: {name} must be {article} {names}, got {kind_of(value)}; {hint}")
+
+
+def kind_of(value: Any) -> str:
+    """A value in a few words: its type, and what tells most about it."""
+    if value is None:
+        return "None"
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple):
+        return f"a {type(value).__name__} of shape {tuple(shape)}"
+    if isinstance(value, str | int | float | bool):
+        text = repr(value)
+        return f"the {type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"
+    if isinstance(value, list | tuple) and value:
+        return f"a {type(value).__name__} of {len(value)} ({', '.join(sorted({type(x).__name__ for x in value}))})"
+    return f"a value of type {type(value).__name__}"
+
+
+def check_fields(
+    where: str,
+    record: Any,
+    ranges: Mapping[str, tuple[float, float]] = {},
+    choices: Mapping[str, Sequence] = {},
+) -> None:
+    """Raise ValueError unless the fields of a frozen dataclass have their annotated types and lie in their ranges.
+
+    Numbers are finite; a whole number may stand for a float, and a NumPy or torch scalar for a Python one, which
+    replaces it in the record.
+
+    Args:
+        where: The record, for the message.
+        record: An instance of a dataclass.
+        ranges: Field -> (lowest, highest), both allowed; of tuples, each of their numbers.
+        choices: Field -> what it may be.
+    """
+    for name, hint in _hints(type(record)).items():
+        value = getattr(record, name)
+        if name in choices:
+            if isinstance(value, bool) or not any(isinstance(value, type(x)) and value == x for x in choices[name]):
+                shown = ", ".join(map(str, choices[name]))
+                raise ValueError(f"{where}: {name} must be one of {shown}, got {value!r}")
+            continue
+        low, high = ranges.get(name, (-math.inf, math.inf))
+        checked, problem = _checked(value, hint, low, high)
+        if problem:
+            raise ValueError(f"{where}: {name} must be {problem}, got {value!r}")
+        if checked is not value:
+            object.__setattr__(record, name, checked)
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(kind)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def _checked(value: Any, hint: Any, low: float, high: float) -> tuple[Any, str | None]:
+    """The value as its field holds it, and what it must be instead if it cannot."""
+    kinds = typing.get_args(hint)
+    if type(None) in kinds:
+        if value is None:
+            return None, None
+        checked, problem = _checked(value, next(kind for kind in kinds if kind is not type(None)), low, high)
+        return checked, f"{problem}, or None" if problem else None
+    if typing.get_origin(hint) is tuple:
+        listed = value.tolist() if hasattr(value, "tolist") else value
+        if isinstance(listed, list | tuple) and len(listed) == len(kinds):
+            pairs = [_checked(x, kind, low, high) for x, kind in zip(listed, kinds, strict=True)]
+            if not any(problem for _, problem in pairs):
+                return tuple(x for x, _ in pairs), None
+        return value, f"{len(kinds)} finite numbers{_between(low, high)}"
+    if hint in (int, float):
+        what = "a whole number" if hint is int else "a finite number"
+        if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
+            value = value.item()
+        is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        good = is_number and (hint is float or isinstance(value, int)) and _finite(value) and low <= value <= high
+        return value, None if good else what + _between(low, high)
+    return value, None if isinstance(value, hint) else {bool: "True or False", str: "a text"}.get(hint, f"{hint}")
+
+
+def _finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer that no float holds
+        return False
+
+
+def _between(low: float, high: float) -> str:
+    if low == -math.inf and high == math.inf:
+        return ""
+    if high == math.inf:
+        return f" >= {low:g}"
+    shown = (f"{int(x)}" if x == int(x) and abs(x) < 1e15 else f"{x:g}" for x in (low, high))
+    return f" in [{', '.join(shown)}]"
