@@ -23,6 +23,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
+import drgs
 from drgs.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Select, Sfm, Stress, Tradeoff
 from drgs.progress import Bar
 
@@ -56,6 +57,9 @@ def main(argv: list[str] | None = None) -> int:
     # Before torch starts them: OpenMP threads that spin between operations take cores from Dr.Jit's.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     argv = sys.argv[1:] if argv is None else list(argv)
+    if argv == ["--version"]:
+        print(f"drgs {drgs.__version__}")
+        return 0
     args = _parse_arguments(argv)
     name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])
@@ -109,7 +113,7 @@ def _parse_arguments(argv: list[str]):
                 commands,
                 args=argv,
                 prog="drgs",
-                description="Differentiable Gaussian rendering, exact gradients, any CPU.",
+                description="Differentiable Gaussian rendering, exact gradients, any CPU. Version: drgs --version.",
                 config=(FlagCreatePairsOff,),
             )
     except SystemExit as end:

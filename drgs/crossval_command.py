@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from drgs import rasterizers, runtime
+from drgs import rasterizers, runtime, tables
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.progress import Bar
 from drgs.render_command import make_folder
@@ -57,20 +57,15 @@ def run(args: Crossval) -> int:
 
 def _print(result: Result, args: Crossval) -> None:
     """What was found, on stdout."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console, report = Console(highlight=False), result.report
-    table = Table(title=f"{report['rasterizer']} against preset {report['preset']} ({report['reference']})")
-    for name in ("group", "verdict", "relative", "cosine", "bias", "why"):
-        table.add_column(name, justify="right" if name in ("relative", "cosine", "bias") else "left", overflow="fold")
+    report, rows = result.report, []
     for name, row in report["groups"].items():
         numbers = f"{row['relative']:.1e}", f"{row['cosine']:.6f}", f"{row['bias']:+.1e}"
-        table.add_row(name, row["verdict"], *numbers, row["why"])
-    console.print(table)
+        rows.append((name, row["verdict"], *numbers, row["why"]))
+    title = f"{report['rasterizer']} against preset {report['preset']} ({report['reference']})"
+    tables.show(title, ("group", "verdict", "relative", "cosine", "bias", "why"), rows, texts=("verdict", "why"))
     for line in result.lines():
         if line.startswith(("convention:", "view ")):
-            console.print(line, markup=False)
+            print(line)
     rms, share = (max(view[k] for view in report["image"]["views"]) for k in ("rms", "share"))
-    console.print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
-    console.print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json", markup=False)
+    print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
+    print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json")

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 import drgs
-from drgs import metrics, pictures, runtime
+from drgs import metrics, pictures, runtime, tables
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.files import SCHEMA, write_json
 from drgs.progress import Bar
@@ -73,18 +73,16 @@ class Plan:
 
 def run(args: Demo) -> None:
     """`drgs demo`."""
-    say = (lambda *_: None) if args.quiet else _printer()
-    make_demo(args.output, Plan.quick() if args.quick else Plan(), say, progress=not args.quiet)
+    make_demo(args.output, Plan.quick() if args.quick else Plan(), progress=not args.quiet)
 
 
-def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) -> dict:
+def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
     """Make, fit, render, compare; writes pictures and demo.json.
 
     Args:
         out_dir: Its folders `still_life` (kept if it is there) and `run` (replaced) belong to the demo.
         plan: How much.
-        say: Called with text, or a rich table, for the reader.
-        progress: Bars and lines on stderr.
+        progress: Say what comes out, on stdout, and how far it is, on stderr.
     Returns:
         What demo.json holds.
     Raises:
@@ -94,6 +92,10 @@ def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) 
     from drgs.train import FitConfig, fit
 
     out_dir, began, seconds = Path(out_dir), time.perf_counter(), {}
+
+    def say(text: str) -> None:
+        if progress:
+            print(text, flush=True)
 
     def lap(stage: str, start: float) -> float:
         seconds[stage] = time.perf_counter() - start
@@ -128,7 +130,8 @@ def make_demo(out_dir: Path, plan: Plan, say: Callable, progress: bool = False) 
         images, rows = _compare(g, frames, plan.repeats)
     lap("comparison", start)
     say(f"3. The same Gaussians by the rules of other renderers ({len(frames)} held-out views)")
-    say(_table(rows))
+    if progress:
+        _table(rows)
 
     start = time.perf_counter()
     with Bar("float64 oracle", show=progress):
@@ -305,28 +308,20 @@ def _turntable(g: Gaussians, path: Path, plan: Plan, progress: bool) -> None:
             bar.advance()
 
 
-def _table(rows: list[dict]):
-    """For rich."""
-    from rich.table import Table
-
-    table = Table()
-    for title in ("preset", "dB to photos", "dB to exact", "largest difference", "ms a view", "time / exact"):
-        table.add_column(title, justify="left" if title == "preset" else "right")
+def _table(rows: list[dict]) -> None:
+    """On stdout."""
+    cells = []
     for row in rows:
         same = row["psnr_to_exact"] is None
-        table.add_row(
-            row["preset"],
-            f"{row['psnr_to_photographs']:.2f}",
-            "-" if same else f"{row['psnr_to_exact']:.1f}",
-            "-" if same else f"{row['max_difference']:.3f}",
-            f"{1e3 * row['seconds']:.0f}",
-            f"{row['time_of_exact']:.2f}",
+        cells.append(
+            (
+                row["preset"],
+                f"{row['psnr_to_photographs']:.2f}",
+                "-" if same else f"{row['psnr_to_exact']:.1f}",
+                "-" if same else f"{row['max_difference']:.3f}",
+                f"{1e3 * row['seconds']:.0f}",
+                f"{row['time_of_exact']:.2f}",
+            )
         )
-    return table
-
-
-def _printer() -> Callable:
-    from rich.console import Console
-
-    console = Console(highlight=False, soft_wrap=True)
-    return lambda text: console.print(text, markup=False)
+    columns = ("preset", "dB to photos", "dB to exact", "most off", "ms a view", "time / exact")
+    tables.show("", columns, cells)

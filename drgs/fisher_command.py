@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs import pictures
+from drgs import pictures, tables
 from drgs.files import SCHEMA, save_state, write_json
 from drgs.gain import variances
 from drgs.progress import Bar
@@ -141,30 +141,21 @@ def _summary(x: torch.Tensor) -> dict:
 
 def _print(report: dict, args: Fisher) -> None:
     """What was found, as tables on stdout."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
-    table = Table(title=f"information of {len(report['known']['names'])} views ({report['known']['source']})")
-    for name in ("group", "shape", "sum", "median > 0", "nothing known"):
-        table.add_column(name, justify="left" if name == "group" else "right")
+    rows = []
     for name, row in report["groups"].items():
-        median, count = row["median_of_positive"], int(np.prod(row["shape"]))
-        share = f"{row['zero'] / max(count, 1):.1%}"
-        table.add_row(name, "x".join(map(str, row["shape"])), f"{row['sum']:.4g}", f"{median or 0:.4g}", share)
-    console.print(table)
-    table = Table(title=f"views ({report['source']})")
-    columns = ["view", "logdet", "eig", "mean variance", *(["eigenvalues of the pose"] * args.pose)]
-    for name in columns:
-        table.add_column(name, justify="left" if name == "view" else "right", overflow="fold")
+        share = f"{row['zero'] / max(int(np.prod(row['shape'])), 1):.1%}"
+        shape = "x".join(map(str, row["shape"]))
+        rows.append((name, shape, f"{row['sum']:.4g}", f"{row['median_of_positive'] or 0:.4g}", share))
+    title = f"information of {len(report['known']['names'])} views ({report['known']['source']})"
+    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known"), rows)
+    rows = []
     for row in report["views"]:
-        pose = [" ".join(f"{x:.2g}" for x in row["pose"]["eigenvalues"])] if args.pose else []
-        gain = row["gain"]
-        table.add_row(
-            row["name"], f"{gain['logdet']:.4g}", f"{gain['eig']:.4g}", f"{row['variance']['mean']:.3g}", *pose
-        )
-    console.print(table)
+        values = row["pose"]["eigenvalues"] if args.pose else []
+        numbers = (row["gain"]["eig"], row["gain"]["logdet"], row["variance"]["mean"], *values[:1], *values[-1:])
+        rows.append((row["name"], *(f"{x:.3g}" for x in numbers)))
+    columns = ("view", "eig", "logdet", "mean variance", *(("pose: least", "most") if args.pose else ()))
+    tables.show(f"views ({report['source']})", columns, rows)
+    if args.pose:
+        print("pose: information about the least and the best known of its six directions; fisher.json has all six")
     files = sum(len(row["files"]) for row in report["views"])
-    console.print(
-        f"information.safetensors, fisher.json and {files} maps: {args.output}", highlight=False, markup=False
-    )
+    print(f"information.safetensors, fisher.json and {files} maps: {args.output}")

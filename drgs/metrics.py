@@ -5,6 +5,7 @@ Metrics that cannot be computed are None with a reason, never left out. `VARIANT
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 
 import drgs
+from drgs import tables
 from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.pictures import file_names, write_png
 from drgs.progress import Bar
@@ -45,7 +47,8 @@ VARIANTS = {
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
 }
 METRICS = tuple(VARIANTS)
-_NO_LPIPS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
+_NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
+_NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11
 _VIEWERS = "gsplat"  # the model that viewers of PLY files draw with
@@ -106,7 +109,7 @@ class Lpips:
             text = " ".join(str(error).split())
             raise FileNotFoundError(
                 f"eval: LPIPS must have the packages lpips and torchvision, importing them failed ({text}); "
-                "install versions that belong to this torch"
+                "pip install 'drgs[lpips]', in versions that belong to this torch"
             ) from None
         state = _read_weights(weights)
         first = state.get("features.0.weight")
@@ -178,7 +181,7 @@ def _evaluated(
 ) -> dict:
     views, reasons = [], {}
     if lpips is None:
-        reasons["lpips"] = _NO_LPIPS
+        reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
         with torch.no_grad():
             image = drgs.render(g, frame.camera, settings).rgb.cpu().clamp(0, 1)
@@ -288,28 +291,24 @@ def run_eval(args: Eval) -> None:
     written = write_metrics(
         run, args.split, frames, result, split_rule=dataset.split_rule(), gaussians=len(g), viewers=viewers
     )
-    print_table(written)
+    if not args.quiet:
+        print_table(written)
 
 
 def print_table(metrics: dict) -> None:
     """The metrics of `write_metrics` as a table on stdout, reasons of missing ones below, and what viewers show."""
-    from rich.console import Console
-    from rich.table import Table
-
     digits = {"psnr": ".2f"}
     names = [name for name in METRICS if metrics["mean"][name] is not None]
-    table = Table(title=f"{metrics['count']} {metrics['split']} views")
-    table.add_column("view")
-    for name in names:
-        table.add_column(name, justify="right")
-    for row in [*metrics["views"], {"name": "mean", **metrics["mean"]}]:
-        table.add_row(row["name"], *(f"{row[name]:{digits.get(name, '.4f')}}" for name in names))
-    console = Console()
-    console.print(table)
+    rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
+    tables.show(
+        f"{metrics['count']} {metrics['split']} views",
+        ("view", *names),
+        [(row["name"], *(f"{row[name]:{digits.get(name, '.4f')}}" for name in names)) for row in rows],
+    )
     for name, reason in metrics["reasons"].items():
-        console.print(f"{name}: none ({reason})", highlight=False, soft_wrap=True)
+        print(f"{name}: none ({reason})")
     if metrics["viewers"]:
-        console.print(_viewers_line(metrics["viewers"]), highlight=False, soft_wrap=True)
+        print(_viewers_line(metrics["viewers"]))
 
 
 def _viewers_line(viewers: dict) -> str:

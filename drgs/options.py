@@ -38,7 +38,7 @@ class _Common:
     threads: int | None = None
     """Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core."""
     quiet: bool = False
-    """No progress, warnings only."""
+    """Print neither progress nor results, which are in the files; only warnings and errors."""
     debug: bool = False
     """Show the traceback of an error."""
 
@@ -348,7 +348,8 @@ class Eval(_Common, _Data):
     split: Literal["all", "train", "test"] = "test"
     """Which views."""
     lpips_weights: Path | None = None
-    """Weights of the LPIPS backbone; without them LPIPS is reported as null."""
+    """torchvision's AlexNet or VGG16, e.g. alexnet-owt-7be5be79.pth, which LPIPS needs besides pip install
+    'drgs[lpips]'; without it LPIPS is null."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

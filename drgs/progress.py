@@ -14,7 +14,7 @@ __all__ = ["Bar"]
 
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
-LEAST_OFTEN = 60.0
+LEAST_OFTEN = 30.0
 _bars: list[Bar] = []  # that are open, the innermost last
 _output: _Lines | _Terminal | None = None  # there is one while one of them is shown
 
@@ -36,9 +36,10 @@ class Bar:
         self.label, self.total, self.done, self.text = label, total, done, ""
         self.is_drawn, self.is_told = not lines_only, False
         self._show, self._before = show, done
+        self._reached = 0.0  # when the last step was done
 
     def __enter__(self) -> Bar:
-        self.began = time.monotonic()
+        self.began = self._reached = time.monotonic()
         self.is_shown = bool(_bars and _bars[-1].is_shown) if self._show is None else self._show
         _open(self)
         return self
@@ -63,7 +64,8 @@ class Bar:
             if self.is_told and self.total is not None:
                 self.note(self.line())
             self.label, self.began, self.is_told, self._before = label, time.monotonic(), False, done
-        self.done = done
+        if done != self.done:
+            self.done, self._reached = done, time.monotonic()
         self.total = self.total if total is None else total
         self.text = self.text if text is None else text
         if self.is_shown:
@@ -80,13 +82,15 @@ class Bar:
 
     def line(self) -> str:
         """The bar in words."""
-        seconds = time.monotonic() - self.began
+        now = time.monotonic()
         parts = [f"{self.done} of {self.total}"] if self.total else []
         parts += [self.text] if self.text else []
-        parts.append(f"{seconds:.0f} s")
+        parts.append(f"{now - self.began:.0f} s")
         steps = self.done - self._before
         if self.total and steps > 0 and self.done < self.total:
-            parts.append(f"about {seconds * (self.total - self.done) / steps:.0f} s left")
+            each = (self._reached - self.began) / steps
+            left = each * (self.total - self.done) - (now - self._reached)
+            parts += [f"about {left:.0f} s left"] if left > 0 else []
         return f"{self.label}: {', '.join(parts)}"
 
 

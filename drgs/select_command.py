@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drgs import tables
 from drgs.files import SCHEMA, write_json
 from drgs.progress import Bar
 from drgs.render_command import described, make_folder
@@ -84,23 +85,18 @@ def run(args: Select) -> None:
 
 def print_table(report: dict, selection: Selection, output: Path) -> None:
     """The picks with each group's part of the score, and what to know about them, on stdout."""
-    from rich.console import Console
-    from rich.table import Table
-
     title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
-    table = Table(title=f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}")
-    groups = list(selection.picks[0].parts)
-    table.add_column("view", no_wrap=True)
-    for name in ("score", "margin", *(f"{_SHORT.get(name, name)} %" for name in groups)):
-        table.add_column(name, justify="right", no_wrap=True)
+    groups, rows = list(selection.picks[0].parts), []
     for pick in selection.picks:
         margin = "-" if pick.margin is None else f"{pick.margin:.3g}"
         parts = (f"{100 * pick.parts[name] / pick.score:.1f}" if pick.score else "-" for name in groups)
-        table.add_row(pick.name, f"{pick.score:.5g}", margin, *parts)
-    console = Console()
-    console.print(table)
+        rows.append((pick.name, f"{pick.score:.4g}", margin, *parts))
+    tables.show(
+        f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}",
+        ("view", "score", "margin", *(f"{_SHORT.get(name, name)} %" for name in groups)),
+        rows,
+    )
     for note in selection.notes:
-        console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
+        print(f"note: {note}")
     known = report["known"]
-    text = f"{len(known['names'])} known views ({known['source']}); {report['seconds']:.1f} s: {output}"
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    print(f"{len(known['names'])} known views ({known['source']}); {report['seconds']:.1f} s: {output}")

@@ -222,7 +222,7 @@ def _install(partial: Path, out_dir: Path, image_dir: Path) -> None:
 
 def run_command(args: Sfm) -> None:
     """`drgs sfm IMAGES -o OUT`."""
-    with Bar("features", 1, not args.quiet) as bar:
+    with Bar("features", show=not args.quiet) as bar:
         summary = run_sfm(
             args.images,
             args.output,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import textwrap
 import time
 import warnings
 from collections.abc import Iterator
@@ -88,17 +89,17 @@ def run(args: Stress) -> int:
 
         make_folder(args.output)
     start, found = time.perf_counter(), []
-    width = max(len(case.name) for case in chosen)
     if not args.quiet:
-        print(f"{len(chosen)} cases; the first run compiles their kernels, which takes minutes, later ones one or two")
-        print(_line(width, "case", "on", *_SHORT, "finite", "verdict"))
+        print(f"{len(chosen)} cases; the first run compiles their kernels: minutes. Later ones take one or two.")
+        print(_line("on", "", "image", "gradient", "forward", "adj/fwd", "Fisher"))
     with Bar("stress", len(chosen), not args.quiet) as bar:
         for number, case in enumerate(chosen):
             bar.update(number, text=case.name)
-            for row in rows(case):
-                found.append(row)
-                if not args.quiet or row.verdict == "FAILS":
-                    print(_printed(row, width), flush=True)
+            measured = list(rows(case))
+            found += measured
+            shown = [_printed(row) for row in measured if not args.quiet or row.verdict == "FAILS"]
+            if shown:
+                print("\n".join([case.name, *shown]), flush=True)
     seconds = time.perf_counter() - start
     failed = [row for row in found if row.verdict == "FAILS"]
     if args.output is not None:
@@ -337,13 +338,8 @@ def refused(case: Refusal) -> Row:
 # -------------------------------------------------- tables
 
 
-_SHORT = ("image", "gradient", "forward", "adj/fwd", "Fisher")
-
-
-def _line(width: int, name: str, traversal: str, *rest: str) -> str:
-    image, gradient, *others, finite, verdict = rest
-    cells = f"{image:>7}  {gradient:<22}" + "".join(f"{x:>8}" for x in others)
-    return f"{name:<{width}}  {traversal:<5} {cells}  {finite:<6}  {verdict}"
+def _line(traversal: str, verdict: str, image: str, gradient: str, *others: str) -> str:
+    return f"  {traversal:<5}  {verdict:<5}  {image:>7}  {gradient:<22}" + "".join(f"{x:>9}" for x in others)
 
 
 def _number(x: float | None) -> str:
@@ -354,11 +350,13 @@ def _finite(row: Row) -> str:
     return "-" if row.finite is None else "yes" if row.finite else "NO"
 
 
-def _printed(row: Row, width: int) -> str:
+def _printed(row: Row) -> str:
+    """Lines of at most 80 characters; the case has a line of its own."""
     gradient = " ".join((_number(row.gradient), row.group)).strip()
     others = (_number(row.forward), _number(row.duality), _number(row.fisher))
-    verdict = row.verdict + (f": {row.remark}" if row.remark else "")
-    return _line(width, row.case, row.traversal, _number(row.image), gradient, *others, _finite(row), verdict)
+    told = "; ".join(["not finite"] * (row.finite is False) + [row.remark] * bool(row.remark))
+    remark = textwrap.wrap(told, 80, initial_indent=" " * 4, subsequent_indent=" " * 4)
+    return "\n".join([_line(row.traversal, row.verdict, _number(row.image), gradient, *others), *remark])
 
 
 def markdown(found: list[Row]) -> list[str]:

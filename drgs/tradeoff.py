@@ -26,7 +26,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs import runtime
+from drgs import runtime, tables
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.progress import Bar
 from drgs.render_command import described, make_folder
@@ -164,8 +164,8 @@ def run(args: Tradeoff) -> None:
         _print(report)
         files = "tradeoff.json, tradeoff.md" + (", tradeoff.png" if drawn else "")
         print(f"{files}: {args.output}", flush=True)
-    if not drawn:
-        print("no plot: matplotlib is not installed; pip install 'drgs[report]'", flush=True)
+        if not drawn:
+            print("no plot: matplotlib is not installed; pip install 'drgs[report]'")
 
 
 def recommend(measured: dict, use: str, budgets) -> list[dict]:
@@ -213,33 +213,23 @@ def _short(value) -> str:
 
 def _print(report: dict) -> None:
     """Tables for a terminal."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=120)
     title = f"time and error relative to exact: {report['gaussians']} Gaussians, {len(report['views'])} views"
-    table = Table(title=f"{title} ({report['source']})", box=None, padding=(0, 1))
-    table.add_column("setting", overflow="fold")
-    table.add_column("kind", no_wrap=True)
-    for name in ("fwd", "+bwd", "info", "image", "gradient", "inform."):
-        table.add_column(name, justify="right", no_wrap=True)
+    rows = []
     for row in report["rows"]:
         if row["skipped"] is None:
             errors = row["errors"] if row["by"] != "oracle" else {**row["errors"], **report["own"]}
-            table.add_row(
-                row["name"],
-                row["kind"],
-                *(_time(row, key) for key in ("forward", "forward_backward", "fisher")),
-                *(_number(errors[key], ".1e") for key in ("image", "gradient", "information")),
-            )
-    console.print(table)
+            times = (_time(row, key) for key in ("forward", "forward_backward", "fisher"))
+            numbers = (_number(errors[key], ".0e") for key in ("image", "gradient", "information"))
+            rows.append((row["name"], row["kind"].replace("approximation", "approx."), *times, *numbers))
+    times = ("forward", "+backward", "Fisher")
+    errors = ("image", "gradient", "Fisher")
+    columns = ("setting", "kind", *(f"time\n{x}" for x in times), *(f"error\n{x}" for x in errors))
+    tables.show(f"{title} ({report['source']})", columns, rows, texts=("kind",))
     for line in _notes(report):
-        console.print(line, markup=False, soft_wrap=True)
-    console.print("\nFastest within a budget:")
+        print(line)
+    print("\nFastest within a budget:")
     for pick in report["recommended"]:
-        console.print("  " + _advice(pick), markup=False, soft_wrap=True)
+        print("  " + _advice(pick))
 
 
 def _page(report: dict, drawn: bool) -> str:

@@ -180,6 +180,8 @@ def run_fit(args: Fit) -> None:
         strict=args.strict,
     )
     result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
+    if args.quiet:
+        return
     metrics.print_table(result.metrics)
     print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
 

@@ -67,6 +67,17 @@ def test_command_help(name, capsys):
     assert all(option in text for option in ("--debug", "--quiet", "--variant", "--threads"))
 
 
+def test_version(capsys):
+    """`drgs --version` prints the package's version, which --help mentions."""
+    import drgs
+
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr() == (f"drgs {drgs.__version__}\n", "")
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert "drgs --version" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 
 import pytest
@@ -12,10 +14,10 @@ from drgs import cli, demo
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     """The folder, the report and the text of one tiny demo."""
-    said = []
-    out = tmp_path_factory.mktemp("demo") / "out"
-    report = demo.make_demo(out, demo.Plan.quick(), said.append)
-    return out, report, said
+    out, said = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
+    with contextlib.redirect_stdout(said):
+        report = demo.make_demo(out, demo.Plan.quick(), progress=True)
+    return out, report, said.getvalue()
 
 
 def test_files(result):
@@ -58,8 +60,9 @@ def test_numbers(result):
 def test_text(result):
     """What is said names the held-out views, the oracle and the files, without superlatives."""
     out, report, said = result
-    text = "\n".join(str(line) for line in said)
-    assert [line[0] for line in said if isinstance(line, str)][:6] == list("123456")
+    text = said
+    assert [line[0] for line in said.splitlines() if line[:1].isdigit()] == list("123456")
+    assert max(len(line) for line in said.splitlines() if not line[:1].isdigit() and str(out) not in line) <= 80
     assert "never saw" in text
     assert f"{report['oracle']['max_error']:.1e}" in text
     assert str(out / "demo.json") in text

@@ -1,5 +1,6 @@
 """Claims of drgs.metrics: values against their definitions, masks, and what is missing is null with a reason."""
 
+import importlib.util
 import math
 
 import numpy as np
@@ -102,9 +103,20 @@ def test_evaluation_is_per_view_and_mean_with_pictures(rng, monkeypatch, tmp_pat
     assert [v["psnr"] for v in result["views"]] == [pytest.approx(psnr), 100]
     assert result["mean"]["psnr"] == pytest.approx((psnr + 100) / 2)
     assert result["mean"]["lpips"] is None
-    assert "--lpips-weights" in result["reasons"]["lpips"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a_b_1.png", "c.png"]
     assert set(result["variants"]) == set(metrics.METRICS) == set(result["mean"])
+
+
+@pytest.mark.parametrize(
+    ("installed", "expected"), [(True, "--lpips-weights FILE"), (False, "pip install 'drgs[lpips]'")]
+)
+def test_what_lpips_needs(rng, monkeypatch, installed, expected):
+    """Weights are asked for where the package is installed, else the package; README.md names both."""
+    a, b = images(rng)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name if installed else None)
+    reason = evaluate(monkeypatch, b, [frame(a)])["reasons"]["lpips"]
+    assert expected in reason
+    assert installed == ("--lpips-weights" in reason)
 
 
 def test_masked_evaluation_ignores_what_is_outside(rng, monkeypatch):

@@ -108,6 +108,20 @@ def test_commands_run(folder, monkeypatch, capsys):
             assert path.is_file() or any(path.iterdir()), command
 
 
+def test_quiet_commands_print_nothing(folder, monkeypatch, capsys):
+    """With --quiet the files are the result."""
+    monkeypatch.chdir(folder)
+    done = set()
+    for command in _commands():
+        if command[0] not in ("fit", "eval", "render", "select", "fisher") or command[0] in done:
+            continue
+        done.add(command[0])
+        new = ["-o", "runs/quiet"] if command[0] == "fit" else []
+        assert cli.main([*command, *_SMALLER.get(command[0], []), *new, "--quiet"]) == 0
+        captured = capsys.readouterr()
+        assert (captured.out, captured.err) == ("", ""), command
+
+
 def test_python_runs(folder, monkeypatch):
     """The Python blocks run one after the other."""
     monkeypatch.chdir(folder)

@@ -90,7 +90,7 @@ def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
     written = json.loads((run.path / "metrics.json").read_text())
     assert written["mean"]["psnr"] == pytest.approx(previews[-1]["test_psnr"], abs=1e-3)
     assert written["mean"]["lpips"] is None
-    assert "lpips-weights" in written["reasons"]["lpips"]
+    assert "lpips" in written["reasons"]["lpips"]
     assert [v["name"] for v in written["views"]] == run.config()["test"] == ["0", "8"]
     assert len(list(run.renders.glob("preview_*.png"))) == 10
     assert (run.renders / "test" / "8.png").is_file()

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,8 +16,8 @@ import numpy as np
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs"]
 
 Progress = Callable[[str, int, int], None]
-_IMAGES_A_STEP = 8
-_PAIRS_A_STEP = 64
+_IMAGES_A_STEP = min(8, os.cpu_count() or 1)  # one a core: all of them are busy, and progress is seen
+_PAIRS_A_STEP = 16
 
 
 @contextlib.contextmanager
