@@ -20,6 +20,7 @@ import drgs
 from drgs import pictures, runtime
 from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import SCHEMA, Run, load_ply, write_json
+from drgs.forecast import forecast
 from drgs.foreign import refuse_foreign
 from drgs.orbits import UP, capture_orbit, scene_orbit
 from drgs.progress import Bar
@@ -44,6 +45,8 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
+_MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as doing it
+_LONG = 10.0  # seconds that are worth a word
 _FORMATS = ("png", "exr", "webm")
 _MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
 
@@ -64,6 +67,8 @@ def run(args: Render) -> None:
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
     make_folder(args.output)
+    if not args.quiet:
+        _say_how_long(args, gaussians, cameras, settings)
     with Bar("render", len(cameras), not args.quiet) as bar:
         report = render_views(
             gaussians,
@@ -331,6 +336,17 @@ def _summary(report: dict, folder: Path) -> str:
         share = report["redone"] / max(report["rays"], 1)
         text += f"\nexact order: {report['redone']} of {report['rays']} rays ({share:.2%}) took more than one pass"
     return text
+
+
+def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> None:
+    """Exact order on every ray may take minutes where the centers' order takes seconds: said beforehand."""
+    if settings.order != "ray" or sum(camera.width * camera.height for camera in cameras) < _MANY_PIXELS:
+        return
+    seconds = forecast(gaussians, cameras, settings)
+    if seconds > _LONG:
+        took = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        what = f"{args.preset}, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}"
+        _say(args, f"{what} will take about {took} on this machine; --preset fast takes a small part of that")
 
 
 def _say(args: Render | Crossval | Tradeoff, text: str) -> None:
