@@ -30,7 +30,7 @@ import drgs  # noqa: E402
 from drgs.crossval import crossval  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
-from drgs.orbits import UP, scene_orbit  # noqa: E402
+from drgs.orbits import Wish, scene_orbit  # noqa: E402
 from drgs.rasterizers import GROUPS, function, load  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 
@@ -48,7 +48,7 @@ def wolf(count: int, width: int, height: int) -> tuple | None:
     if not path.exists():
         return None
     g = load_ply(path)
-    camera = scene_orbit(g, 8, up=UP["minus-y"], width=width, height=height, fov=70, elevation=10.0)[0]
+    camera = scene_orbit(g, 8, width=width, height=height, wish=Wish(fov=70, elevation=10.0))[0]
     weight = drgs.render(g, camera, outputs=("visibility",)).visibility
     index = torch.topk(weight, count).indices
     return Gaussians(**{name: getattr(g, name)[index] for name in GROUPS}), [camera]

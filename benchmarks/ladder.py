@@ -29,7 +29,7 @@ from drgs.cameras import intrinsics_from_fov
 from drgs.data import load
 from drgs.files import Run
 from drgs.ladder import GROUPS, Pictures, ladder, table
-from drgs.orbits import UP, scene_orbit
+from drgs.orbits import Wish, scene_orbit
 from drgs.render_command import run_background
 from drgs.settings import RenderSettings
 from drgs.viewpoints import evenly
@@ -70,7 +70,7 @@ def wolf(fov: float, width: int = 160) -> tuple:
     """(Gaussians, cameras, background)."""
     g = drgs.load_ply(studies.DATA / "splats" / "wolf" / "wolf.ply")
     size = {"width": width, "height": width * 3 // 4}
-    return g, scene_orbit(g, VIEWS, up=UP["minus-y"], fov=fov, **size), (0.0, 0.0, 0.0)
+    return g, scene_orbit(g, VIEWS, wish=Wish(fov=fov), **size), (0.0, 0.0, 0.0)
 
 
 def office(fov: float, path: Path) -> tuple:

@@ -96,12 +96,21 @@ class _Data:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Around:
-    """Options of commands that can make cameras around a scene."""
+    """Options of commands that can make cameras around a scene; what is not given is as a run's photographs or the
+    known views have it, where there are any.
+    """
 
     up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
-    """World direction that is up on an orbit or a dome; auto: as a run's photographs or known views, else minus-y."""
+    """World direction that is up on an orbit or a dome; auto: as the photographs, else minus-y."""
+    center: tuple[float, float, float] | None = None
+    """World point that an orbit or a dome looks at; default as the photographs, else the middle of the Gaussians."""
+    distance: float | None = None
+    """From that point, in scene units; default the photographs' median, else so that all is in the frame."""
     elevation: float | None = None
-    """Degrees of an orbit above its center; default as a run's photographs or known views, else 20."""
+    """Degrees of an orbit above its center; default the photographs' median, else 20."""
+    span: float | None = None
+    """Degrees that an orbit covers; default what the photographs cover (select, fisher: 360 where they look at one
+    point), else 360."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -149,13 +158,13 @@ class Render(_Settings, _Around, _Data):
     output: _Output = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None
-    """Image width in pixels; default the camera's."""
+    """Image width in pixels; default the camera's, of an orbit 640."""
     height: int | None = None
     """Image height in pixels; default the camera's."""
     frames: int = 60
     """Views of an orbit."""
-    fov: float = 45.0
-    """Horizontal field of view of an orbit in degrees."""
+    fov: float | None = None
+    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     format: str = "png"
     """Comma-separated list of png, exr, webm."""
     fps: float = 24.0
@@ -293,8 +302,8 @@ class _Seen(_Settings, _Around, _Data):
     """At most this many views, evenly spaced."""
     max_pixels: int = 20_000
     """Views are reduced to at most this many pixels."""
-    fov: float = 45.0
-    """Horizontal field of view of an orbit in degrees."""
+    fov: float | None = None
+    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     seed: int = 0
     """Seed of everything random."""
 

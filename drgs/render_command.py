@@ -22,9 +22,9 @@ from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.forecast import forecast
 from drgs.foreign import refuse_foreign
-from drgs.orbits import UP, capture_orbit, scene_orbit
+from drgs.orbits import Wish, capture_orbit, scene_orbit, seen_distance
 from drgs.progress import Bar
-from drgs.run_records import fit_record
+from drgs.run_records import fit_record, fitted_views
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -60,8 +60,8 @@ def run(args: Render) -> None:
     if folder is not None and not any(text.startswith("background=") for text in args.overrides):
         # A run was fitted over its background; over another one its edges show a halo.
         settings = settings.replace(background=fit_record(folder).config.settings.background)
-    size = args.width or 640, args.height or round((args.width or 640) * 0.75)
-    cameras, source = cameras_of(args, args.cameras, gaussians, folder, args.frames, size)
+    size = args.width, args.height
+    cameras, source = cameras_of(args, args.cameras, gaussians, folder, args.frames, size, returns=True)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
@@ -190,10 +190,7 @@ def _check_numbers(args: Render) -> None:
             raise ValueError(f"render: {option} must be in [1, {high}], got {value}")
     if not 0 < args.fps <= 240:
         raise ValueError(f"render: --fps must be in (0, 240], got {args.fps}")
-    if not 1 <= args.fov <= 170:
-        raise ValueError(f"render: --fov must be in [1, 170] degrees, got {args.fov}")
-    if args.elevation is not None and not -89 <= args.elevation <= 89:
-        raise ValueError(f"render: --elevation must be in [-89, 89] degrees, got {args.elevation}")
+    Wish.of(args)
 
 
 def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
@@ -216,28 +213,34 @@ def cameras_of(
     gaussians: Gaussians,
     folder: Run | None,
     frames: int,
-    size: tuple[int, int],
+    size: tuple[int | None, int | None],
+    returns: bool = False,
 ) -> tuple[list[Camera], str]:
     """The cameras of a data set, a run, a cameras.json or an orbit, and where they come from in words.
 
     Args:
-        args: Whose `split`, `fov`, `elevation` and `up` apply.
+        args: Whose `split` and options of orbits apply.
         text: What `--cameras` says.
         gaussians, folder: What an orbit goes around, like the photographs of the run if there is one.
-        frames, size: Number of views of an orbit and their (width, height).
+        frames, size: Number of views of an orbit and their (width, height); where one is None, 640 wide and of the
+            photographs' shape, else 4:3.
+        returns: Whether an orbit that is no full circle goes back and forth.
     """
     if text == "orbit":
         if args.split != "all":
             raise ValueError(f"--split {args.split} must have --cameras DATA, an orbit has no split")
-        lens = {"width": size[0], "height": size[1], "fov": args.fov, "elevation": args.elevation}
-        captured = _captured(folder) if folder is not None and args.up == "auto" else []
-        cameras = capture_orbit(captured, frames, **lens) if captured else []
+        wish = Wish.of(args)
+        captured = _captured(folder) if folder is not None else []
+        shape = captured[0].height / captured[0].width if captured else 0.75
+        how = dict(zip(("width", "height"), _size(*size, shape), strict=True)) | {"wish": wish, "returns": returns}
+        cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(gaussians), **how)
         if cameras:
-            return cameras, "orbit like the photographs"
+            _say(args, source)
+            return cameras, source
         up = "minus-y" if args.up == "auto" else args.up
         if args.up == "auto":
             _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
-        return scene_orbit(gaussians, frames, up=UP[up], **lens), f"orbit, up {up}"
+        return scene_orbit(gaussians, frames, **how), f"orbit, up {up}"
     path = Path(text)
     if is_camera_list(path):
         if args.split != "all":
@@ -271,11 +274,22 @@ def _dataset(path: Path, strict: bool) -> tuple[Dataset, int | None]:
 
 
 def _captured(folder: Run) -> list[Camera]:
-    """Cameras of the photographs that a run was fitted to; none if they are no longer there."""
+    """Cameras of the photographs that a run was fitted to, in their order; none if they are no longer there."""
+    from drgs.data import load
+
     try:
-        return [view.camera for view in _dataset(folder.path, strict=False)[0].views]
+        names = set(fitted_views(folder))
+        views = load(fit_record(folder).data, lazy=True, points=False).views
     except (ValueError, OSError, KeyError):
         return []
+    return [view.camera.undistorted() for view in views if view.name in names]
+
+
+def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
+    """Width and height of an orbit's frames, the missing ones by their shape (height / width)."""
+    if width is None:
+        width = 640 if height is None else max(1, min(_MAX_SIDE, round(height / shape)))
+    return width, height or max(1, min(_MAX_SIDE, round(width * shape)))
 
 
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:

@@ -16,7 +16,7 @@ from drgs.active import at_most, resized_alike
 from drgs.camera_lists import load_cameras_json
 from drgs.cameras import Camera, orbit
 from drgs.files import Run
-from drgs.orbits import UP, capture_orbit, scene_orbit
+from drgs.orbits import Wish, capture_orbit, scene_orbit, seen_distance
 from drgs.render_command import cameras_of, is_camera_list, load_scene
 from drgs.run_records import fit_record, fitted_views
 from drgs.settings import RenderSettings
@@ -78,10 +78,10 @@ def scene_of(args: Select | Fisher) -> Scene:
     for option, value, low, high in (
         ("--count", args.count, 1, _MAX_COUNT),
         ("--info-pixels", args.info_pixels, 1, 10**9),
-        ("--elevation", args.elevation, -89, 89),
     ):
         if value is not None and not low <= value <= high:
             raise ValueError(f"{option} must be in [{low}, {high}], got {value}; correct it")
+    Wish.of(args)
     settings = args.settings()
     gaussians, run = load_scene(args.scene)
     pixels = args.info_pixels or _PIXELS
@@ -130,7 +130,7 @@ def other_views(option: str, text: str, args: Select | Fisher, scene: Scene, kno
     Args:
         option: Name of the option, for messages.
         text: Its value.
-        args: Whose `split`, `count`, `up` and `elevation` apply.
+        args: Whose `split`, `count` and options of orbits apply.
         scene: For what is turned around.
         known: Views that are left out if `fresh`; the first one's lens serves orbits and domes.
         fresh: Leave out known views of the same data set.
@@ -142,9 +142,12 @@ def other_views(option: str, text: str, args: Select | Fisher, scene: Scene, kno
     if args.split != "all" and not is_set:
         raise ValueError(f"--split {args.split} must have {option} DATA, {text} has no split; drop it")
     if text == "orbit":
-        return _orbit(args, scene, known, args.count, args.elevation), f"orbit of {args.count}"
+        return _orbit(Wish.of(args), scene, known, args.count), f"orbit of {args.count}"
     if text == "dome":
-        return dome(_orbit(args, scene, known, 24, 0.0), args.count), f"dome of {args.count}"
+        if args.span is not None:
+            raise ValueError(f"--span must have {option} orbit, a dome goes all the way round; drop it")
+        circle = dataclasses.replace(Wish.of(args), elevation=0.0, span=360.0)
+        return dome(_orbit(circle, scene, known, 24), args.count), f"dome of {args.count}"
     if not is_set:
         return [at_most(camera, scene.pixels) for camera in load_cameras_json(path)], text
     every = 8
@@ -210,11 +213,10 @@ def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera]
     for option, value, low, high in (
         ("--limit", args.limit, 1, _MAX_COUNT),
         ("--max-pixels", args.max_pixels, 1, 10**9),
-        ("--fov", args.fov, 1, 170),
-        ("--elevation", args.elevation, -89, 89),
     ):
         if value is not None and not low <= value <= high:
             raise ValueError(f"{option} must be in [{low}, {high}], got {value}; correct it")
+    Wish.of(args)
     gaussians, run = load_scene(args.scene)
     fields = args.replaced()
     if run is not None:
@@ -231,15 +233,18 @@ def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera]
     )
 
 
-def _orbit(args: Select | Fisher, scene: Scene, known: Known, count: int, elevation: float | None) -> list[Camera]:
-    """Around what the known views look at, else around the Gaussians, with the first known view's lens."""
+def _orbit(wish: Wish, scene: Scene, known: Known, count: int) -> list[Camera]:
+    """Around what the known views look at, else around the Gaussians, with the first known view's lens.
+
+    All the way round: what known views do not cover is what candidates are for.
+    """
     lens = known.cameras[0]
     fov = min(2 * math.degrees(math.atan(0.5 * lens.width / lens.K[0, 0])), 170.0)
-    size = {"width": lens.width, "height": lens.height, "fov": fov, "elevation": elevation}
-    cameras = capture_orbit(known.cameras, count, **size) if args.up == "auto" else []
+    how = {"width": lens.width, "height": lens.height, "wish": dataclasses.replace(wish, fov=fov)}
+    walked = sorted(known.cameras, key=lambda camera: camera.name)  # an active run has them as they were picked
+    cameras, _ = capture_orbit(walked, count, distance_of=seen_distance(scene.gaussians), beyond=True, **how)
     if not cameras:
-        up = UP["minus-y" if args.up == "auto" else args.up]
-        cameras = scene_orbit(scene.gaussians, count, up=up, **size)
+        cameras = scene_orbit(scene.gaussians, count, **how)
     return [dataclasses.replace(camera, K=lens.K) for camera in cameras]
 
 

@@ -22,7 +22,7 @@ from drgs.crossval import crossval
 from drgs.differences import _extrapolated, central
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, save_ply
-from drgs.orbits import UP, scene_orbit
+from drgs.orbits import Wish, scene_orbit
 from drgs.rasterizers import GROUPS, function, raw_of
 from drgs.testing import assert_matches, random_scene
 
@@ -119,7 +119,7 @@ def test_a_real_scene(data_dir, name):
     if not path.exists():
         pytest.skip(f"no wolf: {path}")
     g = load_ply(path)
-    camera = scene_orbit(g, 8, up=UP["minus-y"], width=48, height=40, fov=70, elevation=10.0)[0]
+    camera = scene_orbit(g, 8, width=48, height=40, wish=Wish(fov=70, elevation=10.0))[0]
     weight = drgs.render(g, camera, outputs=("visibility",)).visibility
     index = torch.topk(weight, 250).indices
     g = Gaussians(**{field: getattr(g, field)[index] for field in GROUPS})

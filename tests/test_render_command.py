@@ -88,7 +88,7 @@ def test_orbit_frames_the_scene(gaussians):
     far = drgs.Gaussians.from_arrays([[500.0, 0, 0]], [[1.0, 0, 0, 0]], [[1.0] * 3], [0.9], np.zeros((1, 4, 3)))
     both = gaussians.replace(**{name: torch.cat([x, getattr(far, name)]) for name, x in gaussians.parameters().items()})
     for up in ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)):
-        cameras = orbits.scene_orbit(both, 12, up=up, width=64, height=48)
+        cameras = orbits.scene_orbit(both, 12, width=64, height=48, wish=orbits.Wish(up=up))
         reach = []
         for camera in cameras:
             pixels, z = camera.project(gaussians.means.numpy())
@@ -101,23 +101,12 @@ def test_orbit_frames_the_scene(gaussians):
 def test_orbit_of_one_gaussian():
     """A single Gaussian has no spread: its own size decides."""
     one = drgs.Gaussians.from_arrays([[0.0, 0, 5]], [[1.0, 0, 0, 0]], [[0.2] * 3], [0.9], np.zeros((1, 1, 3)))
-    (camera,) = orbits.scene_orbit(one, 1, up=(0, 1, 0), width=32, height=32)
+    (camera,) = orbits.scene_orbit(one, 1, width=32, height=32)
     out = drgs.render(one, camera)
     assert out.alpha.max() > 0.8
     assert out.alpha[0].max() < 0.3
     with pytest.raises(ValueError, match="at least one Gaussian"):
-        orbits.scene_orbit(one.take(slice(0, 0)), 1, up=(0, 1, 0), width=32, height=32)
-
-
-def test_orbit_like_the_photographs():
-    """Photographs around a point give their circle; a forward-facing capture gives none."""
-    photos = orbit((1, 2, 3), 4.0, 9, 35.0, up=(0, 0, 1))
-    made = orbits.capture_orbit(photos, 5, width=32, height=24)
-    for camera in made:
-        assert np.linalg.norm(camera.center - (1, 2, 3)) == pytest.approx(4.0)
-        assert camera.center[2] == pytest.approx(3 + 4 * np.sin(np.radians(35)))
-    ahead = [Camera(K=np.eye(3), w2c=look_at((x, 0, 0), (x, 5, 0)), width=8, height=8) for x in range(5)]
-    assert orbits.capture_orbit(ahead, 5, width=32, height=24) == []
+        orbits.scene_orbit(one.take(slice(0, 0)), 1, width=32, height=32)
 
 
 def test_turntable(scene, tmp_path, capsys):
@@ -225,6 +214,8 @@ def test_lens(scene, gaussians, tmp_path, capsys):
         ("{scene} --limit 0", "--limit must be in"),
         ("{scene} --fov 180", "--fov must be in [1, 170] degrees, got 180"),
         ("{scene} --elevation 90", "--elevation must be in [-89, 89] degrees, got 90"),
+        ("{scene} --distance 0", "--distance must be positive and finite, got 0"),
+        ("{scene} --span 400", "--span must be in [0, 360] degrees, got 400"),
         ("{scene} --fps 0", "--fps must be in (0, 240], got 0"),
         ("{scene} -o {scene}", "-o must be a folder that can be written"),
         ("{scene} -o {scene}/inside", "-o must be a folder that can be written"),
@@ -308,7 +299,7 @@ def test_wolf(data_dir, tmp_path):
     if not path.is_file():
         pytest.skip(f"no {path}")
     g = drgs.load_ply(path)
-    for camera in orbits.scene_orbit(g, 3, up=orbits.UP["y"], width=96, height=72):
+    for camera in orbits.scene_orbit(g, 3, width=96, height=72, wish=orbits.Wish(up=orbits.UP["y"])):
         alpha = drgs.render(g, camera, drgs.RenderSettings.preset("fast")).alpha.numpy()
         rows, columns = np.nonzero(alpha > 0.5)
         assert rows.min() > 3

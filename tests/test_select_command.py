@@ -10,7 +10,7 @@ from test_active import SIZE, config, lazily, plan, write_still
 
 import drgs
 from drgs import cli, fisher
-from drgs.camera_lists import save_cameras_json
+from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.cameras import Camera, look_at, orbit
 from drgs.data import load
 from drgs.files import Run, load_ply, save_ply
@@ -84,6 +84,23 @@ def test_made_candidates_have_the_lens_of_the_known_views(place, monkeypatch, ca
         assert axis @ -eye / 3 > 0.999
 
 
+def test_made_candidates_where_they_are_wished(place, monkeypatch, capsys):
+    """The point, the distance and the span that are asked for hold, for pictures of the run as for candidates."""
+    where = "--center 0.1 -0.2 0.3 --distance 2.5 --span 40"
+    report, _ = select(f"run --candidates orbit --count 4 --policy farthest -k 4 {where}", place, monkeypatch, capsys)
+    candidates = np.array([pick["camera"]["c2w"] for pick in report["picks"]])
+    assert cli.main(f"render run --preset fast --frames 4 --width 16 -o pictures {where}".split()) == 0
+    assert "swing of 40 degrees around (0.1, -0.2, 0.3) at distance 2.5" in capsys.readouterr().out
+    pictures = load_cameras_json(place / "pictures/cameras.json")
+    assert (pictures[0].width, pictures[0].height) == (16, 16)  # the photographs' shape
+    for poses in (candidates, np.array([camera.c2w for camera in pictures])):
+        ahead = np.array([0.1, -0.2, 0.3]) - poses[:, :3, 3]
+        np.testing.assert_allclose(np.linalg.norm(ahead, axis=1), 2.5, rtol=1e-6)
+        np.testing.assert_allclose((ahead * poses[:, :3, 2]).sum(axis=1), 2.5, rtol=1e-6)
+        spread = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2).max()
+        assert 0.4 < spread <= 2 * 2.5 * np.sin(np.radians(20))
+
+
 def test_plain_ply_with_a_list_of_cameras(place, monkeypatch, capsys):
     """No training record: H from the cameras given; a cameras.json is a list of candidates as well."""
     line = "scene.ply --train cameras.json --candidates orbit --count 5 --up z --policy coverage"
@@ -140,7 +157,9 @@ def test_dome_is_even(count):
         ("run --candidates data --prior -1", "lambda (value) must be in [0, inf), got -1"),
         ("run --candidates orbit --split test", "--split test must have --candidates DATA, orbit has no split"),
         ("run --candidates orbit --count 0", "--count must be in [1, 10000], got 0"),
-        ("run --candidates orbit --elevation 90", "--elevation must be in [-89, 89], got 90"),
+        ("run --candidates orbit --elevation 90", "--elevation must be in [-89, 89] degrees, got 90"),
+        ("run --candidates orbit --distance -1", "--distance must be positive and finite, got -1"),
+        ("run --candidates dome --span 90", "--span must have --candidates orbit, a dome goes all the way round"),
         ("run --candidates nowhere", "nowhere: must be a data set, found no such file or folder"),
         ("data --candidates orbit", "must be a run folder, found no config.json"),
         ("run --candidates empty.json", "must be a list of at least one camera"),

@@ -1,0 +1,207 @@
+"""What the poses of photographs say about a capture: what was looked at, from where, which way is up, along which path.
+
+Poses and image sizes only; no image is opened.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.cameras import look_at
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from drgs.cameras import Camera
+
+__all__ = ["Focus", "path", "upright"]
+
+_ROUNDS = 30  # of reweighting; the median of lines settles in about ten
+_MEETING = 0.02  # smallest mean squared sine between the axes and their mean: 8 degrees
+_ALIKE = 0.8  # length of the mean axis of cameras that look the same way: within about 37 degrees
+_AIMED = 0.85  # cosine between an axis and the way to the point looked at: 32 degrees
+_MOST = 0.75  # share of the cameras that a common point must be before
+_PROBES = 8  # cameras asked how far they see
+_WIDEST_GAP = 90.0  # degrees without a camera that a circle may pass
+_LEAST_SPAN = 5.0  # degrees; cameras within less stand in a row, on a drive
+_TILT = 0.05  # weight of the images' up where their horizontals leave it open
+_JUMP = 8.0  # times the median step between photographs: no path leads there
+_TURN = 75.0  # degrees between photographs of one path
+_SMOOTH = 0.75  # standard deviation of the smoothing in steps between photographs, at least
+_SMOOTHED = 40  # and in parts of the whole path, of which a video has many photographs
+
+
+@dataclasses.dataclass(frozen=True)
+class Focus:
+    """A point that cameras look at.
+
+    Attributes:
+        center: (3,) world.
+        eyes: (V, 3) of the cameras that look at it.
+        is_met: Whether the optical axes fix it, or a user does; else it lies where what they see is.
+    """
+
+    center: np.ndarray
+    eyes: np.ndarray
+    is_met: bool
+
+    @classmethod
+    def of(
+        cls,
+        cameras: list[Camera],
+        center: tuple[float, float, float] | None = None,
+        distance_of: Callable[[Camera], float | None] | None = None,
+    ) -> Focus | None:
+        """What most of the cameras look at.
+
+        Args:
+            cameras: Any number.
+            center: The point, if it is given.
+            distance_of: How far away what a camera looks at is; where axes are parallel only that tells.
+        Returns:
+            None where there are fewer than two cameras or no such point.
+        """
+        if len(cameras) < (2 if center is None else 1):
+            return None
+        poses = np.stack([camera.c2w for camera in cameras])
+        eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
+        if center is not None:
+            return cls(np.asarray(center, np.float64), eyes, True)
+        across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+        if np.linalg.eigvalsh(across.mean(axis=0))[0] >= _MEETING:
+            met = _meeting_point(eyes, across)
+            aimed = _aimed(met, eyes, axes)
+            if aimed.mean() >= _MOST:
+                return cls(met, eyes[aimed], True)
+        mean = axes.mean(axis=0)
+        if distance_of is None or np.linalg.norm(mean) < _ALIKE:
+            return None
+        probes = [cameras[i * len(cameras) // _PROBES] for i in range(_PROBES)] if len(cameras) > _PROBES else cameras
+        seen = [distance for distance in map(distance_of, probes) if distance is not None]
+        if not seen:
+            return None
+        ahead = np.median(eyes, axis=0) + np.median(seen) * mean / np.linalg.norm(mean)
+        aimed = _aimed(ahead, eyes, axes)
+        focus = cls(ahead, eyes[aimed], False)
+        if aimed.mean() < _MOST or focus.stand(upright(cameras))[1] < _LEAST_SPAN:
+            return None
+        return focus
+
+    def stand(self, up: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+        """Where the cameras stand around the center.
+
+        Args:
+            up: (3,) of length 1.
+        Returns:
+            The level direction (3,) from the center to the middle of the span that they cover, or to the first one if
+            they surround it; the span in degrees (360: they do); their median distance; their median elevation in
+            degrees.
+        """
+        outward = self.eyes - self.center
+        first = np.cross(np.cross(up, np.eye(3)[np.argmin(np.abs(up))]), up)
+        first /= np.linalg.norm(first)
+        second = np.cross(up, first)
+        azimuths = np.degrees(np.arctan2(outward @ second, outward @ first))
+        start, span, inside = _covered(azimuths)
+        turn = np.radians(start + (0.0 if span >= 360 else span / 2))
+        distance = np.linalg.norm(outward, axis=1)
+        sines = outward @ up / np.maximum(distance, 1e-12)
+        elevation = np.degrees(np.arcsin(np.clip(np.median(sines[inside]), -1, 1)))
+        middle = np.cos(turn) * first + np.sin(turn) * second
+        return middle, span, float(np.median(distance[inside])), float(elevation)
+
+
+def upright(cameras: list[Camera]) -> np.ndarray:
+    """(3,) world direction of length 1 that is up in photographs held level.
+
+    The horizontals of level photographs are level whatever they look down on, and all at a right angle to it; the mean
+    of the images' up, which leans towards what is looked down on from one side, decides where they leave it open.
+    """
+    poses = np.stack([camera.c2w for camera in cameras])
+    rights, mean = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    length = np.linalg.norm(mean)
+    if length > 1e-9:
+        mean /= length
+    lean = np.eye(3) - np.outer(mean, mean)
+    up = np.linalg.eigh(rights.T @ rights / len(rights) + _TILT * lean)[1][:, 0]
+    return up if up @ mean >= 0 else -up
+
+
+def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:
+    """World-to-camera matrices (4,4) along the way that the photographs were taken, smoothed, at even speed.
+
+    The longest stretch without a jump of the cameras in their order, so that nothing is crossed that they did not.
+
+    Returns:
+        None of them where no three cameras in a row are near each other.
+    """
+    if len(cameras) < 3:
+        return []
+    poses = np.stack([camera.c2w for camera in cameras])
+    walked = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turned = np.degrees(np.arccos(np.clip((poses[1:, :3, 2] * poses[:-1, :3, 2]).sum(axis=1), -1, 1)))
+    typical = max(float(np.median(walked)), 1e-12)
+    breaks = np.flatnonzero((walked > _JUMP * typical) | (turned > _TURN)) + 1
+    stretch = max(np.split(np.arange(len(poses)), breaks), key=len)
+    if len(stretch) < 3:
+        return []
+    poses, walked, turned = poses[stretch], walked[stretch[:-1]], turned[stretch[:-1]]
+    # A turn by 30 degrees takes as long as a step.
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(walked / typical + turned / 30, 1e-3))])
+    width = max(_SMOOTH * times[-1] / (len(times) - 1), times[-1] / _SMOOTHED)
+    made = []
+    for time in np.linspace(0, times[-1], frames):
+        weights = np.exp(-0.5 * ((times - time) / width) ** 2)
+        pose = np.tensordot(weights / weights.sum(), poses, 1)
+        eye = pose[:3, 3]
+        made.append(look_at(eye, eye + pose[:3, 2], -pose[:3, 1]))
+    return made
+
+
+def _meeting_point(eyes: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """The point (3,) whose distances to the optical axes have the smallest sum: a few stray cameras do not move it.
+
+    Args:
+        eyes: (V, 3).
+        across: (V, 3, 3) projections onto the plane across each axis.
+    """
+    weights = np.ones(len(eyes))
+    for _ in range(_ROUNDS):
+        total = (weights[:, None, None] * across).sum(axis=0)
+        point = np.linalg.solve(total, (weights[:, None] * (across @ eyes[:, :, None])[:, :, 0]).sum(axis=0))
+        miss = np.linalg.norm((across @ (point - eyes)[:, :, None])[:, :, 0], axis=1)
+        weights = 1 / np.maximum(miss, max(1e-3 * float(np.median(miss)), 1e-12))
+        weights /= weights.max()
+    return point
+
+
+def _aimed(point: np.ndarray, eyes: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """(V,) bool: which cameras have the point before them, near the middle of the picture."""
+    ahead = point - eyes
+    return (ahead * axes).sum(axis=1) >= _AIMED * np.linalg.norm(ahead, axis=1)
+
+
+def _covered(azimuths: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """The arc that holds most cameras without a wide gap: its start, its span (360 without a wide gap at all), both in
+    degrees, and which cameras (V,) lie in it.
+
+    Args:
+        azimuths: (V,) degrees.
+    """
+    order = np.argsort(azimuths, kind="stable")
+    around = azimuths[order]
+    gaps = np.diff(around, append=around[0] + 360)
+    wide = np.flatnonzero(gaps > _WIDEST_GAP)
+    if not len(wide):
+        return float(azimuths[0]), 360.0, np.ones(len(azimuths), bool)
+    # Begin after a wide gap; every wide gap then ends a piece.
+    order = np.roll(order, -(wide[-1] + 1))
+    ends = np.flatnonzero(np.roll(gaps, -(wide[-1] + 1)) > _WIDEST_GAP) + 1
+    piece = max(np.split(order, ends[:-1]), key=len)
+    inside = np.zeros(len(azimuths), bool)
+    inside[piece] = True
+    start = float(azimuths[piece[0]])
+    return start, float((azimuths[piece[-1]] - start) % 360), inside
