@@ -79,11 +79,16 @@ class Focus:
         mean = axes.mean(axis=0)
         if distance_of is None or np.linalg.norm(mean) < _ALIKE:
             return None
+        mean /= np.linalg.norm(mean)
+        moved = eyes - eyes.mean(axis=0)
+        along = moved @ mean
+        if (along**2).sum() > 0.5 * (moved**2).sum():  # a drive: they move where they look
+            return None
         probes = [cameras[i * len(cameras) // _PROBES] for i in range(_PROBES)] if len(cameras) > _PROBES else cameras
         seen = [distance for distance in map(distance_of, probes) if distance is not None]
         if not seen:
             return None
-        ahead = np.median(eyes, axis=0) + np.median(seen) * mean / np.linalg.norm(mean)
+        ahead = np.median(eyes, axis=0) + np.median(seen) * mean
         aimed = _aimed(ahead, eyes, axes)
         focus = cls(ahead, eyes[aimed], False)
         if aimed.mean() < _MOST or focus.stand(upright(cameras))[1] < _LEAST_SPAN:
