@@ -45,8 +45,9 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
         for place in _BANDS:
             # What projecting and sorting all Gaussians takes, however small the image is, and what its rows take.
             least = seconds(place, 1)
-            view += least / len(_BANDS)
-            row += max(seconds(place, rows) - least, 0.0) / (rows - 1) / len(_BANDS)
+            each = max(seconds(place, rows) - least, 0.0) / (rows - 1)
+            view += max(least - each, 0.0) / len(_BANDS)
+            row += each / len(_BANDS)
             bar.advance()
     pixels = sum(camera.width * camera.height for camera in cameras)
     return view * len(cameras) + row * pixels / first.width
