@@ -286,7 +286,7 @@ class ActiveViews:
                 )
         if old["pool"] != [view.name for view in self.views]:
             raise ValueError(
-                f"{where}: --resume must have the same training views, the data set has changed; fit again"
+                f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
         self.picks = old["picks"]
         self.chosen = self.chosen[: self.active.initial] + [pick["index"] for pick in self.picks]

@@ -5,7 +5,7 @@ when its command runs, so that `drgs --help` imports nothing heavy. A `run` func
 None or an exit code.
 
 Exit codes: 0 done, 1 a wrong gradient (crossval) or a broken bound (stress), 2 bad usage or bad input (one line on
-stderr), 130 interrupted.
+stderr), 129, 130 or 143 ended by SIGHUP, Ctrl-C or SIGTERM.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
+from drgs import interrupts
 from drgs.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Select, Sfm, Stress, Tradeoff
 from drgs.progress import Bar
 
@@ -61,32 +62,38 @@ def main(argv: list[str] | None = None) -> int:
         print(f"drgs {drgs.__version__}")
         return 0
     args = _parse_arguments(argv)
+    from drgs import outputs  # not for --help
+
     name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])
     logging.getLogger("drgs").setLevel(logging.WARNING if args.quiet else logging.INFO)
     try:
         if not 0 <= getattr(args, "seed", 0) < 1 << 31:
             raise ValueError(f"--seed must be in [0, {(1 << 31) - 1}], got {args.seed}; choose another")
-        # Whatever a command does without a bar of its own is not silent either.
-        with Bar(f"drgs {name}", show=not args.quiet, lines_only=True):
-            with Bar("loading libraries"):
-                if args.variant != "auto" or args.threads is not None:
-                    # Only when asked for: a command that needs no backend shall not load one.
-                    from drgs import runtime
+        with interrupts.handled(outputs.clean, lambda error: f"drgs {name}: {_ending(error)}\n"):
+            try:
+                # Whatever a command does without a bar of its own is not silent either.
+                with Bar(f"drgs {name}", show=not args.quiet, lines_only=True):
+                    with Bar("loading libraries"):
+                        if args.variant != "auto" or args.threads is not None:
+                            # Only when asked for: a command that needs no backend shall not load one.
+                            from drgs import runtime
 
-                    runtime.setup(args.variant, args.threads)
-                run = getattr(importlib.import_module(module), function)
-            return run(args) or 0
+                            runtime.setup(args.variant, args.threads)
+                        run = getattr(importlib.import_module(module), function)
+                    return run(args) or 0
+            finally:
+                outputs.release_all()
     except (ValueError, NotImplementedError, OSError) as error:
         if args.debug:
             raise
         _complain(name, str(error) or type(error).__name__)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         if args.debug:
             raise
-        _complain(name, "interrupted")
-        return 130
+        _complain(name, _ending(error))
+        return interrupts.exit_code(error)
 
 
 class _Stderr(logging.StreamHandler):
@@ -141,6 +148,12 @@ def _one_line(framed: str) -> str:
         if section and section[0].startswith("Perhaps you meant"):
             message += f"; perhaps {section[1]}"
     return message
+
+
+def _ending(error: KeyboardInterrupt) -> str:
+    """`interrupted` or `terminated`, and what was saved."""
+    word = "terminated" if isinstance(error, interrupts.Terminated) else "interrupted"
+    return f"{word}: {error}" if str(error) else word
 
 
 def _complain(command: str | None, message: str) -> None:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from drgs import rasterizers, runtime, tables
 from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.outputs import check_file, claim
 from drgs.progress import Bar
-from drgs.render_command import make_folder
 from drgs.viewpoints import seen_views
 
 if TYPE_CHECKING:
@@ -22,6 +22,13 @@ def run(args: Crossval) -> int:
     from drgs.crossval import crossval
     from drgs.report import html
 
+    inputs = [args.scene, args.cameras or "", args.rasterizer]
+    if args.export is None:
+        claim(args.output, "crossval", ["report.html", "crossval.json"], inputs)
+    elif args.export.suffix != ".npz":
+        raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
+    else:
+        check_file(args.export, "crossval", inputs, rasterizers.is_export)
     g, fields, cameras, source = seen_views(args)
     if args.export is not None:
         background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
@@ -30,7 +37,6 @@ def run(args: Crossval) -> int:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0
     rasterizer = rasterizers.load(args.rasterizer, g, cameras, fields)
-    make_folder(args.output)
     with Bar("crossval", show=not args.quiet) as bar:
 
         def advance(stage: str) -> None:

@@ -7,7 +7,6 @@ nothing in it is a Gaussian. Times are medians of interleaved runs with warm ker
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import statistics
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ import drgs
 from drgs import metrics, pictures, runtime, tables
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.files import SCHEMA, write_json
+from drgs.outputs import Claim, claim
 from drgs.progress import Bar
 from drgs.settings import RenderSettings
 
@@ -39,6 +39,7 @@ _PRESETS = {
     "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
 }
 _GAIN = 8  # of difference pictures
+_OWN = ("demo", "eval")  # commands whose files in the run may be replaced
 _TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
 _DISTANCE = 1.1
 
@@ -80,18 +81,29 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
     """Make, fit, render, compare; writes pictures and demo.json.
 
     Args:
-        out_dir: Its folders `still_life` (kept if it is there) and `run` (replaced) belong to the demo.
+        out_dir: Its folders `still_life` (kept if it is there) and `run` (replaced) belong to the demo; a folder of
+            that name that an earlier demo did not make is refused.
         plan: How much.
         progress: Say what comes out, on stdout, and how far it is, on stderr.
     Returns:
         What demo.json holds.
     Raises:
         FileNotFoundError: If the package `scenes` is not installed.
+        ValueError: If something is in the way that an earlier demo did not make.
     """
+    with (
+        claim(out_dir, "demo", ["comparison.png", "turntable.webm", "demo.json"]),
+        claim(Path(out_dir) / "run", "demo") as run_folder,
+    ):
+        return _make_demo(Path(out_dir), run_folder, plan, progress)
+
+
+def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> dict:
     from drgs.frames import load_frames
     from drgs.train import FitConfig, fit
 
-    out_dir, began, seconds = Path(out_dir), time.perf_counter(), {}
+    run_folder.check_all(_OWN)
+    began, seconds = time.perf_counter(), {}
 
     def say(text: str) -> None:
         if progress:
@@ -114,8 +126,7 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
     config = FitConfig(
         max_steps=plan.steps, max_gaussians=plan.gaussians, max_pixels=plan.width * plan.height, save_every=plan.steps
     )
-    if (out_dir / "run" / "config.json").is_file():
-        shutil.rmtree(out_dir / "run")
+    run_folder.clear(_OWN)
     fitted = fit(dataset, out_dir / "run", config, progress=progress)
     lap("fit", start)
     g, mean = fitted.gaussians, fitted.metrics["mean"]
@@ -161,6 +172,7 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
     say(f"All of it took {seconds['total']:.0f} s; numbers: {out_dir / 'demo.json'}")
     report = {
         "schema": SCHEMA,
+        "command": "demo",
         "plan": dataclasses.asdict(plan),
         "fit": {"gaussians": len(g), "seconds": fitted.seconds, "split": fitted.metrics["split_rule"], "mean": mean},
         "presets": rows,

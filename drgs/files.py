@@ -12,13 +12,13 @@ import json
 import logging
 import os
 import struct
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from drgs import outputs
 from drgs.foreign import refuse_foreign
 from drgs.json_files import parse_json, read_json
 
@@ -218,24 +218,12 @@ def _layout_hint(names: list[str]) -> str:
 def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """A binary file that appears under its name only once it is complete; missing folders are made.
 
-    A process that dies leaves the old file, or none, and at most a hidden `.NAME.*.tmp` beside it.
+    A process that dies leaves the old file, or none, and at most a hidden `.drgs.NAME.*.tmp` beside it.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        umask = os.umask(0)  # mkstemp makes private files; what we write is to be shared as any other
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+    with outputs.replacing(path) as name, open(name, "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
@@ -276,18 +264,20 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
 
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a checkpoint, found none; start without --resume")
+        raise FileNotFoundError(f"{path}: must be a checkpoint, found none; check the path")
     refuse_foreign(path, "a checkpoint")
     try:
         with safe_open(str(path), "pt") as file:
             header = parse_json((file.metadata() or {}).get("drgs", "{}"), str(path))
             schema = header.get("schema") if isinstance(header, dict) else None
             if schema != SCHEMA:
-                raise ValueError(f"{path}: checkpoint schema must be {SCHEMA}, got {schema!r}; fit again")
+                raise ValueError(
+                    f"{path}: checkpoint schema must be {SCHEMA}, got {schema!r}; fit into another run folder (-o)"
+                )
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
     except (SafetensorError, struct.error) as error:
         text = " ".join(str(error).split())
-        raise ValueError(f"{path}: must be a checkpoint, got {text}; start without --resume") from None
+        raise ValueError(f"{path}: must be a checkpoint, got {text}; copy it again") from None
 
 
 class Run:
@@ -347,10 +337,10 @@ class Run:
         path = self.path / "config.json"
         if not path.is_file():
             raise FileNotFoundError(f"{self.path}: must be a run folder, found no config.json; run `drgs fit` first")
-        config = read_json(path, "a run's config.json", "fit again")
+        config = read_json(path, "a run's config.json", "fit again in another folder")
         if not isinstance(config, dict) or config.get("schema") != SCHEMA:
             got = config.get("schema") if isinstance(config, dict) else type(config).__name__
-            raise ValueError(f"{path}: schema must be {SCHEMA}, got {got!r}; fit again")
+            raise ValueError(f"{path}: schema must be {SCHEMA}, got {got!r}; fit again in another folder")
         return config
 
     def log(self, event: str, **fields: Any) -> None:
@@ -369,5 +359,4 @@ class Run:
     def _drop_partial_line(self) -> None:
         path = self.path / "log.jsonl"
         if path.exists() and not (data := path.read_bytes()).endswith(b"\n"):
-            with atomic_write(path) as file:
-                file.write(data[: data.rfind(b"\n") + 1])
+            os.truncate(path, data.rfind(b"\n") + 1)

@@ -18,8 +18,9 @@ import torch
 from drgs import pictures, tables
 from drgs.files import SCHEMA, save_state, write_json
 from drgs.gain import variances
+from drgs.outputs import claim
 from drgs.progress import Bar
-from drgs.render_command import described, make_folder
+from drgs.render_command import described
 from drgs.viewpoints import evenly, known_views, other_views, scene_of
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ def run(args: Fisher) -> None:
     if not 1 <= args.limit <= 10_000:
         raise ValueError(f"fisher: --limit must be in [1, 10000], got {args.limit}; correct it")
     prior = Prior(value=args.prior, relative=args.relative_prior)
+    inputs = [args.scene, args.train or "", args.cameras or ""]
+    output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     scene = scene_of(args)
     text = args.train
     if text is None and scene.run is None:
@@ -53,7 +56,8 @@ def run(args: Fisher) -> None:
     if args.cameras is not None:
         views, source = other_views("--cameras", args.cameras, args, scene, known, fresh=False)
     views = evenly(views, args.limit)
-    make_folder(args.output)
+    names = pictures.file_names([camera.name for camera in views])
+    output.check(f"{name}.{kind}.png" for name in names for kind in ("variance", "share"))
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
         H: Information = {}
         for camera in known.cameras:
@@ -62,7 +66,7 @@ def run(args: Fisher) -> None:
             H = {name: x + H[name] if H else x for name, x in part.items()}
             bar.advance()
         rows = []
-        for camera, name in zip(views, pictures.file_names([camera.name for camera in views]), strict=True):
+        for camera, name in zip(views, names, strict=True):
             rows.append(_view(args, scene, camera, name, H, prior))
             bar.advance()
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": scene.settings}

@@ -18,6 +18,7 @@ from drgs import tables
 from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.pictures import file_names, write_png
 from drgs.progress import Bar
+from drgs.resume import claim_run
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -266,6 +267,7 @@ def run_eval(args: Eval) -> None:
 
     run = Run(args.run)
     recorded = fit_record(run)
+    output = claim_run(run, "eval")
     config = recorded.config
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
     g = load_ply(run.point_cloud)
@@ -286,6 +288,8 @@ def run_eval(args: Eval) -> None:
     if not views:
         raise ValueError(f"eval: split {args.split} must hold a view, holds none ({dataset.split_rule()}); use --split")
     frames = load_frames(views, config.max_pixels, config.mask)
+    names = file_names([frame.name for frame in frames])
+    output.check(f"renders/{args.split}/{name}.png" for name in names)
     result = evaluate(g, frames, config.settings, lpips=lpips, pictures=run.renders / args.split)
     viewers = through_viewers(g, frames, config.settings, args.split)
     written = write_metrics(

@@ -268,7 +268,7 @@ class Select(_Policy, _Views):
     """A data set or a run (those of its views that are not known), a cameras.json, orbit, or dome."""
     k: Annotated[int, arg(aliases=["-k"])] = 1
     """Views to pick, each given the ones before."""
-    output: _Output = Path("selection.json")
+    output: _Output = Path("out/select.json")
     """The JSON file."""
     preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
     """Render settings of a named system; fast ranks as exact does, in a fraction of the time (docs)."""

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from drgs import outputs
 from drgs.files import atomic_write
 
 __all__ = [
@@ -220,21 +220,10 @@ class Video:
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[str]:
     """A name beside `path`, with its suffix, for a library that opens files itself; moved there at the end."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    try:
+    with outputs.replacing(path, path.suffix) as name:
         yield name
         if not os.path.getsize(name):
             raise OSError(f"{path}: must be written, but the file stayed empty; is the disk full?")
-        umask = os.umask(0)  # mkstemp makes private files
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        raise
 
 
 @contextlib.contextmanager

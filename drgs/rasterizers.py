@@ -8,10 +8,12 @@ gradients only: it cannot be asked again.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
 import inspect
 import sys
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +26,11 @@ from drgs.foreign import refuse_foreign
 from drgs.integrator import render
 from drgs.settings import PRESETS, RenderSettings
 
-__all__ = ["GROUPS", "Dump", "Rasterizer", "cotangents", "export", "load", "raw_of"]
+__all__ = ["GROUPS", "Dump", "Rasterizer", "cotangents", "export", "is_export", "load", "raw_of"]
 
 GROUPS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 _DUMPS = (".npz", ".safetensors")
+_EXPORT = "drgs_export"  # an array by which an export can be told from a dump, which holds more
 _LARGEST = 4 << 30  # bytes of a dump
 
 
@@ -282,10 +285,23 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
     """
     arrays = scene_arrays(g, cameras, background)
     arrays["cotangent"] = cotangents(cameras, seed).float().numpy()
-    if path.suffix != ".npz":
-        raise ValueError(f"--export {path}: must end with .npz, got {path.suffix or 'no suffix'}")
+    arrays[_EXPORT] = _signature(arrays)
     with atomic_write(path) as file:
         np.savez_compressed(file, **arrays)
+
+
+def is_export(path: Path) -> bool:
+    """Whether `export` wrote a file; a dump that was made of one holds more arrays."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return np.array_equal(arrays[_EXPORT], _signature({*arrays.files} - {_EXPORT}))
+    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile):
+        return False
+
+
+def _signature(names: Iterable[str]) -> np.ndarray:
+    """Of an export: numbers, for readers that make tensors of all that they find."""
+    return np.frombuffer(hashlib.sha256(" ".join(sorted(names)).encode()).digest(), np.uint8)
 
 
 def _dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple) -> Dump:

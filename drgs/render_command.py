@@ -23,6 +23,7 @@ from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.forecast import forecast
 from drgs.foreign import refuse_foreign
 from drgs.orbits import Wish, capture_orbit, scene_orbit, seen_distance
+from drgs.outputs import claim
 from drgs.progress import Bar
 from drgs.run_records import fit_record, fitted_views
 
@@ -38,7 +39,6 @@ __all__ = [
     "described",
     "is_camera_list",
     "load_scene",
-    "make_folder",
     "render_views",
     "run",
 ]
@@ -56,6 +56,9 @@ def run(args: Render) -> None:
     settings = args.settings()
     formats = _formats(args.format)
     _check_numbers(args)
+    movie = "turntable.webm" if args.cameras == "orbit" else "video.webm"
+    fixed = ["render.json", "cameras.json", *([movie] * ("webm" in formats))]
+    output = claim(args.output, "render", fixed, inputs=[args.scene, args.cameras])
     gaussians, folder = load_scene(args.scene)
     if folder is not None and not any(text.startswith("background=") for text in args.overrides):
         # A run was fitted over its background; over another one its edges show a halo.
@@ -66,7 +69,8 @@ def run(args: Render) -> None:
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
-    make_folder(args.output)
+    kinds = [*(kind for kind in formats if kind != "webm"), *(["depth.png"] * args.depth)]
+    output.check(f"{name}.{kind}" for name in pictures.file_names([x.name for x in cameras]) for kind in kinds)
     if not args.quiet:
         _say_how_long(args, gaussians, cameras, settings)
     with Bar("render", len(cameras), not args.quiet) as bar:
@@ -78,7 +82,7 @@ def run(args: Render) -> None:
             formats=formats,
             depth=args.depth,
             fps=args.fps,
-            video="turntable.webm" if args.cameras == "orbit" else "video.webm",
+            video=movie,
             advance=bar.advance,
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
@@ -304,18 +308,6 @@ def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
 
 
 # ----------------------------------------------------------------------------------------- outputs
-
-
-def make_folder(path: Path) -> None:
-    """The output folder, found out to be writable before anything is computed."""
-    probe = path / ".drgs-probe"
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        reason = error.strerror or error
-        raise ValueError(f"{path}: -o must be a folder that can be written, got: {reason}; choose another") from None
 
 
 def described(camera: Camera) -> dict:

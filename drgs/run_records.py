@@ -61,7 +61,7 @@ def fit_record(run: Run) -> FitRecord:
         ValueError: If config.json is damaged, of another version, or says something that no fit has written.
     """
     config, where = run.config(), f"{run.path / 'config.json'}"
-    advice = "restore the file, or fit again"
+    advice = "restore the file, or fit again in another folder"
     check_json(where, config, _CONFIG, advice)
     try:
         fit = FitConfig.from_json(config["fit"])
@@ -82,9 +82,9 @@ def fitted_views(run: Run) -> list[str]:
     record = fit_record(run)
     if not record.is_active:
         return list(record.train)
-    path = run.path / "selection.json"
-    selection = read_json(path, "the record of the chosen views", "resume the fit")
-    check_json(str(path), selection, {"start": [_VIEW], "picks": [_VIEW]}, "resume the fit")
+    path, advice = run.path / "selection.json", "move it away and resume the fit"
+    selection = read_json(path, "the record of the chosen views", advice)
+    check_json(str(path), selection, {"start": [_VIEW], "picks": [_VIEW]}, advice)
     return [view["name"] for view in (*selection["start"], *selection["picks"])]
 
 

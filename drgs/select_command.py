@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from drgs import tables
 from drgs.files import SCHEMA, write_json
+from drgs.outputs import check_file
 from drgs.progress import Bar
-from drgs.render_command import described, make_folder
+from drgs.render_command import described
 from drgs.viewpoints import known_views, other_views, scene_of
 
 if TYPE_CHECKING:
@@ -28,9 +29,7 @@ def run(args: Select) -> None:
     from drgs.gain import Prior
     from drgs.select import select
 
-    if args.output.is_dir():
-        raise ValueError(f"{args.output}: -o must be a file for the JSON, is a folder; name a file in it")
-    make_folder(args.output.parent)
+    check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior(value=args.prior, relative=args.relative_prior)
     scene = scene_of(args)
     known = known_views(args.train, scene)

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
 from drgs.foreign import refuse_foreign
+from drgs.outputs import claim, temporary_folder
 from drgs.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.options import Sfm
+    from drgs.outputs import Claim
 
 __all__ = ["SfmSummary", "run_command", "run_sfm"]
 
@@ -66,8 +68,8 @@ def run_sfm(
     """Find camera poses and points from photos; afterwards ``drgs.data.load(out_dir)`` works.
 
     Writes ``out_dir/{database.db, sparse/0, images}``; ``images`` is a link to ``image_dir`` where
-    links work, a copy elsewhere. An existing result is replaced, and only once the new one is
-    complete.
+    links work, a copy elsewhere. An earlier result of this function is replaced, and only once the
+    new one is complete; nothing else ever is.
 
     Args:
         image_dir: folder of photos.
@@ -81,7 +83,8 @@ def run_sfm(
 
     Raises:
         FileNotFoundError: no such folder.
-        ValueError: fewer than 2 photos, an unknown option, or photos that do not connect.
+        ValueError: fewer than 2 photos, an unknown option, photos that do not connect, or an
+            ``out_dir`` that holds a COLMAP project or photos that were not made here.
     """
     image_dir, out_dir = Path(image_dir), Path(out_dir)
     if image_dir.is_file():
@@ -98,27 +101,24 @@ def run_sfm(
         raise ValueError(f"run_sfm: camera_model must be one of {', '.join(_CAMERA_MODELS)}, got {camera_model!r}")
     if matching not in ("auto", "exhaustive", "sequential"):
         raise ValueError(f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one")
-    if out_dir.exists() and not out_dir.is_dir():
-        raise ValueError(f"{out_dir}: must be a folder, found a file; choose another output")
-    # A folder with photos of its own here is the user's, not an earlier result.
-    own = out_dir / "images"
-    if (
-        own.is_dir()
-        and not own.is_symlink()
-        and own.resolve() != image_dir.resolve()
-        and not (out_dir / "database.db").exists()
-    ):
-        raise ValueError(f"{out_dir}: must not hold other photos in images, found some; choose another output")
-
-    partial = out_dir.with_name(out_dir.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    (partial / "models").mkdir(parents=True)
-    try:
-        summary = _reconstruct(image_dir, names, partial, progress, camera_model, max_image_size, matching, seed)
-        _install(partial, out_dir, image_dir)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with claim(out_dir, "sfm", inputs=[image_dir]) as output:
+        _check_output(output, image_dir)
+        with temporary_folder("sfm", output.path) as partial:
+            (partial / "models").mkdir()
+            summary = _reconstruct(image_dir, names, partial, progress, camera_model, max_image_size, matching, seed)
+            _install(partial, output, image_dir)
     return summary
+
+
+def _check_output(output: Claim, image_dir: Path) -> None:
+    """Find out that what is to be replaced is an earlier result, before minutes of work."""
+    places = ["sparse", *(path.name for path in output.path.glob("database.db*"))]
+    if (output.path / "images").resolve() != image_dir.resolve():
+        places.append("images")
+    try:
+        output.check(places)
+    except ValueError as error:
+        raise ValueError(f"{str(error).partition(';')[0]}; choose another output (-o), a new folder is best") from None
 
 
 def _reconstruct(
@@ -132,9 +132,8 @@ def _reconstruct(
     seed: int,
 ) -> SfmSummary:
     """Run the three stages; leaves ``database.db`` and ``sparse/0`` in ``partial``."""
-    import pycolmap
-
     from drgs.data.matching import extract, match, quiet, sequential_pairs
+    from drgs.data.native import pycolmap
 
     report = progress or (lambda stage, done, total: None)
     database = partial / "database.db"
@@ -182,7 +181,6 @@ def _reconstruct(
     best.update_point_3d_errors()
     (partial / "sparse/0").mkdir(parents=True)
     best.write_binary(partial / "sparse/0")
-    shutil.rmtree(partial / "models")
     found = {best.images[index].name for index in best.reg_image_ids()}
     report("mapping", len(names), len(names))
     return SfmSummary(
@@ -196,28 +194,27 @@ def _reconstruct(
     )
 
 
-def _install(partial: Path, out_dir: Path, image_dir: Path) -> None:
+def _install(partial: Path, output: Claim, image_dir: Path) -> None:
     """Move the finished result to its place; the model, which makes the folder a data set, comes
     last.
     """
-    out_dir.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out_dir / "sparse", ignore_errors=True)
-    images = out_dir / "images"
+    _check_output(output, image_dir)  # minutes later
+    output.remove(output.path / "sparse")
+    images = output.path / "images"
     if images.resolve() != image_dir.resolve():
-        if images.is_symlink():
-            images.unlink()
-        elif images.exists():
-            shutil.rmtree(images)
+        output.remove(images)
+        made = partial / "images"
         try:
-            images.symlink_to(image_dir.resolve(), target_is_directory=True)
+            made.symlink_to(image_dir.resolve(), target_is_directory=True)
         except OSError:
-            shutil.copytree(image_dir, images)
+            shutil.copytree(image_dir, made)
+        output.put(made, "images")
     # SQLite may have left side files; they belong to the database.
-    for stale in out_dir.glob("database.db*"):
-        stale.unlink()
+    for stale in output.path.glob("database.db*"):
+        output.remove(stale)
     for file in partial.glob("database.db*"):
-        os.replace(file, out_dir / file.name)
-    os.replace(partial / "sparse", out_dir / "sparse")
+        output.put(file, file.name)
+    output.put(partial / "sparse", "sparse")
 
 
 def run_command(args: Sfm) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.outputs import claim
 from drgs.progress import Bar
 
 if TYPE_CHECKING:
@@ -85,9 +86,7 @@ def run(args: Stress) -> int:
     if not chosen:
         raise ValueError(f"stress: --match must be part of a case's name, got {args.match!r}; drgs stress lists all")
     if args.output is not None:
-        from drgs.render_command import make_folder
-
-        make_folder(args.output)
+        claim(args.output, "stress", ["stress.json", "stress.md"])
     start, found = time.perf_counter(), []
     if not args.quiet:
         print(f"{len(chosen)} cases; the first run compiles their kernels: minutes. Later ones take one or two.")

@@ -28,8 +28,9 @@ from typing import TYPE_CHECKING
 
 from drgs import runtime, tables
 from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.outputs import claim, replacing
 from drgs.progress import Bar
-from drgs.render_command import described, make_folder
+from drgs.render_command import described
 from drgs.tradeoff_measure import measure
 from drgs.viewpoints import seen_views
 
@@ -133,10 +134,11 @@ def run(args: Tradeoff) -> None:
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
     if not 1 <= args.repeats <= 1000:
         raise ValueError(f"--repeats must be in [1, 1000], got {args.repeats}; correct it")
+    names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
+    claim(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
     gaussians, fields, cameras, source = seen_views(args)
     if not len(gaussians):
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")
-    make_folder(args.output)
     with Bar("tradeoff", (args.repeats + 1) * sum(x.by == "view" for x in VARIANTS), not args.quiet) as bar:
         measured = measure(gaussians, cameras, VARIANTS, fields, args.repeats, args.seed, bar.advance)
     for row, variant in zip(measured["rows"], VARIANTS, strict=True):
@@ -360,7 +362,8 @@ def _plot(report: dict, path: Path) -> bool:
         _labels(figure, axis, [*front, *rest], points)
     figure.suptitle(f"{report['scene']}: {report['gaussians']:,} Gaussians", fontsize=10)
     figure.tight_layout(rect=(0, 0, 1, 0.985))
-    figure.savefig(path)
+    with replacing(path, path.suffix) as name:
+        figure.savefig(name)
     plt.close(figure)
     return True
 

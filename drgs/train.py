@@ -9,9 +9,8 @@ import contextlib
 import dataclasses
 import logging
 import math
-import signal
-import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,15 +18,16 @@ import numpy as np
 import torch
 
 import drgs
-from drgs import metrics
+from drgs import interrupts, metrics
 from drgs.active import ActiveConfig, ActiveViews
 from drgs.data.views import check_parallax
 from drgs.density import Model
-from drgs.files import Run, load_state, save_ply, save_state
+from drgs.files import Run, save_ply, save_state
 from drgs.frames import Frame, load_frames
-from drgs.pictures import write_png
+from drgs.outputs import claim
+from drgs.pictures import file_names, write_png
 from drgs.progress import Bar
-from drgs.run_records import check_checkpoint
+from drgs.resume import claim_run, keep_previous, last_checkpoint
 from drgs.trainer import FitConfig, Trainer
 
 if TYPE_CHECKING:
@@ -80,12 +80,14 @@ def fit(
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
     Raises:
-        ValueError: On a bad config, data set or run folder, and when losses stay not finite.
-        KeyboardInterrupt: Passed on after a checkpoint and the PLY have been written.
+        ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
+            not finite.
+        KeyboardInterrupt: On Ctrl-C, SIGTERM and SIGHUP, after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
     drgs.runtime.backend()  # sets torch's threads too, at first use
-    with _one_thread() if config.deterministic else contextlib.nullcontext(), Bar("fit", show=progress):
+    threads = _one_thread() if config.deterministic else contextlib.nullcontext()
+    with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         return _fit(dataset, out_dir, config, active, resume)
 
 
@@ -95,9 +97,8 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
         check_parallax(train)
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
-    tensors, header = load_state(run.state) if resume and run.state.is_file() else (None, None)
+    tensors, header = last_checkpoint(run) if resume else (None, None)
     if header:
-        check_checkpoint(run.state, tensors, header)
         was, now = ("active" if x else "all" for x in (header.get("active"), plan))
         if was != now:
             raise ValueError(
@@ -130,6 +131,7 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
     }
     if plan:
         recorded |= {"active": active.to_json(), "pool": [view.name for view in train], "pool_leak": plan.pool_leak}
+    _check_pictures(out_dir, config.max_steps, held_out)
     run.start(recorded, resume=resume)
     if plan:
         plan.write(run)  # forgets picks that no checkpoint knows of
@@ -166,11 +168,8 @@ def run_fit(args: Fit) -> None:
     names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
     config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
     active = args.active()
-    if not args.resume and (args.output / "config.json").exists():
-        # Found out before minutes of reading images and triangulating points.
-        raise ValueError(
-            f"{args.output}: must be a new run folder, holds a run already; add --resume or choose another"
-        )
+    # Before minutes of reading images and triangulating points.
+    claim_run(Run(args.output), "fit", args.resume, [args.data])
     dataset = load(
         args.data,
         test_every=config.test_every,
@@ -207,6 +206,23 @@ def _start(
     return Trainer(config, frames, model, extent), source
 
 
+def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame]) -> None:
+    """See to it that no picture of somebody else's is in the way, before the first step."""
+    every = _preview_every(max_steps)
+    names = [_preview_name(step) for step in range(every, max_steps + 1, every)]
+    names += [f"test/{name}.png" for name in file_names([frame.name for frame in held_out])]
+    with claim(out_dir, "fit", [f"renders/{name}" for name in names]):
+        pass
+
+
+def _preview_every(max_steps: int) -> int:
+    return max(1, max_steps // _PREVIEWS)
+
+
+def _preview_name(step: int) -> str:
+    return f"preview_{step:06d}.png"
+
+
 class _Loop:
     """Steps, and the files that are due at them."""
 
@@ -223,20 +239,24 @@ class _Loop:
         self.seconds, self.plan = seconds, plan
         self._recent: list[dict] = []
         self._psnr: float | None = None  # of the last steps
+        self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
 
     def run(self, bar: Bar) -> None:
         trainer, config = self.trainer, self.trainer.config
-        preview_every = max(1, config.max_steps // _PREVIEWS)
+        preview_every = _preview_every(config.max_steps)
         if self.plan:
             trainer.reserved = self.plan.reserved
-        with _interrupt_between_steps() as is_interrupted:
+        # In the middle of a step the Gaussians may be half-way through density control: not a state to save.
+        with interrupts.between_steps() as is_interrupted:
             while trainer.step_index < config.max_steps:
                 if is_interrupted():
                     self.run_folder.log("interrupted", step=trainer.step_index)
                     self.save()
-                    raise KeyboardInterrupt
+                    raise interrupts.interruption(f"saved at step {trainer.step_index}, --resume goes on")
                 while self.plan and self.plan.is_due(trainer.step_index):
-                    self._pick(bar)
+                    self.save()  # choosing may take minutes, and can be interrupted anywhere
+                    with interrupts.at_once():
+                        self._pick(bar)
                 began = time.perf_counter()
                 row = trainer.step()
                 self.seconds += time.perf_counter() - began
@@ -247,21 +267,26 @@ class _Loop:
                 shown = "" if self._psnr is None else f"{self._psnr:.2f} dB, "
                 bar.update(done, text=f"{shown}{len(trainer.model)} Gaussians")
                 if done % preview_every == 0:
-                    self._preview(bar)
+                    self._preview(bar, is_interrupted)
                 if done % config.save_every == 0 and done < config.max_steps:
                     self.save()
             self.save()
 
     def save(self) -> None:
-        """The PLY, then the checkpoint."""
+        """The PLY, then the checkpoint, unless both are there."""
+        now = self.trainer.step_index, len(self.trainer.frames)
+        if now == self._saved:
+            return
         tensors, header = self.trainer.state()
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
         header |= {"seconds": self.seconds, "point_source": self.source}
         if self.plan:
             more_tensors, more_header = self.plan.state()
             tensors, header = tensors | more_tensors, header | more_header
+        keep_previous(self.run_folder)
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index)
+        self._saved = now
 
     def _pick(self, bar: Bar) -> None:
         """One more view."""
@@ -300,46 +325,25 @@ class _Loop:
             )
             self._recent = []
 
-    def _preview(self, bar: Bar) -> None:
-        """One picture, and the PSNR of all held-out views."""
+    def _preview(self, bar: Bar, is_interrupted: Callable[[], bool]) -> None:
+        """One picture, and the PSNR of all held-out views, unless the fit is interrupted."""
         trainer, done = self.trainer, self.trainer.step_index
         frames = self.held_out or trainer.frames[:1]
         values = []
         for i, frame in enumerate(frames):
+            if is_interrupted():
+                return
             with torch.no_grad():
                 image = drgs.render(trainer.gaussians(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
             values.append(metrics.psnr(image, frame.image(), frame.mask))
             if i == 0:
                 pair = torch.cat([frame.image(), image], dim=1)
-                write_png(self.run_folder.renders / f"preview_{done:06d}.png", pair.numpy())
+                write_png(self.run_folder.renders / _preview_name(done), pair.numpy())
         psnr = float(np.mean(values)) if self.held_out else None
         self.run_folder.log("preview", step=done, test_psnr=psnr, gaussians=len(trainer.model), seconds=self.seconds)
         shown = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
         total = trainer.config.max_steps
         bar.note(f"step {done} of {total}: {len(trainer.model)} Gaussians{shown}, {self.seconds:.0f} s")
-
-
-@contextlib.contextmanager
-def _interrupt_between_steps():
-    """Yields a function that says whether Ctrl-C was pressed; pressed again, it interrupts at once.
-
-    In the middle of a step the Gaussians may be half-way through density control: not a state to save.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False  # signals reach the main thread only
-        return
-    pressed = []
-
-    def on_interrupt(*_):
-        if pressed:
-            raise KeyboardInterrupt
-        pressed.append(True)
-
-    before = signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

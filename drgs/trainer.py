@@ -250,7 +250,7 @@ class Trainer:
                 )
         if header["views"] != [frame.name for frame in frames]:
             raise ValueError(
-                f"{where}: --resume must have the same training views, the data set has changed; fit again"
+                f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
         trainer = cls(config, frames, Model.from_state(tensors), header["extent"])
         trainer.step_index, trainer.bad_steps = header["step"], header["bad_steps"]

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-from pathlib import Path
 
 import numpy as np
+
+from drgs.outputs import claim, temporary_folder
 
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",
@@ -320,58 +319,41 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
 
 
 def publish(out_dir, parameters, fill, where):
-    """Makes a folder in one step: it is complete or absent, whenever the process dies.
+    """Makes a folder whose params.json comes last: with it, the folder is complete, whenever the process dies.
 
     Args:
         out_dir: Path to make. A folder published with the same parameters is kept, one published
-            with others is replaced, and any other that is not empty is refused.
+            with others is replaced, and one that holds anything else is refused.
         parameters: JSON-serializable dict that determines the content.
-        fill: Called with a hidden neighbor of `out_dir` to write the content into.
+        fill: Called with a hidden folder in `out_dir` to write the content into.
         where: Who asks, for the error.
 
     Returns:
         `out_dir`.
 
     Raises:
-        ValueError: If `out_dir` holds something that was not published here.
+        ValueError: If `out_dir` holds something that was not published here, or was changed since.
     """
     digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()
     stamp = out_dir / "params.json"
-    held = stamp.read_text() if stamp.is_file() else ""
-    if digest in held:
+    if stamp.is_file() and digest in stamp.read_text():
         return out_dir
-    empty = not out_dir.exists() or (out_dir.is_dir() and not any(out_dir.iterdir()))
-    if "sha256" not in held and not empty:
-        raise ValueError(
-            f"{where}: the output must be a new folder or one made here, got {out_dir}; name another or remove it"
-        )
-    out_dir = Path(os.path.abspath(out_dir))
-    out_dir.parent.mkdir(parents=True, exist_ok=True)
-    for stale in out_dir.parent.glob(f".{out_dir.name}.*.partial"):  # of runs that were killed
-        if not _alive(int(stale.name.split(".")[-2])):
-            shutil.rmtree(stale, ignore_errors=True)
-    partial = out_dir.parent / f".{out_dir.name}.{os.getpid()}.partial"
-    partial.mkdir()
-    try:
-        fill(partial)
-        (partial / "params.json").write_text(json.dumps({"sha256": digest, **parameters}, indent=1) + "\n")
-        if held:
-            shutil.rmtree(out_dir)
-        partial.rename(out_dir)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with claim(out_dir, where) as output:
+        try:
+            output.check_all((where,))
+        except ValueError as error:
+            text = str(error).partition(":")[0]
+            raise ValueError(
+                f"{where}: the output must be a new folder or as it was made here, {text} is not; "
+                "name another or move it away"
+            ) from None
+        with temporary_folder("scene", output.path) as partial:
+            fill(partial)
+            (partial / "params.json").write_text(json.dumps({"sha256": digest, **parameters}, indent=1) + "\n")
+            output.clear((where,))
+            for path in sorted(partial.iterdir(), key=lambda path: path.name == "params.json"):
+                output.put(path, path.name)
     return out_dir
-
-
-def _alive(pid):
-    """Whether a process of this number runs."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
 
 
 def _write_png(path, picture):

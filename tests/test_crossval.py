@@ -359,6 +359,9 @@ def test_dumps(folder):
     assert report["groups"]["means"]["verdict"] == "agreement"
     from safetensors.numpy import save_file
 
+    # An export may be written again; a dump, which holds an export's arrays and more, is the user's.
+    assert _run(folder, "--export", str(folder / "scene.npz")) == 0
+    assert _run(folder, "--export", str(folder / "good.npz")) == 2
     save_file({k: np.atleast_1d(np.ascontiguousarray(x)) for k, x in arrays.items()}, folder / "good.safetensors")
     assert _run(folder, "--no-ladder", "--rasterizer", str(folder / "good.safetensors")) == 0
 

@@ -24,7 +24,7 @@ def test_files(result):
     """Pictures, video, run folder and JSON are there, and nothing half-written."""
     out, report, _ = result
     names = {path.name for path in out.iterdir()}
-    assert names == {"still_life", "run", "comparison.png", "turntable.webm", "demo.json"}
+    assert names == {".drgs.jsonl", "still_life", "run", "comparison.png", "turntable.webm", "demo.json"}
     assert json.loads((out / "demo.json").read_text())["presets"] == report["presets"]
     assert (out / "run" / "point_cloud.ply").is_file()
 
@@ -71,6 +71,8 @@ def test_text(result):
 def test_again(result, monkeypatch, capsys):
     """A second demo in the same folder keeps the still life and replaces the run."""
     out, _, _ = result
+    assert cli.main(["eval", str(out / "run")]) == 0  # measured again: still the demo's own
+    capsys.readouterr()
     stamp = (out / "still_life" / "params.json").stat().st_mtime_ns
     before = (out / "run" / "config.json").stat().st_mtime_ns
     assert cli.main(["demo", "--quick", "--quiet", "-o", str(out)]) == 0
@@ -86,3 +88,22 @@ def test_bad_output(tmp_path, capsys):
     assert cli.main(["demo", "--quick", "-o", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert [path.name for path in tmp_path.rglob("*")] == ["still_life", "mine.txt"]
+
+
+def test_run_of_somebody_else_stays(result, tmp_path, capsys):
+    """A fit in X/run, or a file that was added to the demo's own, is refused in one line and left as it is."""
+    import shutil
+
+    out, _, _ = result
+    shutil.copytree(out / "run", tmp_path / "run")
+    (tmp_path / "run" / ".drgs.jsonl").unlink()  # then it is as a `drgs fit` of the user's
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert cli.main(["demo", "--quick", "-o", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "must not be deleted, `drgs demo` did not make it" in error
+    assert error.count("\n") == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    (out / "run" / "renders" / "notes.txt").write_text("mine")
+    assert cli.main(["demo", "--quick", "-o", str(out)]) == 2
+    assert (out / "run" / "point_cloud.ply").is_file()
+    (out / "run" / "renders" / "notes.txt").unlink()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,7 +82,7 @@ def test_files_hold_the_render(scene, gaussians, camera, tmp_path, capsys):
     again = load_cameras_json(out / "cameras.json")
     np.testing.assert_allclose(again[0].w2c, camera.w2c, atol=1e-12)
     assert "exact order:" in capsys.readouterr().out
-    assert not [path for path in out.iterdir() if path.name.startswith(".")]
+    assert [path.name for path in out.iterdir() if path.name.startswith(".")] == [".drgs.jsonl"]
 
 
 def test_orbit_frames_the_scene(gaussians):
@@ -116,7 +118,7 @@ def test_turntable(scene, tmp_path, capsys):
     out = tmp_path / "out"
     line = f"render {scene} --frames 3 --width 33 --height 21 --format webm --preset fast -o {out} --up z"
     assert cli.main(line.split()) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["cameras.json", "render.json", "turntable.webm"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == ["cameras.json", "render.json", "turntable.webm"]
     video = cv2.VideoCapture(str(out / "turntable.webm"))
     frames = []
     while (got := video.read())[0]:
@@ -245,10 +247,37 @@ def test_bad_input(scene, gaussians, camera, tmp_path, capsys, line, expected):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("name", ["view.png", "render.json", "turntable.webm", "cameras.json"])
+def test_files_of_others_stay(scene, camera, tmp_path, capsys, monkeypatch, name):
+    """Whatever -o is: what is there and was not rendered here is refused before the first frame."""
+    monkeypatch.setattr("drgs.render_command.render_views", lambda *_, **__: pytest.fail("rendered"))
+    save_cameras_json(tmp_path / "other.json", [dataclasses.replace(camera, name="view")])
+    (tmp_path / name).write_text("[1, 2]")
+    cameras = "orbit" if name.endswith("webm") else tmp_path / "other.json"
+    line = f"render {scene} --cameras {cameras} -o {tmp_path} --format png,webm"
+    assert cli.main(line.split()) == 2
+    assert f"{name}: must not be replaced" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "[1, 2]"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["other.json", "scene.ply", name])
+
+
+def test_input_is_no_output(scene, camera, tmp_path, capsys, monkeypatch):
+    """`cd OUT; drgs render --cameras cameras.json -o .`, where OUT was rendered into before; elsewhere it works."""
+    save_cameras_json(tmp_path / "other.json", [camera])
+    fast = f"render {scene} --preset fast --width 16"
+    assert cli.main(f"{fast} --cameras {tmp_path / 'other.json'} -o {tmp_path / 'out'}".split()) == 0
+    assert cli.main(f"{fast} --cameras {tmp_path / 'other.json'} -o {tmp_path / 'out'}".split()) == 0  # and again
+    before = (tmp_path / "out" / "cameras.json").read_bytes()
+    monkeypatch.chdir(tmp_path / "out")
+    capsys.readouterr()
+    assert cli.main(f"{fast} --cameras cameras.json -o .".split()) == 2
+    assert "cameras.json: must not be read and replaced, it is an input" in capsys.readouterr().err
+    assert Path("cameras.json").read_bytes() == before
+    assert cli.main(f"{fast} --cameras cameras.json -o again".split()) == 0
+
+
 def test_names_that_repeat_or_escape(gaussians, camera, tmp_path):
     """Names become file names inside the folder, each its own."""
-    import dataclasses
-
     from drgs.render_command import render_views
 
     cameras = [dataclasses.replace(camera, name=name) for name in ("../x", "../x", "", "..")]

@@ -67,7 +67,7 @@ def test_files(made, views):
     """Layout, frames, exposure; nothing but surfaces in view."""
     assert len(views) == VIEWS
     assert sorted(p.name for p in made.iterdir()) == [
-        "depth", "images", "params.json", "transforms.json"
+        ".drgs.jsonl", "depth", "images", "params.json", "transforms.json"
     ]  # fmt: skip
     K = views[0][0]
     assert abs(K[0, 2] - WIDTH / 2) > 0.5  # off the center on purpose
@@ -175,10 +175,29 @@ def test_interrupted_run_leaves_nothing(tmp_path):
 
 def test_leftovers_of_killed_runs_go(tmp_path):
     """What a killed process left is removed by the next run."""
-    dead = tmp_path / ".set.99999999.partial"
-    dead.mkdir()
+    (tmp_path / "set" / ".drgs.scene.abcdefgh.tmp").mkdir(parents=True)
+    (tmp_path / ".set.99999999.partial").mkdir()  # the user's
     scenes.publish(tmp_path / "set", {}, lambda folder: (folder / "a").write_text("b"), "test")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["set"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".set.99999999.partial", "set"]
+    assert sorted(p.name for p in (tmp_path / "set").iterdir()) == [".drgs.jsonl", "a", "params.json"]
+
+
+def test_what_was_added_to_a_published_folder_stays(tmp_path):
+    """Other parameters replace what was made here, and refuse to while something else is in the folder."""
+
+    def publish(number):
+        scenes.publish(tmp_path / "set", {"n": number}, lambda folder: (folder / "a").write_text(str(number)), "test")
+
+    publish(1)
+    (tmp_path / "set" / "run").mkdir()
+    (tmp_path / "set" / "run" / "point_cloud.ply").write_text("hours of work")
+    with pytest.raises(ValueError, match=r"must be a new folder or as it was made here, .*run is not; name another"):
+        publish(2)
+    assert (tmp_path / "set" / "run" / "point_cloud.ply").read_text() == "hours of work"
+    assert (tmp_path / "set" / "a").read_text() == "1"
+    (tmp_path / "set" / "run").rename(tmp_path / "elsewhere")
+    publish(2)
+    assert (tmp_path / "set" / "a").read_text() == "2"
 
 
 def test_bad_input(tmp_path, capsys):

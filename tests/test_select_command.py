@@ -32,7 +32,7 @@ def place(tmp_path_factory):
 def select(line: str, folder, monkeypatch, capsys) -> tuple[dict, str]:
     monkeypatch.chdir(folder)
     assert cli.main(["select", *line.split()]) == 0, capsys.readouterr().err
-    return json.loads((folder / "selection.json").read_text()), capsys.readouterr().out
+    return json.loads((folder / "out/select.json").read_text()), capsys.readouterr().out
 
 
 def test_unused_views_of_a_run(place, monkeypatch, capsys):
@@ -164,7 +164,7 @@ def test_dome_is_even(count):
         ("data --candidates orbit", "must be a run folder, found no config.json"),
         ("run --candidates empty.json", "must be a list of at least one camera"),
         ("early --candidates orbit", "must hold point_cloud.ply, found none; the fit has not reached"),
-        ("run --candidates data -o data", "-o must be a file for the JSON, is a folder"),
+        ("run --candidates data -o data", "data: must be a file, is a folder; name a file in it"),
         ("run --candidates data --method best", "--method"),
     ],
 )
@@ -174,7 +174,7 @@ def test_bad_input_is_one_line(place, monkeypatch, capsys, line, message):
     (place / "empty.json").write_text("[]")
     (place / "early").mkdir(exist_ok=True)
     (place / "early/config.json").write_text((place / "run/config.json").read_text())
-    (place / "selection.json").unlink(missing_ok=True)
+    (place / "out/select.json").unlink(missing_ok=True)
     try:
         assert cli.main(["select", *line.split()]) == 2
     except SystemExit as end:  # usage errors leave as argparse's do
@@ -182,7 +182,21 @@ def test_bad_input_is_one_line(place, monkeypatch, capsys, line, message):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
-    assert not (place / "selection.json").exists()
+    assert not (place / "out/select.json").exists()
+
+
+def test_selection_of_the_fit_stays(place, monkeypatch, capsys):
+    """In a run folder the default is another name; named itself, the fit's own record is not replaced."""
+    before = (place / "run/selection.json").read_bytes()
+    monkeypatch.chdir(place / "run")
+    line = ["select", ".", "--candidates", "orbit", "--count", "2", "--policy", "uniform"]
+    assert cli.main(line) == 0
+    assert cli.main(line) == 0  # its own result may be
+    assert json.loads((place / "run/out/select.json").read_text())["command"] == "select"
+    assert cli.main([*line, "-o", "selection.json"]) == 2
+    assert "selection.json: must not be replaced, `drgs select` did not make it" in capsys.readouterr().err
+    assert cli.main([*line, "-o", "../cameras.json"]) == 2
+    assert (place / "run/selection.json").read_bytes() == before
 
 
 def test_run_whose_views_are_gone(place, tmp_path, capsys):
@@ -204,7 +218,7 @@ def test_data_set_with_absent_images(place, tmp_path, monkeypatch, capsys, caplo
     gone = load(tmp_path / "data").views[2]
     gone.image_path.unlink()
     line = f"{place}/scene.ply --train {place}/cameras.json --candidates {tmp_path}/data --policy uniform"
-    report, _ = select(f"{line} -o selection.json", tmp_path, monkeypatch, capsys)
+    report, _ = select(line, tmp_path, monkeypatch, capsys)
     names = [row["name"] for row in report["candidates"]]
     assert len(names) == len(load(place / "data").views) - 1
     assert gone.name not in names

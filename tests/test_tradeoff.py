@@ -202,7 +202,7 @@ def test_flags_can_be_used(report):
 
 def test_files(report, place):
     """A page with every row, a picture, and nothing else."""
-    assert sorted(x.name for x in (place / "out").iterdir()) == ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
+    assert sorted(x.name for x in (place / "out").glob("[!.]*")) == ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     page = (place / "out" / "tradeoff.md").read_text()
     assert all(f"| {name} |" in page for name in rows(report))
     assert report["command"] == "tradeoff"

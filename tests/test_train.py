@@ -74,7 +74,8 @@ def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
     run = result.run
     names = {p.name for p in run.path.iterdir()}
     assert names == {
-        "config.json", "env.json", "log.jsonl", "metrics.json", "state.safetensors", "point_cloud.ply", "renders",
+        "config.json", "env.json", "log.jsonl", "metrics.json", "state.safetensors", "state.previous.safetensors",
+        "point_cloud.ply", "renders", ".drgs.jsonl",
     }  # fmt: skip
     events = run.events()
     train = [e for e in events if e["event"] == "train"]
@@ -192,7 +193,7 @@ def test_killed_run_leaves_no_half_written_file(dataset, tmp_path, monkeypatch):
 
     def die(source, target):
         calls.append(target)
-        if str(target).endswith("state.safetensors") and sum("state" in str(t) for t in calls) == 2:
+        if str(target).endswith("state.safetensors") and sum(str(t).endswith("/state.safetensors") for t in calls) == 2:
             raise SystemExit(9)  # as if killed between writing and renaming
         replace(source, target)
 

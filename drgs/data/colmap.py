@@ -5,7 +5,6 @@ been checked.
 from __future__ import annotations
 
 import struct
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from drgs.cameras import Camera, intrinsics
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
 from drgs.foreign import refuse_foreign
+from drgs.outputs import temporary_folder
 
 __all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
 
@@ -187,20 +187,20 @@ def _read(model: Path, points: bool = True) -> object:
         check(model / f"{name}{suffix}", name)
     if points:
         return _reconstruction(model, model, suffix)
-    with tempfile.TemporaryDirectory(prefix="drgs-poses-") as folder:
+    with temporary_folder("poses") as folder:
         for name in read:
             file = model / f"{name}{suffix}"
             data = file.read_bytes()
             if name == "images":
                 data = _without_observations(file, data) if suffix == ".bin" else _poses_only(data)
-            (Path(folder) / file.name).write_bytes(data)
-        (Path(folder) / f"points3D{suffix}").write_bytes(_COUNT.pack(0) if suffix == ".bin" else b"")
-        return _reconstruction(Path(folder), model, suffix)
+            (folder / file.name).write_bytes(data)
+        (folder / f"points3D{suffix}").write_bytes(_COUNT.pack(0) if suffix == ".bin" else b"")
+        return _reconstruction(folder, model, suffix)
 
 
 def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
     """What pycolmap reads in a folder; errors name the model."""
-    import pycolmap
+    from drgs.data.native import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
@@ -324,7 +324,7 @@ def _parameter_count(path: Path, number: int) -> int:
     for model_number, parameters in _MODELS.values():
         if model_number == number:
             return parameters
-    import pycolmap
+    from drgs.data.native import pycolmap
 
     try:
         name = pycolmap.CameraModelId(number).name

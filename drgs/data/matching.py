@@ -7,11 +7,13 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+
+from drgs import interrupts
+from drgs.outputs import temporary_folder
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs"]
 
@@ -22,13 +24,14 @@ _PAIRS_A_STEP = 16
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep COLMAP's log off the terminal, errors included: they arrive as exceptions."""
-    import pycolmap
+    """COLMAP's log kept off the terminal, errors included: they arrive as exceptions. Signals end a command there."""
+    from drgs.data.native import pycolmap
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
     try:
-        yield
+        with interrupts.in_native_code():
+            yield
     finally:
         pycolmap.logging.minloglevel = level
 
@@ -58,7 +61,7 @@ def extract(
             the cost.
         progress: called with ("features", done, total).
     """
-    import pycolmap
+    from drgs.data.native import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -100,15 +103,15 @@ def match(database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progre
         seed: of the random sampling in the verification.
         progress: called with ("matching", done, total).
     """
-    import pycolmap
+    from drgs.data.native import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    with tempfile.TemporaryDirectory(prefix="drgs-pairs-") as folder:
+    with temporary_folder("pairs") as folder:
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = Path(folder) / "pairs.txt"
+        pairing.match_list_path = folder / "pairs.txt"
         for start in range(0, len(pairs), _PAIRS_A_STEP):
             if progress:
                 progress("matching", start, len(pairs))

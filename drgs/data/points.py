@@ -4,7 +4,6 @@ scene extent.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from drgs.cameras import Camera
 from drgs.data.matching import extract, match, nearby_pairs, quiet
 from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
+from drgs.outputs import temporary_folder
 from drgs.progress import Bar
 
 __all__ = ["initial_points", "read_point_ply", "scene_extent"]
@@ -226,10 +226,10 @@ def _triangulated(
 ) -> tuple[np.ndarray, np.ndarray]:
     """SIFT features inside the masks, matched and triangulated with the given poses."""
     import cv2
-    import pycolmap
 
-    with tempfile.TemporaryDirectory(prefix="drgs-points-") as folder, quiet():
-        base = Path(folder)
+    from drgs.data.native import pycolmap
+
+    with temporary_folder("points") as base, quiet():
         for name in ("images", "masks", "model"):
             (base / name).mkdir()
         names, cameras = [], []
@@ -288,7 +288,7 @@ def _posed_model(database: Path, names: list[str], cameras: list[Camera]) -> obj
     """A reconstruction with the given poses, its numbers those of the database, whose intrinsics
     are set too.
     """
-    import pycolmap
+    from drgs.data.native import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as handle:

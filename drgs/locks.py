@@ -1,0 +1,136 @@
+"""One writer a folder: a lock file that names its process, and is taken over from a process that no longer runs."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["NAME", "acquire", "release"]
+
+NAME = ".drgs.lock"
+"""Name of the lock in the folder that is being written."""
+
+_MAX_BYTES = 4096
+_UNWRITTEN = 2.0  # seconds after which a lock without content is of a process that was killed while it wrote it
+
+
+def acquire(folder: Path, command: str) -> str | None:
+    """Become the only writer of a folder.
+
+    Args:
+        folder: Exists; the lock is a file in it.
+        command: What it is locked for, for people.
+    Returns:
+        Whose lock was taken over because its process no longer runs, in words; else None.
+    Raises:
+        ValueError: If another process writes there, or one of another machine may.
+        OSError: If the folder cannot be written.
+    """
+    path, stale = folder / NAME, None
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    text = json.dumps({**_this_process(), "command": command, "since": now}) + "\n"
+    with _one_at_a_time(folder):
+        while True:
+            owner = _owner(path)
+            if owner is not None:
+                _refuse_if_running(folder, path, owner)
+                stale = _in_words(owner)
+                path.unlink(missing_ok=True)
+            try:
+                handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+            except FileExistsError:  # another machine was faster
+                continue
+            with os.fdopen(handle, "w") as file:
+                file.write(text)
+            return stale
+
+
+def release(folder: Path) -> None:
+    """Remove this process's lock; somebody else's is left alone."""
+    path = folder / NAME
+    with contextlib.suppress(OSError):
+        owner = _owner(path)
+        if owner and all(owner.get(key) == value for key, value in _this_process().items()):
+            path.unlink()
+
+
+def _refuse_if_running(folder: Path, path: Path, owner: dict) -> None:
+    this = _this_process()
+    if not owner:
+        if time.time() - path.stat().st_mtime < _UNWRITTEN:
+            raise ValueError(f"{folder}: must not be written by two commands at once, another one begins; wait for it")
+        return
+    where = f"{folder}: must not be written by two commands at once, {_in_words(owner)} writes there"
+    if (owner.get("host"), owner.get("space")) != (this["host"], this["space"]):
+        raise ValueError(f"{where}; choose another folder, or delete {path} if that process no longer runs")
+    if owner.get("started") == _started(owner.get("pid")):
+        raise ValueError(f"{where}; wait for it, end it, or choose another folder")
+
+
+def _owner(path: Path) -> dict | None:
+    """What a lock says; None: there is none, {}: it cannot be read."""
+    try:
+        value = json.loads(path.read_bytes()[:_MAX_BYTES])
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _in_words(owner: dict) -> str:
+    if not owner:
+        return "a process that is not named"
+    return f"`drgs {owner.get('command')}` (process {owner.get('pid')} on {owner.get('host')}, {owner.get('since')})"
+
+
+def _this_process() -> dict:
+    """The number of a process means something on one machine, in one container, until it is given to the next one."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")
+    except OSError:  # not Linux
+        space = None
+    return {"pid": os.getpid(), "host": os.uname().nodename, "space": space, "started": _started(os.getpid())}
+
+
+def _started(pid: object) -> str | None:
+    """When a process of this machine began, in the system's own terms; None if there is none of this number."""
+    if not isinstance(pid, int) or pid <= 0:
+        return None
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:  # not Linux
+        import subprocess
+
+        command = ["ps", "-o", "lstart=", "-p", str(pid)]
+        try:
+            return subprocess.run(command, capture_output=True, text=True, timeout=10).stdout.strip() or None
+        except (OSError, subprocess.SubprocessError):
+            return "unknown"  # then a lock is believed
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if fields[0] in "ZX" else f"{boot} {fields[19]}"  # a zombie writes nothing any more
+
+
+@contextlib.contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """Of this machine's processes: without it, two that find the same stale lock might each remove the other's new one.
+
+    Only they may remove one, so that this is enough; other machines are kept out by the exclusive creation of the file.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError, ImportError):  # a file system without it
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
