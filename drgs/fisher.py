@@ -29,6 +29,7 @@ from drgs.groups import GROUPS, Information, groups_of
 from drgs.integrator import render_jvp
 from drgs.jacobian import GEOMETRY
 from drgs.replay import Replay, by_probes
+from drgs.runtime import alone
 from drgs.settings import RenderSettings
 
 __all__ = [
@@ -50,6 +51,7 @@ BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 _BATCH = 16  # tangents of one traversal
 
 
+@alone
 def diagonal(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -103,6 +105,7 @@ def diagonal(
     return total
 
 
+@alone
 def blocks(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -124,6 +127,7 @@ def blocks(
     return total
 
 
+@alone
 def coverage(
     gaussians: Gaussians, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
 ) -> torch.Tensor:
@@ -136,6 +140,7 @@ def coverage(
     return total
 
 
+@alone
 def variance_map(
     gaussians: Gaussians,
     camera: Camera,
