@@ -33,6 +33,7 @@ _INK = (235, 235, 235)
 _UNKNOWN = 0.25  # gray of depth where nothing is
 _NOTHING = 64  # gray of pixels whose value is 0
 _DECADES = 3.0  # at most so many are told apart by color
+_WEBM_SEGMENT, _WEBM_HEAD = bytes.fromhex("18538067"), 1024  # what holds all of a WebM file, and where it begins
 _OPAQUE = 0.5  # depth is shown where at least this much of the light stops
 
 
@@ -90,6 +91,9 @@ def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) 
             # The encoder hands its work to the thread pool and waits: with a pool of one, for ever.
             dr.set_thread_count(max(2, threads))
             bitmap.write(name, mi.Bitmap.FileFormat.OpenEXR)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split()).rpartition(": ")[2]
+            raise OSError(f"{path}: must be written, got: {reason}; free some space or choose another folder") from None
         finally:
             dr.set_thread_count(threads)
 
@@ -185,7 +189,23 @@ class Video:
     def __exit__(self, kind, error, trace) -> bool:
         if self._writer is not None:
             self._writer.release()
+            if kind is None and (problem := self._problem()):
+                self._stack.__exit__(OSError, problem, None)
+                raise problem
         return bool(self._stack.__exit__(kind, error, trace))
+
+    def _problem(self) -> OSError | None:
+        """The encoder says nothing where the disk is full: whether the file is as long as it says itself."""
+        with open(self._name, "rb") as file:
+            head = file.read(_WEBM_HEAD)
+        start = head.find(_WEBM_SEGMENT) + len(_WEBM_SEGMENT) + 8
+        stated = int.from_bytes(head[start - 7 : start], "big")  # after the byte that says that 7 follow
+        if os.path.getsize(self._name) == start + stated:
+            return None
+        return OSError(
+            f"{self.path}: must be written, the file is not whole; is the disk full? free some space or choose another "
+            "folder"
+        )
 
     def write(self, image: np.ndarray) -> None:
         """Append an (H, W, 3) image, uint8 or float in [0, 1]; all frames must have one size.
