@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from drgs.arguments import ArgumentError, kind_of
+
 __all__ = [
     "IMAGE_MAX",
     "as_numpy",
@@ -46,9 +48,16 @@ def read_only(array: np.ndarray) -> np.ndarray:
     return array
 
 
+def _numbers(where: str, name: str, value: Any) -> np.ndarray:
+    try:
+        return read_only(as_numpy(value))
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{where}: {name} must be an array of numbers, got {kind_of(value)}; correct it") from None
+
+
 def checked_intrinsics(where: str, K: Any) -> np.ndarray:
     """(3,3) float64 K, read-only, finite, with positive focal lengths and ones and zeros where they belong."""
-    K = read_only(as_numpy(K))
+    K = _numbers(where, "K", K)
     if K.shape != (3, 3):
         raise ValueError(f"{where}: K must have shape (3, 3), got {K.shape}; see drgs.cameras.intrinsics")
     if not np.isfinite(K).all():
@@ -78,7 +87,7 @@ def check_proportions(where: str, K: np.ndarray, size: tuple[int, int]) -> None:
 
 def checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
     """(4,4) float64 w2c, read-only, finite, a rotation and a translation."""
-    w2c = read_only(w2c)
+    w2c = _numbers(where, "w2c", w2c)
     if w2c.shape != (4, 4):
         raise ValueError(f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1")
     if not np.isfinite(w2c).all():
@@ -108,7 +117,10 @@ def check_distance(where: str, pose: np.ndarray) -> None:
 
 def checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, ...]:
     """Finite coefficients, as many as the lens model takes."""
-    values = tuple(float(v) for v in distortion)
+    try:
+        values = tuple(float(v) for v in distortion)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{where}: distortion must hold numbers, got {kind_of(distortion)}; correct it") from None
     if not all(abs(v) <= _DISTORTION_MAX for v in values):
         raise ValueError(
             f"{where}: distortion must be finite, no coefficient above {_DISTORTION_MAX:g}, got {values}; correct it"

@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from drgs.arguments import must_be
 from drgs.camera_checks import (
     IMAGE_MAX,
     as_numpy,
@@ -92,6 +93,7 @@ class Camera:
     name: str = ""
 
     def __post_init__(self) -> None:
+        must_be("Camera", "name", self.name, str, "it becomes a file name")
         where = f"Camera {self.name!r}" if self.name else "Camera"
         put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 (the dataclass is frozen)
         put("K", checked_intrinsics(where, self.K))

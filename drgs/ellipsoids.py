@@ -15,6 +15,8 @@ import warnings
 import numpy as np
 import torch
 
+from drgs.arguments import ArgumentError, kind_of, must_be
+
 __all__ = ["Gaussians", "ellipsoids_shape", "sh_degree_of"]
 
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
@@ -53,6 +55,20 @@ class Gaussians:
     origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self):
+        for name in _FIELDS:
+            x = getattr(self, name)
+            if x is None and name == "features":
+                continue
+            must_be("Gaussians", name, x, torch.Tensor, "Gaussians.from_arrays takes arrays too")
+            if x.dtype not in (torch.float32, torch.float64):
+                raise ArgumentError(f"Gaussians: {name} must be float32 or float64, got {x.dtype}; use {name}.float()")
+            if x.device != self.means.device:
+                raise ArgumentError(
+                    f"Gaussians: all tensors must be on one device, got means on {self.means.device} and {name} on "
+                    f"{x.device}; move them with .to()"
+                )
+        if self.means.ndim == 0:
+            _check_shape("means", self.means, ("N", 3), 0)
         n = len(self.means)
         want = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
         for name, shape in want.items():
@@ -173,9 +189,12 @@ class Gaussians:
 def _tensor(name: str, x) -> torch.Tensor:
     if isinstance(x, torch.Tensor):
         return x if x.is_floating_point() else x.to(torch.float32)
-    array = np.asarray(x)
+    try:
+        array = np.asarray(x)
+    except ValueError:  # lists of different lengths
+        array = np.empty(0, object)
     if array.dtype.kind not in "fiub":
-        raise ValueError(f"Gaussians.from_arrays: {name} must be numeric, got dtype {array.dtype}")
+        raise ArgumentError(f"Gaussians.from_arrays: {name} must be an array of numbers, got {kind_of(x)}")
     dtype = np.float64 if array.dtype == np.float64 and name == "means" else np.float32
     return torch.from_numpy(np.ascontiguousarray(array, dtype))
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from drgs import outputs
+from drgs.arguments import ArgumentError
 from drgs.foreign import refuse_foreign
 from drgs.json_files import parse_json, read_json
 
@@ -70,9 +71,10 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     import plyfile
     import torch
 
+    from drgs.doors import check_path
     from drgs.ellipsoids import Gaussians
 
-    path = Path(path)
+    path = check_path("load_ply", path)
     names = _check_ply(path)
     rest = _rest_columns(path, names)
     columns = {
@@ -128,6 +130,12 @@ def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
     """
     import plyfile
 
+    from drgs.doors import check_path, check_scene
+
+    if isinstance(g, str | os.PathLike):
+        raise ArgumentError("save_ply: gaussians must come first and the path second, got a path first; swap them")
+    check_scene("save_ply", g, None)
+    path = check_path("save_ply", path)
     g.validate("save_ply")
     if g.features is not None:
         _log.warning("%s: the 3DGS layout has no columns for features, they are left out", path)

@@ -17,19 +17,20 @@ Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 
+from drgs.arguments import must_be
 from drgs.cameras import Camera
+from drgs.doors import camera_list, check_scene, check_view
 from drgs.ellipsoids import Gaussians
 from drgs.gain import Prior, information_gain
 from drgs.groups import GROUPS, Information, groups_of
 from drgs.integrator import render_jvp
 from drgs.jacobian import GEOMETRY
 from drgs.replay import Replay, by_probes
-from drgs.runtime import alone
 from drgs.settings import RenderSettings
 
 __all__ = [
@@ -51,7 +52,6 @@ BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 _BATCH = 16  # tangents of one traversal
 
 
-@alone
 def diagonal(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -83,10 +83,11 @@ def diagonal(
         ValueError: If a method, group or weight is unknown or wrong, or a parameter is not finite.
         NotImplementedError: For SH along each ray, by `exact` and `fisherrf` (use `columns` or `probes`).
     """
+    check_scene("fisher.diagonal", gaussians, settings)
     settings = settings or RenderSettings.preset("exact")
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    cameras, wanted = _cameras(cameras), groups_of(gaussians, groups)
+    cameras, wanted = _cameras("fisher.diagonal", cameras), groups_of(gaussians, groups)
     weights = _weights(channel_weights)
     if method == "fisherrf":
         wanted = {name: group for name, group in wanted.items() if group.fisherrf}
@@ -105,7 +106,6 @@ def diagonal(
     return total
 
 
-@alone
 def blocks(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -119,28 +119,28 @@ def blocks(
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
+    check_scene("fisher.blocks", gaussians, settings)
     settings = settings or RenderSettings.preset("exact")
     total = torch.zeros(len(gaussians), BLOCK, BLOCK, dtype=torch.float64)
-    for camera in _cameras(cameras):
+    for camera in _cameras("fisher.blocks", cameras):
         if len(gaussians):
             total += Replay(gaussians, camera, settings).blocks(_weights(channel_weights))
     return total
 
 
-@alone
 def coverage(
     gaussians: Gaussians, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
 ) -> torch.Tensor:
     """(N,) float64 sum over views and pixels of w^2: the information about a color without direction."""
+    check_scene("fisher.coverage", gaussians, settings)
     settings = settings or RenderSettings.preset("exact")
     total = torch.zeros(len(gaussians), dtype=torch.float64)
-    for camera in _cameras(cameras):
+    for camera in _cameras("fisher.coverage", cameras):
         if len(gaussians):
             total += Replay(gaussians, camera, settings, geometry=False).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
     return total
 
 
-@alone
 def variance_map(
     gaussians: Gaussians,
     camera: Camera,
@@ -156,6 +156,8 @@ def variance_map(
         gaussians, camera, settings, channel_weights: As for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0.
     """
+    check_view("fisher.variance_map", gaussians, camera, settings)
+    must_be("fisher.variance_map", "weights", weights, Mapping, "group -> tensor, as fisher.diagonal returns")
     settings = settings or RenderSettings.preset("exact")
     known = {name: group for name, group in groups_of(gaussians).items() if group.spread}
     for name, x in weights.items():
@@ -184,6 +186,8 @@ def jacobian_columns(
     Raises:
         ValueError: If a group or an index is unknown.
     """
+    check_view("fisher.jacobian_columns", gaussians, camera, settings)
+    must_be("fisher.jacobian_columns", "index", index, Mapping, 'e.g. {"camera": range(6)}')
     chosen = []
     for name, rows in index.items():
         shape = _tangent_shape(gaussians, name)
@@ -215,20 +219,24 @@ def pose_information(gaussians: Gaussians, camera: Camera, settings: RenderSetti
 
     Of the world-frame twist c2w <- exp(xi) c2w, rotation (radians) first, then translation (world units).
     """
+    check_view("fisher.pose_information", gaussians, camera, settings)
     columns = jacobian_columns(gaussians, camera, {"camera": range(6)}, settings)[..., :3]
     flat = columns.reshape(6, -1).double()
     return flat @ flat.T
 
 
-def _cameras(cameras) -> list[Camera]:
-    cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
+def _cameras(where: str, cameras) -> list[Camera]:
+    cameras = camera_list(where, "cameras", cameras)
     if not cameras:
         raise ValueError("fisher: there must be at least one camera, got none")
     return cameras
 
 
 def _weights(channel_weights) -> list[float]:
-    weights = [float(x) for x in channel_weights]
+    try:
+        weights = [float(x) for x in channel_weights]
+    except (TypeError, ValueError):
+        weights = []
     if len(weights) != 3 or not all(np.isfinite(weights)) or min(weights) < 0:
         raise ValueError(f"fisher: channel_weights must be 3 finite numbers >= 0, got {channel_weights}")
     return weights

@@ -19,6 +19,8 @@ from collections.abc import Callable, Mapping
 
 import torch
 
+from drgs.arguments import must_be
+
 __all__ = [
     "BLOCK_LAYOUT",
     "CRITERIA",
@@ -133,6 +135,10 @@ def information_gain(
     Raises:
         ValueError: If groups, shapes, criterion or weights are wrong, or an entry is negative, NaN or infinite.
     """
+    for name, value in (("candidate", candidate), ("train", train)):
+        must_be("information_gain", name, value, Mapping, "group -> tensor, as fisher.diagonal returns")
+    if prior is not None:
+        must_be("information_gain", "prior", prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
     check("information_gain: train", train, criterion)
     check("information_gain: candidate", candidate, criterion)
     return scorer(train, criterion, prior, weights)(candidate)

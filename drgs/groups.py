@@ -109,6 +109,8 @@ def groups_of(gaussians, wanted=None) -> dict[str, Group]:
     Raises:
         ValueError: If one is wanted that they do not have.
     """
+    if isinstance(wanted, str):
+        wanted = (wanted,)
     there = {name: group for name, group in GROUPS.items() if group.there(gaussians)}
     for name in wanted or ():
         if name not in there:

@@ -3,16 +3,21 @@
 `render` projects the Gaussians (projection.py), lists or traces them (tiles.py, bvh.py), composites them in order
 (walk.py, kernels.py) and returns torch tensors; scene.py holds one call together. Compositing is one Dr.Jit operation
 with its own adjoint and forward mode (composite.py); what a Gaussian needs once a view is differentiated by Dr.Jit's
-AD. Two `autograd.Function`s bridge torch: `_Reverse` keeps the graph of a call for its backward pass, `_Bridge` serves
-`torch.func` and forward-mode AD. All may be called from any number of Python threads (runtime.alone).
+AD. `dr.wrap` bridges torch; an `autograd.Function` stands in for it under `torch.func` and forward-mode AD, which
+`dr.wrap` does not support.
 """
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping
+
 import torch
 
 from drgs import runtime
+from drgs.arguments import must_be
 from drgs.cameras import Camera
+from drgs.doors import check_scene, check_view
 from drgs.ellipsoids import Gaussians
 from drgs.scene import EPS_ALPHA, Output, Scene, to_drjit
 from drgs.settings import RenderSettings
@@ -25,7 +30,6 @@ OUTPUTS = ("depth", "median_depth", "count", "visibility")
 _NAMES = {"depth": "depth", "median_depth": "median", "count": "count", "visibility": "visibility"}
 
 
-@runtime.alone
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -52,12 +56,13 @@ def render(
     Reference:
         Kerbl et al. 2023 (compositing, SH); Moenne-Loccoz et al. 2024 (response at the peak of the ray).
     """
+    check_view("render", gaussians, camera, settings)
     settings = settings or RenderSettings.preset("exact")
     scene = Scene(gaussians, camera, settings, _wanted(outputs))
-    return scene.output(_differentiable(scene))
+    with _own_errors():
+        return scene.output(_differentiable(scene))
 
 
-@runtime.alone
 def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth",)) -> Output:
     """Forward mode: how a view changes along tangents of its parameters.
 
@@ -73,12 +78,13 @@ def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth
     Raises:
         ValueError: If a name or shape is wrong.
     """
+    check_view("render_jvp", gaussians, camera, settings)
+    must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
     scene = Scene(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
     return scene.jvp(tangents)
 
 
-@runtime.alone
 def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",)) -> Output:
     """Render arbitrary rays on the `bvh` traversal: fisheye, panoramas, lidar, thin lenses.
 
@@ -89,20 +95,39 @@ def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",
     Returns:
         An `Output` with the leading shape of the rays instead of (H, W).
     """
+    check_scene("render_rays", gaussians, settings)
     settings = settings or RenderSettings.preset("exact", traversal="bvh")
     if settings.traversal != "bvh":
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
     scene = Scene(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
-    return scene.output(_differentiable(scene))
+    with _own_errors():
+        return scene.output(_differentiable(scene))
 
 
 def _wanted(outputs) -> frozenset:
     if outputs == "all":
         outputs = OUTPUTS
+    if isinstance(outputs, str):
+        outputs = (outputs,)
+    must_be("render", "outputs", outputs, Iterable, f'any of {", ".join(OUTPUTS)}, or "all"')
     unknown = [name for name in outputs if name not in OUTPUTS]
     if unknown:
         raise ValueError(f"render: outputs must be among {', '.join(OUTPUTS)}, got {unknown[0]!r}")
     return frozenset(_NAMES[name] for name in outputs)
+
+
+@contextlib.contextmanager
+def _own_errors() -> Iterator[None]:
+    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said."""
+    try:
+        yield
+    except RuntimeError as error:
+        cause = error.__cause__
+        while cause is not None and not isinstance(cause, ValueError | NotImplementedError):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from None
 
 
 def _differentiable(scene: Scene) -> dict:
@@ -115,8 +140,7 @@ def _differentiable(scene: Scene) -> dict:
         results = _Bridge.apply(scene, names, *values)
         return dict(zip(scene.result_names, results, strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
-        results = _Reverse.apply(scene, list(scene.inputs), *values)
-        return dict(zip(scene.result_names, results, strict=True))
+        return dr.wrap(source="torch", target="drjit")(scene.trace)(**scene.inputs)
     images = scene.trace(**{name: to_drjit(scene.t, x) for name, x in scene.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
 
@@ -130,34 +154,8 @@ def _forward_ad(values) -> bool:
     )
 
 
-class _Reverse(torch.autograd.Function):
-    """Reverse mode through the graph that Dr.Jit keeps of a call.
-
-    Not `dr.wrap`, whose description of its outputs is one global of all threads.
-    """
-
-    @staticmethod
-    def forward(ctx, scene, names, *values):
-        inputs = {n: to_drjit(scene.t, x) for n, x in zip(names, values, strict=True)}
-        needed = ctx.needs_input_grad[2:]
-        ctx.scene, ctx.inputs = scene, [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
-        dr.enable_grad([x for x in ctx.inputs if x is not None])
-        images = scene.trace(**inputs)
-        scene.result_names, ctx.images = list(images), list(images.values())
-        return tuple(x.torch() for x in ctx.images)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    @runtime.alone
-    def backward(ctx, *cotangents):
-        for image, g in zip(ctx.images, cotangents, strict=True):
-            dr.set_grad(image, to_drjit(ctx.scene.t, g).array)
-        slopes = iter(dr.backward_to([x for x in ctx.inputs if x is not None]))
-        return None, None, *(None if x is None else next(slopes).torch() for x in ctx.inputs)
-
-
 class _Bridge(torch.autograd.Function):
-    """Every mode, for `torch.func` and dual numbers: each derivative computes the view again."""
+    """`dr.wrap` for `torch.func` and dual numbers."""
 
     @staticmethod
     def forward(scene, names, *values):
@@ -172,7 +170,6 @@ class _Bridge(torch.autograd.Function):
         ctx.save_for_forward(*values)
 
     @staticmethod
-    @runtime.alone
     def backward(ctx, *cotangents):
         scene, t = ctx.scene, ctx.scene.t
         inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
@@ -185,7 +182,6 @@ class _Bridge(torch.autograd.Function):
         return None, None, *(dr.grad(x).torch().clone() for x in inputs.values())
 
     @staticmethod
-    @runtime.alone
     def jvp(ctx, _scene, _names, *tangents):
         scene, t = ctx.scene, ctx.scene.t
         inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from drgs.doors import check_oracle
 from drgs.oracle import (
     activate,
     cull_near,
@@ -103,6 +104,7 @@ def render(
     Raises:
         ValueError: If `ewa` meets rays or distortion, or a camera is needed and missing.
     """
+    check_oracle("reference.render", g, cam, settings)
     s = settings
     if s.response == "ewa" and (rays is not None or getattr(cam, "model", "pinhole") != "pinhole"):
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")

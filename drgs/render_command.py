@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 
 import drgs
-from drgs import pictures, runtime
+from drgs import memory, pictures, runtime
 from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import SCHEMA, Run, load_ply, write_json
 from drgs.forecast import forecast
@@ -69,6 +69,7 @@ def run(args: Render) -> None:
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
+    _check_memory(cameras, settings, formats)
     kinds = [*(kind for kind in formats if kind != "webm"), *(["depth.png"] * args.depth)]
     output.check(f"{name}.{kind}" for name in pictures.file_names([x.name for x in cameras]) for kind in kinds)
     if not args.quiet:
@@ -305,6 +306,19 @@ def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
     if height is None:
         height = max(1, round(camera.height * width / camera.width))
     return camera.resized(width, height)
+
+
+def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tuple[str, ...]) -> None:
+    """Refuse a view that is too large to be rendered and written, before the first one is."""
+    largest = max(cameras, key=lambda camera: camera.width * camera.height)
+    pixels = largest.width * largest.height
+    pictures_need = max(memory.PICTURES[name] for name in formats)
+    size = f"view {largest.name!r} of {largest.width}x{largest.height} pixels"
+    needed = memory.frame_bytes(pixels, settings)
+    if runtime.backend().name == "cuda":
+        memory.require("render", needed, size, "lower --width or --height", cuda=True)
+        needed = 0
+    memory.require("render", needed + pictures_need * pixels, size, "lower --width or --height")
 
 
 # ----------------------------------------------------------------------------------------- outputs

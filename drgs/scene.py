@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import torch
 
-from drgs import runtime
+from drgs import memory, runtime
+from drgs.arguments import ArgumentError, kind_of
 from drgs.cameras import Camera, rigid
 
 runtime.backend()  # chooses libLLVM, which has to happen before drjit is imported
@@ -63,9 +64,10 @@ class Scene:
                 f"render: traversal='tiles' must have a pinhole camera, got model {camera.model!r} with distortion; "
                 "use traversal='bvh' (true rays) or camera.undistorted()"
             )
+        self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
+        self._check_memory(gaussians, rays)
         gaussians.validate("render")
         self.device = gaussians.means.device
-        self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
         if settings.traversal == "bvh" and gaussians.means.dtype == torch.float64 and len(gaussians):
             # World records are float32, so a world far from 0 is moved there.
             middle = gaussians.means.detach().mean(0)
@@ -95,6 +97,16 @@ class Scene:
         shift = pose[:3, 3] + pose[:3, :3] @ origin
         self.inputs["w2c"] = self._move(torch.cat([pose[:3, :3], shift[:, None]], 1).reshape(-1))
         self.view = None
+
+    def _check_memory(self, gaussians, rays):
+        """Refuse what cannot fit before anything is allocated for it."""
+        camera = self.camera
+        pixels = torch.as_tensor(rays[1]).numel() // 3 if rays is not None else camera.width * camera.height
+        size = f"{pixels} rays" if rays is not None else f"an image of {camera.width}x{camera.height} pixels"
+        width = 0 if gaussians.features is None else gaussians.features.shape[1]
+        gradients = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians.parameters().values())
+        needed = memory.frame_bytes(pixels, self.settings, width, gradients)
+        memory.require("render", needed, size, "render a smaller one", self.home.type == "cuda")
 
     def _pose(self):
         """(3, 4) of w2c in float64, as the rigid motion that it means; a copy of an array, which may be read-only."""
@@ -213,6 +225,10 @@ class Scene:
     def jvp(self, tangents: dict) -> Output:
         """`render_jvp`."""
         columns, batched = self._tangents(tangents)
+        pixels = int(np.prod(self.shape))
+        what = f"{len(columns)} tangents of {pixels} pixels"
+        needed = memory.frame_bytes(pixels, self.settings, self.width) + memory.TANGENT * pixels * len(columns)
+        memory.require("render_jvp", needed, what, "take fewer at a time", self.home.type == "cuda")
         if self.count == 0:
             still = self.output(self.nothing())
             images = {name: getattr(still, name) for name in ("rgb", "alpha", "depth", "features")}
@@ -232,7 +248,7 @@ class Scene:
         for name, x in tangents.items():
             if name not in shapes:
                 raise ValueError(f"render_jvp: tangents must be named among {', '.join(shapes)}, got {name!r}")
-            x = torch.as_tensor(x).to(torch.float64).detach()
+            x = _numbers(f"render_jvp: tangent of {name}", x).detach()
             if tuple(x.shape) == shapes[name]:
                 lengths.add(None)
                 x = x[None]
@@ -331,9 +347,17 @@ def _jvp_output(scene: Scene, pushed, batched: bool) -> Output:
     return Output(**outputs[0])
 
 
+def _numbers(what, x):
+    """A float64 tensor of anything that torch takes for an array."""
+    try:
+        return torch.as_tensor(x).to(torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise ArgumentError(f"{what} must be an array of numbers, got {kind_of(x)}") from None
+
+
 def _checked_rays(origins, directions, settings):
     """Float64 tensors of rays that can be traced."""
-    o, d = (torch.as_tensor(x, dtype=torch.float64) for x in (origins, directions))
+    o, d = (_numbers(f"render_rays: {n}", x) for n, x in (("origins", origins), ("directions", directions)))
     for name, x in (("origins", o), ("directions", d)):
         if x.ndim == 0 or x.shape[-1] != 3:
             raise ValueError(f"render_rays: {name} must have shape (..., 3), got {tuple(x.shape)}")

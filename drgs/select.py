@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.doors import camera_list, check_scene
 from drgs.gain import BLOCKS, CRITERIA, Information, Prior
 from drgs.greedy import Cache, Pick, Selection, Source, greedy
 
@@ -111,7 +112,8 @@ def select(
             or infinite.
     """
     started = time.perf_counter()
-    candidates, train = list(candidates), list(train)
+    check_scene("select", gaussians, settings)
+    candidates, train = camera_list("select", "candidates", candidates), camera_list("select", "train", train)
     if not candidates:
         raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
     if not (isinstance(k, int) and 1 <= k <= len(candidates)):

@@ -12,6 +12,7 @@ import math
 
 import drjit as dr
 
+from drgs import memory, runtime
 from drgs import projection as layout
 
 __all__ = ["TILE", "Lists", "build", "depth_order"]
@@ -77,6 +78,8 @@ def build(t, projected, settings, width: int, height: int, record) -> Lists:
             f"render: the tile lists must have fewer than 2^32 entries, got {total64}; lower extent or image size"
         )
     pairs = int(total64)
+    what = f"{pairs} entries of tile lists ({count} Gaussians, {width}x{height} pixels)"
+    memory.require("render", memory.PAIR * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
     start, end = dr.zeros(t.UInt32, columns * rows), dr.zeros(t.UInt32, columns * rows)
     nothing = Lists(dr.zeros(t.UInt32, 1), start, end, dr.zeros(t.Float, 1), columns, rows, 0)
     if pairs == 0:

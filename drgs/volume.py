@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from drgs.doors import check_oracle
 from drgs.oracle import activate, cull_near, float64, sh_colors, take, view_rays, within
 from drgs.settings import RenderSettings
 
@@ -141,6 +142,7 @@ def render_volume(
     Reference:
         Max 1995, "Optical models for direct volume rendering", the emission-absorption integral.
     """
+    check_oracle("reference.render_volume", g, cam, settings)
     s = settings or RenderSettings.preset("exact")
     if cam is None and (rays is None or s.near > 0):
         raise ValueError("reference.render_volume: near and images need cam, got None")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from drgs import memory
 from drgs.foreign import refuse_foreign
 
 __all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_npy"]
@@ -116,7 +117,9 @@ def read_image(path: Path) -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
     if _stated_size(path):
-        image_size(path)
+        width, height = image_size(path)
+        what = f"its {width}x{height} pixels"  # 8 bits and 3 channels, decoded and in the order of RGB
+        memory.require(f"{path}", 6 * width * height, what, "reduce the image, and w, h, fl_x, ... with it")
     with _native_stderr() as complaints:
         try:
             data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
