@@ -104,7 +104,7 @@ class Result:
         for view in r["image"]["views"]:
             if abs(bias := view["alpha"]["bias"]) > _ALPHA:
                 what = "lower: hits are missing" if bias < 0 else "higher"
-                lines.append(f"view {view['view']}: alpha is {abs(bias):.1e} {what}, in the mean")
+                lines.append(f"view {view['view']}: alpha is {abs(bias):.1e} {what} on average")
         for name, group in r["groups"].items():
             what = group["verdict"] + (f": {group['why']}" if group["why"] else "")
             lines.append(f"{name}: {what}; relative difference {group['relative']:.2g}, cosine {group['cosine']:.6f}")

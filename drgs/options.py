@@ -109,8 +109,7 @@ class _Around:
     elevation: float | None = None
     """Degrees of an orbit above its center; default the photographs' median, else 20."""
     span: float | None = None
-    """Degrees that an orbit covers; default what the photographs cover (select, fisher: 360 where they look at one
-    point), else 360."""
+    """Degrees of an orbit; default as the photographs (select, fisher: 360 if they look at a point), else 360."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,13 +117,13 @@ class _Information(_Settings):
     """Options of commands that compute Fisher information."""
 
     method: Literal["exact", "columns", "probes", "fisherrf"] = "exact"
-    """How the diagonal is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
+    """How information is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
     prior: float = 1e-6
-    """lambda: prior precision of every parameter; 0 leaves out what no training view has seen."""
+    """How firmly every parameter counts as known beforehand (lambda); 0 leaves out what no training view has seen."""
     relative_prior: bool = False
-    """lambda is --prior times the median of the group's positive information."""
+    """lambda is --prior times the median information of a parameter's group, where it is not 0."""
     info_pixels: int | None = None
-    """Views are reduced to at most this many pixels; default as in the fit."""
+    """Information is computed on views of at most this many pixels; default as in the fit."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -132,7 +131,7 @@ class _Policy(_Information):
     """Options of commands that choose views."""
 
     policy: Literal["fisher", "fisherrf", "coverage", "farthest", "uniform", "random"] = "fisher"
-    """How the next view is chosen."""
+    """How the next view is chosen (docs/information.md)."""
     criterion: Literal["eig", "logdet", "trace_cov", "block_logdet"] = "eig"
     """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
     seed: int = 0
@@ -192,10 +191,9 @@ class Fit(_Policy, _Data):
     max_pixels: int = 130_000
     """Images are reduced to at most this many pixels."""
     max_gaussians: int = 30_000
-    """Budget of the density control."""
+    """How many Gaussians there may be."""
     init_points: Literal["auto", "views", "all"] = "auto"
-    """Initial points: only what the training views show (views), or the data set's if it has any (all). auto: all, with
-    --views active: views."""
+    """Initial points: of the training views (views) or of the data set (all); auto: all, or views if --views active."""
     test_every: int = 8
     """Every n-th view, by name, is held out; 0 holds out none."""
     sh_degree: Literal[0, 1, 2, 3] = 3
@@ -207,7 +205,7 @@ class Fit(_Policy, _Data):
     save_every: int = 1000
     """Steps between checkpoints."""
     mask: Literal["auto", "object", "valid", "ignore"] = "auto"
-    """Outside a mask is nothing (object; auto, if there are mask files), anything (valid), or the image (ignore)."""
+    """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """RGB in [0, 1] behind everything."""
     views: Literal["all", "active"] = "all"
@@ -215,9 +213,9 @@ class Fit(_Policy, _Data):
     initial: int = 2
     """Views at the start: the first one, then those farthest away."""
     add: int = 10
-    """Views to be chosen, one at a time; others are not read."""
+    """Views to be chosen on the way, one at a time; others are not read."""
     every: int = 200
-    """Steps between two of them."""
+    """Steps before the first of them, and between two."""
     pick_points: Literal["auto", "uncovered", "none"] = "auto"
     """New points of a picked view where there is nothing yet (uncovered); auto: none with --init-points all."""
 
@@ -317,7 +315,7 @@ class Crossval(_Seen):
     preset: Literal["auto", "exact", "fast", "inria", "gsplat", "mitsuba"] = "auto"
     """The model that it claims to compute; auto: the one whose image is nearest."""
     ladder: bool = True
-    """Attribute what is left between that model and the exact one."""
+    """Say which approximations make that model differ from the exact one; --no-ladder saves the time."""
     strict: bool = False
     """Conventions that differ and known deviations fail, too, and so does a data set with images that are missing."""
     export: Path | None = None
@@ -357,8 +355,7 @@ class Eval(_Common, _Data):
     split: Literal["all", "train", "test"] = "test"
     """Which views."""
     lpips_weights: Path | None = None
-    """torchvision's AlexNet or VGG16, e.g. alexnet-owt-7be5be79.pth, which LPIPS needs besides pip install
-    'drgs[lpips]'; without it LPIPS is null."""
+    """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ __all__ = ["TILE", "Lists", "build", "depth_order"]
 TILE = 8
 _FAR = 3.0e38
 _NOWHERE = 2**64 - 1
-_LARGE = 8  # tiles of a box, in the mean
+_LARGE = 8  # tiles of a box, on average
 
 
 @dataclasses.dataclass

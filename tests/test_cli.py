@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -65,6 +66,14 @@ def test_command_help(name, capsys):
     text = capsys.readouterr().out
     assert f"usage: drgs {name}" in text
     assert all(option in text for option in ("--debug", "--quiet", "--variant", "--threads"))
+
+
+def test_help_texts_are_single_lines():
+    """tyro keeps the line breaks of an option's text wherever the terminal's are."""
+    source = Path(ROOT / "drgs/options.py").read_text()
+    fields = re.findall(r'^    """(.*?)"""$', source, flags=re.M | re.S)
+    assert len(fields) > 40
+    assert not [text for text in fields if "\n" in text and not text.startswith("Options of")]
 
 
 def test_version(capsys):
