@@ -27,7 +27,7 @@ import drgs
 from drgs.active import at_most
 from drgs.cameras import intrinsics_from_fov
 from drgs.data import load
-from drgs.files import Run
+from drgs.files import Run, atomic_write
 from drgs.ladder import GROUPS, Pictures, ladder, table
 from drgs.orbits import Wish, scene_orbit
 from drgs.render_command import run_background
@@ -117,9 +117,8 @@ def write(path: Path, result: dict) -> None:
     text = json.dumps(result, separators=(",", ":"))
     for name in STARTS:
         text = text.replace(f'"{name}":', f'\n"{name}":')
-    part = path.with_suffix(".part")
-    part.write_text(text + "\n")
-    part.replace(path)
+    with atomic_write(path) as file:
+        file.write(text.encode() + b"\n")
 
 
 def plot(result: dict, path: Path) -> None:

@@ -23,7 +23,7 @@ from drgs import runtime  # noqa: E402
 from drgs.active import initial_views  # noqa: E402
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
 from drgs.density import Model  # noqa: E402
-from drgs.files import load_state, save_state  # noqa: E402
+from drgs.files import atomic_write, load_state, save_state  # noqa: E402
 from drgs.frames import load_frames  # noqa: E402
 from drgs.trainer import FitConfig, Trainer  # noqa: E402
 
@@ -127,10 +127,8 @@ def stamp(script: str) -> str:
 
 def write_rows(path: Path, rows) -> None:
     """JSON, atomically: studies are resumed from it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(rows, indent=1) + "\n")
-    part.replace(path)
+    with atomic_write(path) as file:
+        file.write(json.dumps(rows, indent=1).encode() + b"\n")
 
 
 def read_rows(path: Path, default):

@@ -31,6 +31,7 @@ from drgs.groups import GROUPS, Information, groups_of
 from drgs.integrator import render_jvp
 from drgs.jacobian import GEOMETRY
 from drgs.replay import Replay, by_probes
+from drgs.runtime import alone
 from drgs.settings import RenderSettings
 
 __all__ = [
@@ -52,6 +53,7 @@ BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 _BATCH = 16  # tangents of one traversal
 
 
+@alone
 def diagonal(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -106,6 +108,7 @@ def diagonal(
     return total
 
 
+@alone
 def blocks(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -128,6 +131,7 @@ def blocks(
     return total
 
 
+@alone
 def coverage(
     gaussians: Gaussians, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
 ) -> torch.Tensor:
@@ -141,6 +145,7 @@ def coverage(
     return total
 
 
+@alone
 def variance_map(
     gaussians: Gaussians,
     camera: Camera,

@@ -3,8 +3,8 @@
 `render` projects the Gaussians (projection.py), lists or traces them (tiles.py, bvh.py), composites them in order
 (walk.py, kernels.py) and returns torch tensors; scene.py holds one call together. Compositing is one Dr.Jit operation
 with its own adjoint and forward mode (composite.py); what a Gaussian needs once a view is differentiated by Dr.Jit's
-AD. `dr.wrap` bridges torch; an `autograd.Function` stands in for it under `torch.func` and forward-mode AD, which
-`dr.wrap` does not support.
+AD. Two `autograd.Function`s bridge torch: `_Reverse` keeps the graph of a call for its backward pass, `_Bridge` serves
+`torch.func` and forward-mode AD. All may be called from any number of Python threads (runtime.alone).
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ OUTPUTS = ("depth", "median_depth", "count", "visibility")
 _NAMES = {"depth": "depth", "median_depth": "median", "count": "count", "visibility": "visibility"}
 
 
+@runtime.alone
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -63,6 +64,7 @@ def render(
         return scene.output(_differentiable(scene))
 
 
+@runtime.alone
 def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth",)) -> Output:
     """Forward mode: how a view changes along tangents of its parameters.
 
@@ -85,6 +87,7 @@ def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth
     return scene.jvp(tangents)
 
 
+@runtime.alone
 def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",)) -> Output:
     """Render arbitrary rays on the `bvh` traversal: fisheye, panoramas, lidar, thin lenses.
 
@@ -140,7 +143,8 @@ def _differentiable(scene: Scene) -> dict:
         results = _Bridge.apply(scene, names, *values)
         return dict(zip(scene.result_names, results, strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
-        return dr.wrap(source="torch", target="drjit")(scene.trace)(**scene.inputs)
+        results = _Reverse.apply(scene, list(scene.inputs), *values)
+        return dict(zip(scene.result_names, results, strict=True))
     images = scene.trace(**{name: to_drjit(scene.t, x) for name, x in scene.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
 
@@ -154,8 +158,34 @@ def _forward_ad(values) -> bool:
     )
 
 
+class _Reverse(torch.autograd.Function):
+    """Reverse mode through the graph that Dr.Jit keeps of a call.
+
+    Not `dr.wrap`, whose description of its outputs is one global of all threads.
+    """
+
+    @staticmethod
+    def forward(ctx, scene, names, *values):
+        inputs = {n: to_drjit(scene.t, x) for n, x in zip(names, values, strict=True)}
+        needed = ctx.needs_input_grad[2:]
+        ctx.scene, ctx.inputs = scene, [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
+        dr.enable_grad([x for x in ctx.inputs if x is not None])
+        images = scene.trace(**inputs)
+        scene.result_names, ctx.images = list(images), list(images.values())
+        return tuple(x.torch() for x in ctx.images)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    @runtime.alone
+    def backward(ctx, *cotangents):
+        for image, g in zip(ctx.images, cotangents, strict=True):
+            dr.set_grad(image, to_drjit(ctx.scene.t, g).array)
+        slopes = iter(dr.backward_to([x for x in ctx.inputs if x is not None]))
+        return None, None, *(None if x is None else next(slopes).torch() for x in ctx.inputs)
+
+
 class _Bridge(torch.autograd.Function):
-    """`dr.wrap` for `torch.func` and dual numbers."""
+    """Every mode, for `torch.func` and dual numbers: each derivative computes the view again."""
 
     @staticmethod
     def forward(scene, names, *values):
@@ -170,6 +200,7 @@ class _Bridge(torch.autograd.Function):
         ctx.save_for_forward(*values)
 
     @staticmethod
+    @runtime.alone
     def backward(ctx, *cotangents):
         scene, t = ctx.scene, ctx.scene.t
         inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
@@ -182,6 +213,7 @@ class _Bridge(torch.autograd.Function):
         return None, None, *(dr.grad(x).torch().clone() for x in inputs.values())
 
     @staticmethod
+    @runtime.alone
     def jvp(ctx, _scene, _names, *tangents):
         scene, t = ctx.scene, ctx.scene.t
         inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}

@@ -14,15 +14,12 @@ import hashlib
 import json
 import logging
 import os
-import re
-import shutil
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from drgs import locks
+from drgs import locks, unfinished
 
 __all__ = [
     "Claim",
@@ -31,20 +28,16 @@ __all__ = [
     "clean",
     "release_all",
     "replacing",
-    "temporary_folder",
 ]
 
 JOURNAL = ".drgs.jsonl"
 _MAX_JSON = 64 << 20
 _LARGE = 1 << 20
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-# Names that nobody else gives: `replacing` and `temporary_folder` make them, and a killed process leaves them.
-_PARTIAL = re.compile(r"\.drgs\..+\.[a-z0-9_]{8}\.tmp(\.[a-z0-9]+)?")
 
 _log = logging.getLogger(__name__)
 _claims: dict[Path, Claim] = {}
 _hashes: dict[tuple, str] = {}  # of checkpoints, which are moved and linked
-_partial: set[str] = set()  # files and folders that are being made
 
 
 class Claim:
@@ -164,7 +157,7 @@ class Claim:
             ValueError: If they have not.
         """
         ours = JOURNAL, locks.NAME
-        content = [x for x in self.path.iterdir() if x.name not in ours and not _PARTIAL.fullmatch(x.name)]
+        content = [x for x in self.path.iterdir() if x.name not in ours and not unfinished.NAME.fullmatch(x.name)]
         for path in content:
             if not self.is_made(path, by):
                 raise ValueError(
@@ -182,9 +175,9 @@ class Claim:
         """Delete unfinished files of processes that were killed here, in the folder and in the given ones in it."""
         for folder in (self.path, *(self.path / name for name in folders)):
             for path in folder.iterdir() if folder.is_dir() else ():
-                if _PARTIAL.fullmatch(path.name) and str(path) not in _partial:
+                if unfinished.is_left_over(path):
                     _log.info("%s: removed, an interrupted command left it unfinished", path)
-                    _delete(path)
+                    unfinished.delete(path)
 
     def release(self) -> None:
         """Unlock the folder; it is removed if it was made for the claim and nothing came into it."""
@@ -293,8 +286,7 @@ def release_all() -> None:
 
 def clean() -> None:
     """Remove what is unfinished, and the locks; for a process that is about to end in the middle of its work."""
-    for name in list(_partial):
-        _delete(Path(name))
+    unfinished.delete_all()
     release_all()
 
 
@@ -312,47 +304,23 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     parent = os.path.realpath(path.parent)
-    handle, name = tempfile.mkstemp(prefix=f".drgs.{path.name}.", suffix=f".tmp{suffix}", dir=parent)
-    os.close(handle)
-    _partial.add(name)
     try:
-        yield name
-        umask = os.umask(0)  # mkstemp makes private files; what we write is to be shared as any other
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        held = _claim_of(Path(parent)) if claimed else None
-        if held is not None:
-            inside = (Path(parent) / path.name).relative_to(held.path).as_posix()
-            held.check([inside])
-            held.record(inside, name)
-        os.replace(name, path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        if isinstance(error, OSError) and error.errno in _FULL:
-            reason = f"must be written, got: {error.strerror}; free some space or choose another folder"
-            raise OSError(f"{path}: {reason}") from None
-        raise
-    finally:
-        _partial.discard(name)
-
-
-@contextlib.contextmanager
-def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iterator[Path]:
-    """A folder that is gone after the block, or when the process is interrupted.
-
-    Args:
-        kind: Part of its name.
-        parent: Where it is; default the system's place for such.
-    """
-    parent = None if parent is None else os.path.realpath(parent)
-    name = tempfile.mkdtemp(prefix=f".drgs.{kind}.", suffix=".tmp", dir=parent)
-    _partial.add(name)
-    try:
-        yield Path(name)
-    finally:
-        _delete(Path(name))
-        _partial.discard(name)
+        with unfinished.hidden_file(parent, path.name, suffix) as name:
+            yield name
+            umask = os.umask(0)  # hidden files are private; what we write is to be shared as any other
+            os.umask(umask)
+            os.chmod(name, 0o666 & ~umask)
+            held = _claim_of(Path(parent)) if claimed else None
+            if held is not None:
+                inside = (Path(parent) / path.name).relative_to(held.path).as_posix()
+                held.check([inside])
+                held.record(inside, name)
+            os.replace(name, path)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        reason = f"must be written, got: {error.strerror}; free some space or choose another folder"
+        raise OSError(f"{path}: {reason}") from None
 
 
 def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim:
@@ -443,16 +411,3 @@ def _is_log(path: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(value, dict) and isinstance(value.get("schema"), int) and "event" in value
-
-
-def _delete(path: Path) -> None:
-    """Native code may still be writing there."""
-    for _ in range(5):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            with contextlib.suppress(OSError):
-                path.unlink()
-        if not os.path.lexists(path):
-            return
-        time.sleep(0.02)

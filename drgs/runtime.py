@@ -6,14 +6,19 @@ Three entry points, from cheap to complete. Nothing else in the package imports 
     prepare()    sets DRJIT_LIBLLVM_PATH; imports nothing; called by `import drgs`
     backend()    Dr.Jit, its array types and thread counts; no Mitsuba
     mitsuba()    the `mitsuba` module with a variant set: the user's if there is one
+
+What computes is decorated with `alone`: one thread at a time, and not in a forked child.
 """
 
 from __future__ import annotations
 
 import ctypes
 import dataclasses
+import functools
 import os
 import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -22,6 +27,7 @@ from drgs.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_
 __all__ = [
     "VARIANTS",
     "Backend",
+    "alone",
     "backend",
     "cuda_status",
     "dr_types",
@@ -71,6 +77,33 @@ class Backend:
 
 
 _active: Backend | None = None
+_computing = threading.RLock()
+_owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
+
+
+def alone(function: Callable) -> Callable:
+    """Lets one Python thread at a time compute, as one computation uses all cores, and refuses in a forked child.
+
+    Dr.Jit's worker threads do not survive `os.fork`: a kernel would wait for them forever.
+    """
+
+    @functools.wraps(function)
+    def one_at_a_time(*args, **kwargs):
+        global _owner
+        _refuse_fork()
+        _owner = os.getpid()
+        with _computing:
+            return function(*args, **kwargs)
+
+    return one_at_a_time
+
+
+def _refuse_fork() -> None:
+    if _owner not in (None, os.getpid()):
+        raise NotImplementedError(
+            f"drgs: a process must not render when it was forked from one that has rendered, got process {os.getpid()} "
+            f"forked from {_owner}; use multiprocessing.get_context('spawn'), or fork before the first render"
+        )
 
 
 def unwrapped(x, convert):
@@ -99,6 +132,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         FileNotFoundError: If no backend is usable.
     """
     global _active
+    _refuse_fork()
     wanted = _wanted_variant(variant)
     count = _wanted_threads(threads)
     if wanted == "llvm_ad_rgb" and "drjit" not in sys.modules:

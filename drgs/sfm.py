@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
 from drgs.foreign import refuse_foreign
-from drgs.outputs import claim, temporary_folder
+from drgs.outputs import claim
 from drgs.progress import Bar
+from drgs.unfinished import temporary_folder
 
 if TYPE_CHECKING:
     from drgs.options import Sfm

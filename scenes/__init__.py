@@ -12,7 +12,8 @@ import json
 
 import numpy as np
 
-from drgs.outputs import claim, temporary_folder
+from drgs.outputs import claim
+from drgs.unfinished import temporary_folder
 
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",

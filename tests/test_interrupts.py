@@ -16,7 +16,7 @@ from drgs import interrupts
 _COMMAND = """
 import hashlib, sys, time
 from pathlib import Path
-from drgs import interrupts, outputs
+from drgs import interrupts, outputs, unfinished
 
 def native():
     hashlib.pbkdf2_hmac("sha256", b"x", b"y", 10**9)
@@ -31,7 +31,7 @@ def wait(kind):
 try:
     say = lambda error: type(error).__name__ + "\\n"
     with interrupts.handled(outputs.clean, say):
-        with outputs.claim(sys.argv[1], "fit"), outputs.temporary_folder("sfm", sys.argv[1]) as folder:
+        with outputs.claim(sys.argv[1], "fit"), unfinished.temporary_folder("sfm", sys.argv[1]) as folder:
             (folder / "a").write_text("b")
             if sys.argv[2] == "callback":
                 with interrupts.in_native_code():

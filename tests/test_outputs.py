@@ -12,7 +12,8 @@ import pytest
 
 from drgs import locks, outputs
 from drgs.files import atomic_write, write_json
-from drgs.outputs import check_file, claim, replacing, temporary_folder
+from drgs.outputs import check_file, claim, replacing
+from drgs.unfinished import temporary_folder
 
 
 def put(path: Path, text: str) -> None:
@@ -132,7 +133,7 @@ def test_nothing_is_left_of_a_command_that_wrote_nothing(tmp_path):
 def test_sweep_takes_only_unfinished_files_of_ours(tmp_path):
     """A killed process leaves a file and a folder, which the next one removes; names like them stay."""
     code = (
-        "import os, sys; from drgs.outputs import *\n"
+        "import os, sys; from drgs.outputs import *; from drgs.unfinished import *\n"
         "with claim(sys.argv[1], 'fit'), temporary_folder('sfm', sys.argv[1]) as folder:\n"
         "    (folder / 'database.db').write_text('x')\n"
         "    with replacing(sys.argv[1] + '/state.safetensors') as name:\n"

@@ -12,7 +12,7 @@ import numpy as np
 from drgs.cameras import Camera, intrinsics
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
 from drgs.foreign import refuse_foreign
-from drgs.outputs import temporary_folder
+from drgs.unfinished import temporary_folder
 
 __all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs import interrupts
-from drgs.outputs import temporary_folder
+from drgs.unfinished import temporary_folder
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs"]
 

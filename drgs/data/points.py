@@ -13,8 +13,8 @@ from drgs.cameras import Camera
 from drgs.data.matching import extract, match, nearby_pairs, quiet
 from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
-from drgs.outputs import temporary_folder
 from drgs.progress import Bar
+from drgs.unfinished import temporary_folder
 
 __all__ = ["initial_points", "read_point_ply", "scene_extent"]
 

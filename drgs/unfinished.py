@@ -1,0 +1,83 @@
+"""Files and folders that are being made: gone when their block or the process ends, swept up after a killed one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["NAME", "delete", "delete_all", "hidden_file", "is_left_over", "temporary_folder"]
+
+NAME = re.compile(r"\.drgs\..+\.[a-z0-9_]{8}\.tmp(\.[a-z0-9]+)?")
+"""What they are called, and nothing else is."""
+
+_made: set[str] = set()  # by this process, and not finished
+
+
+@contextlib.contextmanager
+def hidden_file(folder: str, name: str, suffix: str = "") -> Iterator[str]:
+    """The name of an empty private file; after the block it is renamed, or removed.
+
+    Args:
+        folder: Where it is, without links.
+        name: What it will be called.
+        suffix: That its name must end with, for a library that goes by it.
+    """
+    handle, hidden = tempfile.mkstemp(prefix=f".drgs.{name}.", suffix=f".tmp{suffix}", dir=folder)
+    os.close(handle)
+    _made.add(hidden)
+    try:
+        yield hidden
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(hidden)
+        raise
+    finally:
+        _made.discard(hidden)
+
+
+@contextlib.contextmanager
+def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iterator[Path]:
+    """A folder that is gone after the block, or when the process is interrupted.
+
+    Args:
+        kind: Part of its name.
+        parent: Where it is; default the system's place for such.
+    """
+    parent = None if parent is None else os.path.realpath(parent)
+    name = tempfile.mkdtemp(prefix=f".drgs.{kind}.", suffix=".tmp", dir=parent)
+    _made.add(name)
+    try:
+        yield Path(name)
+    finally:
+        delete(Path(name))
+        _made.discard(name)
+
+
+def is_left_over(path: Path) -> bool:
+    """Whether another process left it, in a folder that this one alone writes into."""
+    return NAME.fullmatch(path.name) is not None and str(path) not in _made
+
+
+def delete_all() -> None:
+    """Remove everything that this process has not finished."""
+    for name in list(_made):
+        delete(Path(name))
+
+
+def delete(path: Path) -> None:
+    """Remove a file or a folder, also one that native code is still writing into."""
+    for _ in range(5):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        if not os.path.lexists(path):
+            return
+        time.sleep(0.02)

@@ -1,0 +1,116 @@
+"""Rendering from several Python threads, and in processes that are forked or spawned."""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import torch
+from scenes_random import camera, gaussians
+
+from drgs.integrator import render, render_jvp
+from drgs.scene import Scene
+from drgs.settings import RenderSettings
+
+HERE = Path(__file__).parent
+SETTINGS = RenderSettings.preset("fast")
+
+
+def everything(seed: int) -> list[torch.Tensor]:
+    """Image, gradients of every group and the pose, and a tangent image, of a scene of its own."""
+    rng = np.random.default_rng(seed)
+    g, cam = gaussians(rng, 8 + seed, 4), camera(rng, (9 + seed, 7))
+    out = render(g, cam, SETTINGS)
+    (out.rgb.square().sum() + out.depth.sum()).backward()
+    pushed = render_jvp(g, cam, {"means": torch.ones_like(g.means), "sh": torch.ones_like(g.sh)}, SETTINGS)
+    return [out.rgb.detach(), pushed.rgb, cam.w2c.grad, *(x.grad for x in g.parameters().values())]
+
+
+def test_four_threads(monkeypatch):
+    """Forward, backward and forward mode of four scenes at once equal those of one thread.
+
+    To rounding of float32: additions of one worker come in one order. Threads are made to meet where each hands its
+    images to torch; now only one of them ever gets there.
+    """
+    want, trace = [everything(seed) for seed in range(4)], Scene.trace
+    failed, pair, together = [], threading.Barrier(2), []
+
+    def meet(scene, **inputs):
+        images = trace(scene, **inputs)
+        try:
+            pair.wait(2)
+            together.append(scene)
+        except threading.BrokenBarrierError:
+            pass
+        return images
+
+    def work(seed):
+        try:
+            for a, b in zip(everything(seed), want[seed], strict=True):
+                torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
+        except Exception as error:
+            failed.append(error)
+
+    monkeypatch.setattr(Scene, "trace", meet)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed, failed[0]
+    assert not together
+
+
+def _run(script: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, cwd=HERE)
+
+
+SCENE = """
+import os, sys
+import numpy as np
+from drgs.accuracy import random_camera, random_gaussians
+from drgs.integrator import render
+from drgs.scene import Scene
+from drgs.settings import RenderSettings
+
+def draw():
+    rng = np.random.default_rng(0)
+    g, cam = random_gaussians(rng, 300, 1).detach(), random_camera(rng, (200, 150))
+    return render(g, cam, RenderSettings.preset("fast"), outputs=()).rgb
+
+def in_child():
+    if (child := os.fork()) == 0:
+        try:
+            print("drawn", float(draw().mean()) > 0, flush=True)
+        except NotImplementedError as problem:
+            print("refused:", problem, flush=True)
+        os._exit(0)  # as multiprocessing ends its children; Dr.Jit's own end would wait for its threads
+    assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+def test_forks():
+    """A child forked before the first render renders; one forked behind it refuses, in one line, and ends.
+
+    Before, the latter waited for workers that only its parent has.
+    """
+    done = _run(SCENE + "in_child()\ndraw()\nin_child()\ndraw()\n")
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert first == "drawn True"
+    assert second.startswith("refused: drgs: a process must not render when it was forked from one that has rendered")
+    assert "spawn" in second
+
+
+def test_spawn():
+    """`multiprocessing`'s spawn starts processes that render, from one that has."""
+    want = everything(0)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        got = pool.apply(everything, (0,))
+    for a, b in zip(got, want, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
