@@ -30,7 +30,7 @@ from drgs.data import load
 from drgs.files import Run, atomic_write
 from drgs.ladder import GROUPS, Pictures, ladder, table
 from drgs.orbits import Wish, scene_orbit
-from drgs.render_command import run_background
+from drgs.run_records import fit_record
 from drgs.settings import RenderSettings
 from drgs.viewpoints import evenly
 
@@ -83,7 +83,7 @@ def office(fov: float, path: Path) -> tuple:
     views = load(Path(run.config()["data"]), lazy=True, points=False).views
     cameras = [at_most(view.camera.undistorted(), PIXELS) for view in evenly(views, VIEWS)]
     cameras = [dataclasses.replace(c, K=intrinsics_from_fov(fov, c.width, c.height)) for c in cameras]
-    return drgs.load_ply(path / "point_cloud.ply"), cameras, run_background(run)
+    return drgs.load_ply(path / "point_cloud.ply"), cameras, fit_record(run).config.settings.background
 
 
 def measure(scene: tuple, crop: int) -> dict:
