@@ -22,11 +22,15 @@ from drgs.integrator import render
 from drgs.oracle import activate, screen_rows
 from drgs.settings import RenderSettings
 
-__all__ = ["Finding", "Found", "Model", "find"]
+__all__ = ["LEAST", "Finding", "Found", "Model", "find"]
 
 _SH0 = math.sqrt(1 / (4 * math.pi))
 _SHARE = 0.3  # of the remaining difference that a variation must explain to be named
 _ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
+_WINDOW = 16  # pixels a side
+_NEAR = 2e-6  # of the distance: some ten times what float32 loses where it computes a depth
+_EFFECT = 1e-5  # of a weight: what moves less moves no gradient by what counts
+LEAST = 0.1  # of the pixels: fewer that are without near ties say nothing
 _COMPENSATION_FLOOR = 0.005**2  # of the ratio of determinants
 
 
@@ -79,12 +83,57 @@ class Model:
             camera: Pinhole.
             oracle: By the float64 oracle instead of the renderer.
         """
+        rows: dict[int, list] = {}
+        for (y, _), image, alpha in self._pieces(raw, camera, oracle):
+            rows.setdefault(y, []).append(torch.cat([image, alpha[..., None]], -1))
+        whole = self._flipped(torch.cat([torch.cat(row, 1) for row in rows.values()]))
+        return whole[..., :3], whole[..., 3]
+
+    def gradient(self, raw: dict, camera: Camera, cotangent: torch.Tensor, oracle: bool = False) -> dict:
+        """float64 gradient of <cotangent, image> by group."""
+        leaves = {name: x.detach().clone().requires_grad_() for name, x in raw.items()}
+        total = {name: torch.zeros_like(x) for name, x in raw.items()}
+        cotangent = self._flipped(cotangent)  # of what is not flipped yet
+        # One piece at a time: what autograd keeps of it is freed before the next one is drawn.
+        for (y, x), image, _ in self._pieces(leaves, camera, oracle):
+            if image.requires_grad:
+                loss = (image * cotangent[y : y + image.shape[0], x : x + image.shape[1]]).sum()
+                found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
+                for name, slope in zip(leaves, found, strict=True):
+                    total[name] += 0 if slope is None else slope.double()
+        return total
+
+    def near_ties(self, raw: dict, camera: Camera) -> torch.Tensor:
+        """(H, W) bool: pixels that hang on what float32 cannot tell, by the float64 oracle.
+
+        Two Gaussians whose depths are as good as equal, or a hit or a ray on the very edge of a cut-off, as
+        `drgs.reference` marks them `ambiguous`: two correct renderers differ there, the gradient more than the image.
+        """
+        camera = self._camera(camera)
+        found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+        with torch.no_grad():
+            g = Gaussians(**self._parameters(raw, camera))
+            for x, y, width, height in _windows(camera):
+                window = (x, y, width, height)
+                out = reference.render(
+                    g, camera, self.settings, tolerance=_NEAR, window=window, exact_ties=True, effect=_EFFECT
+                )
+                found[y : y + height, x : x + width] = out.ambiguous
+        return self._flipped(found)
+
+    def _pieces(self, raw: dict, camera: Camera, oracle: bool) -> Iterator[tuple]:
+        """The image before it is flipped, in pieces: (row, column) of its corner, image and alpha."""
         camera = self._camera(camera)
         g = Gaussians(**self._parameters(raw, camera))
-        if oracle:
-            out = reference.render(g, camera, self.settings)
-        else:
-            out = render(g, camera, self.settings, outputs=())
+        if not oracle:
+            yield ((0, 0), *self._developed(render(g, camera, self.settings, outputs=())))
+            return
+        for x, y, width, height in _windows(camera):
+            window = (x, y, width, height)
+            yield ((y, x), *self._developed(reference.render(g, camera, self.settings, window=window)))
+
+    def _developed(self, out) -> tuple[torch.Tensor, torch.Tensor]:
+        """Image and alpha, float64, with this model's channels and transfer function."""
         image, alpha = out.rgb.double(), out.alpha.double()
         if self.channels in _ORDERS:
             image = image[..., ["rgb".index(c) for c in self.channels]]
@@ -93,22 +142,10 @@ class Model:
             if self.transfer.endswith("behind"):
                 behind = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
             image = _linear(image - behind) + behind
-        if self.flip != "none":
-            axis = ("vertical", "horizontal").index(self.flip)
-            image, alpha = image.flip(axis), alpha.flip(axis)
         return image, alpha
 
-    def gradient(self, raw: dict, camera: Camera, cotangent: torch.Tensor, oracle: bool = False) -> dict:
-        """float64 gradient of <cotangent, image> by group."""
-        leaves = {name: x.detach().clone().requires_grad_() for name, x in raw.items()}
-        image, _ = self.draw(leaves, camera, oracle)
-        if not image.requires_grad:
-            return {name: torch.zeros_like(x) for name, x in raw.items()}
-        found = torch.autograd.grad((image * cotangent).sum(), list(leaves.values()), allow_unused=True)
-        return {
-            name: torch.zeros_like(x) if d is None else d.double()
-            for (name, x), d in zip(leaves.items(), found, strict=True)
-        }
+    def _flipped(self, picture: torch.Tensor) -> torch.Tensor:
+        return picture if self.flip == "none" else picture.flip(("vertical", "horizontal").index(self.flip))
 
     def replace(self, **fields) -> Model:
         """A copy with fields, or fields of the settings, replaced."""
@@ -164,6 +201,13 @@ class Model:
             towards = towards @ torch.tensor(camera.w2c[:3, :3]).T
         color = 0.5 + (reference.sh_basis(towards, sh.shape[1])[..., None] * sh).sum(1)
         return ((color - 0.5) / _SH0)[:, None]  # the renderer clamps at 0 as ever
+
+
+def _windows(camera: Camera) -> Iterator[tuple[int, int, int, int]]:
+    """(x, y, width, height) of squares that cover the image: the oracle takes of each the Gaussians that it can see."""
+    for y in range(0, camera.height, _WINDOW):
+        for x in range(0, camera.width, _WINDOW):
+            yield x, y, min(_WINDOW, camera.width - x), min(_WINDOW, camera.height - y)
 
 
 def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) -> torch.Tensor:
@@ -240,31 +284,37 @@ _FITTED = ("dilation", "alpha_min", "alpha_max", "transmittance_min")  # refined
 
 
 def find(
-    image: torch.Tensor, raw: dict, camera: Camera, starts: list[Model], oracle: bool = False, settled: float = 1e-5
+    image: torch.Tensor,
+    starts: list[Model],
+    draw: Callable[[Model], torch.Tensor],
+    near_ties: Callable[[Model], torch.Tensor],
+    settled: float = 1e-5,
 ) -> Found:
     """The model whose image is nearest to a given one, and what is unusual about it.
 
     Variations are added one at a time, each time the one that explains most of what is left, as long as that is at
-    least 30 %; what a later one makes needless is dropped.
+    least 30 %; what a later one makes needless is dropped. Where an image is not the nearest start's at once, pixels
+    that hang on near ties of that start do not count: a tie that fell the other way must not be taken for an order.
 
     Args:
         image: (H, W, 3) of the rasterizer.
-        raw: Raw parameters, float64.
-        camera: Its pinhole camera.
         starts: Models that may be meant: the claimed one, or one a preset. What differs is counted from the one that
             needs least.
-        oracle: Search with the float64 oracle.
+        draw: Model -> its (H, W, 3) image of that view.
+        near_ties: Model -> (H, W) bool.
         settled: RMS below which two images are one: what their rounding does.
     """
-    known: dict[Model, float] = {}
+    known: dict[Model, torch.Tensor] = {}
+    counts = torch.ones(image.shape[:2], dtype=torch.bool)
 
     def distance(model: Model) -> float:
         if model not in known:
-            with torch.no_grad():
-                known[model] = float((model.draw(raw, camera, oracle)[0] - image).square().mean().sqrt())
-        return known[model]
+            known[model] = (draw(model) - image).square().mean(-1)
+        return float(known[model][counts].mean().sqrt())
 
     start = min(starts, key=distance)
+    if distance(start) > settled:
+        counts = _countable(near_ties(start))
     model = _descend(distance, start, start, settled)
     odd = [field for field in _different(model, start) if not hasattr(model, field) and field != "background"]
     for other in starts if odd or distance(model) > settled else ():
@@ -283,6 +333,11 @@ def find(
         without = distance(model.replace(**{field: usual}))
         findings.append(Finding(name, _text(usual), _text(_get(model, field)), without, distance(model), groups))
     return Found(start, model, distance(start), distance(model), findings)
+
+
+def _countable(ties: torch.Tensor) -> torch.Tensor:
+    """Pixels to be compared: those without near ties, or all where there would be next to none."""
+    return ~ties if float((~ties).double().mean()) >= LEAST else torch.ones_like(ties)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drgs import rasterizers, runtime, tables
+from drgs.active import at_most
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.outputs import check_file, claim
 from drgs.progress import Bar
@@ -30,6 +31,7 @@ def run(args: Crossval) -> int:
     else:
         check_file(args.export, "crossval", inputs, rasterizers.is_export)
     g, fields, cameras, source = seen_views(args)
+    cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:
         background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
         rasterizers.export(args.export, g, cameras, background, args.seed)
@@ -69,6 +71,8 @@ def _print(result: Result, args: Crossval) -> None:
         rows.append((name, row["verdict"], *numbers, row["why"]))
     title = f"{report['rasterizer']} against preset {report['preset']} ({report['reference']})"
     tables.show(title, ("group", "verdict", "relative", "cosine", "bias", "why"), rows, texts=("verdict", "why"))
+    for line in report["scope"]:
+        print(line)
     for line in result.lines():
         if line.startswith(("convention:", "view ")):
             print(line)

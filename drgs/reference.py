@@ -40,7 +40,6 @@ __all__ = ["EPS_ALPHA", "Output", "render", "render_volume", "sh_basis"]
 EPS_ALPHA = 1e-10
 """Expected depth is divided by max(alpha, EPS_ALPHA)."""
 
-_EFFECT = 1e-7  # a near tie counts only if it can move a weight by more than this
 _TILE = 16  # pixels; both rasterizers' tile size
 _PAIRS = 1 << 19  # (ray, Gaussian) pairs held at once: about 0.3 GB of intermediates
 
@@ -77,6 +76,8 @@ def render(
     rays: tuple[torch.Tensor, torch.Tensor] | None = None,
     tolerance: float = 1e-5,
     window: tuple[int, int, int, int] | None = None,
+    exact_ties: bool = False,
+    effect: float = 1e-7,
 ) -> Output:
     """Renders by brute force in float64.
 
@@ -90,13 +91,16 @@ def render(
             center is each ray's own origin.
         settings: The `RenderSettings`; `traversal` plays no role here.
         rays: Origins and directions, (..., 3) each, in place of the camera's; not for `ewa`.
-        tolerance: A pixel is `ambiguous` when rounding could move a weight by more than 1e-7:
+        tolerance: A pixel is `ambiguous` when rounding could move a weight by more than `effect`:
             neighbors in the order have keys closer than `tolerance` times the distance (exact ties
-            are safe, the index decides), or a hit or T is within a relative `tolerance` of a
+            are safe, the index decides; see `exact_ties`), or a hit or T is within a relative `tolerance` of a
             cut-off, clamp, tile border or of T = 0.5.
         window: (x, y, width, height) in pixels: only these of the camera's image. Unlike a camera with a shifted
             principal point it keeps the tiles and the field-of-view clamp of the whole image. Gaussians that none of
             its rays can meet are left out first, which changes nothing but the time.
+        exact_ties: Keys that are equal make a pixel `ambiguous`, too: a renderer that rounds in another way, or sorts
+            without the index, may have either order.
+        effect: The change of a weight that matters to `ambiguous`.
 
     Returns:
         `Output` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
@@ -125,7 +129,7 @@ def render(
     parts = []
     for i in range(0, max(len(directions), 1), step):
         part = (x[i : i + step] for x in (view.origins, directions, view.pixels))
-        args = (scene, s, rotation, center, *part, tolerance)
+        args = (scene, s, rotation, center, *part, tolerance, exact_ties, effect)
         # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
         if torch.is_grad_enabled() and len(directions) > step:
             parts.append(checkpoint(_composite, *args, use_reentrant=False))
@@ -258,7 +262,7 @@ def _responses(scene: SimpleNamespace, s: RenderSettings, rotation, center, o, d
     return a, rest, t, key.detach().expand_as(a), exists, margin, to_max, distance
 
 
-def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, tolerance) -> dict:
+def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, tolerance, exact_ties, effect) -> dict:
     """The fields of `Output` for one chunk of rays."""
     a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels)
     # Near misses are sorted in, without effect, to see what they would have done.
@@ -288,7 +292,7 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
         slack = tolerance * (1 + growth)
         off = _previous(slack, tolerance) if s.stop == "after" else slack
         to_stop = (tested - s.transmittance_min).abs() - off * tested
-        matters = candidate & (a * before > _EFFECT) & (~stops | (to_stop <= 0))
+        matters = candidate & (a * before > effect) & (~stops | (to_stop <= 0))
         doubt = matters & ((margin.abs() <= tolerance) | (to_stop <= 0))
         doubt |= alive & ((after - 0.5).abs() <= slack * after)
         if s.alpha_max < 1:
@@ -299,7 +303,7 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
         gap = key - _previous(last, -math.inf)
         swap = a * a.gather(1, place) * before.gather(1, place)
         close = gap <= tolerance * torch.maximum(distance, key.abs())
-        doubt |= matters & (gap > 0) & close & (swap > _EFFECT)
+        doubt |= matters & ((gap > 0) | exact_ties) & close & (swap > effect)
     return {
         "rgb": (weights[:, :, None] * colors).sum(dim=1) + background,
         "alpha": alpha,

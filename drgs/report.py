@@ -36,7 +36,8 @@ code { background: #f3f3f3; padding: 0 .25rem }
 <p>{{ meaning[r.verdict] }} Compared with preset <code>{{ r.preset }}</code> by {{ r.reference }} on
 {{ r.gaussians }} Gaussians, {{ r.cameras | length }} views of {{ r.size[0] }}x{{ r.size[1] }} pixels, background
 {{ r.background }}. Scene {{ r.scene }}; cameras {{ r.source }}.</p>
-
+{% for line in r.scope %}<p>{{ line }}.</p>
+{% endfor %}
 <h2>Conventions</h2>
 {% if r.conventions %}
 <table><tr><th>convention</th><th>preset</th><th>rasterizer</th><th>RMS without it</th><th>RMS with all</th></tr>

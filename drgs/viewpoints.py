@@ -205,7 +205,7 @@ def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera]
 
     Returns:
         The Gaussians; the settings that hold whatever the preset is (what --set says, over the run's background);
-        pinhole cameras, reduced; and where they come from in words.
+        pinhole cameras, as large as they are drawn; and where they come from in words.
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If an option is out of range or a file damaged.
@@ -222,15 +222,8 @@ def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera]
     if run is not None:
         fields = {"background": fit_record(run).config.settings.background} | fields
     text = args.cameras or ("orbit" if run is None else str(run.path))
-    width = max(1, int(math.sqrt(args.max_pixels * 4 / 3)))
-    size = width, max(1, args.max_pixels // width)
-    cameras, source = cameras_of(args, text, gaussians, run, args.limit, size)
-    return (
-        gaussians,
-        fields,
-        [at_most(c.undistorted(), args.max_pixels) for c in evenly(cameras, args.limit)],
-        source,
-    )
+    cameras, source = cameras_of(args, text, gaussians, run, args.limit, (None, None))
+    return gaussians, fields, [camera.undistorted() for camera in evenly(cameras, args.limit)], source
 
 
 def _orbit(wish: Wish, scene: Scene, known: Known, count: int) -> list[Camera]:

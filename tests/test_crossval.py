@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +56,29 @@ def _made(seed):
     g = Gaussians(**{name: s[name].float() for name in GROUPS})
     camera = Camera(K=s["K"].numpy(), w2c=s["viewmat"].numpy(), width=s["width"], height=s["height"])
     return g, [camera], tuple(float(x) for x in s["background"])
+
+
+def _tied(contrast, seed=0):
+    """A plane of Gaussians, as good as across the view: float32 depths are equal, float64 order is not the index's.
+
+    `contrast`: of the colors of the plane, which the order makes visible. Behind it and beside it is what ties nowhere.
+    """
+    rng, plane, others = np.random.default_rng(seed), 24, 12
+    n = plane + others
+    x, y = np.sort(rng.uniform(-1.6, -0.4, plane)), rng.uniform(-1.2, 1.2, plane)
+    means = np.concatenate([np.stack([x, y, np.full(plane, 3.0)], 1), rng.uniform((-1, -2, 2), (3, 2, 7), (others, 3))])
+    colors = 0.4 * rng.normal(size=(n, 4, 3))
+    colors[:plane] *= contrast
+    g = Gaussians(
+        means=torch.tensor(means).float(),
+        quats=torch.tensor(rng.normal(size=(n, 4))).float(),
+        log_scales=torch.tensor(math.log(0.2) + 0.4 * rng.normal(size=(n, 3))).float(),
+        logit_opacities=torch.tensor(rng.normal(size=n) - 2.0 * (np.arange(n) < plane)).float(),
+        sh=torch.tensor(colors).float(),
+    )
+    w2c = np.eye(4)
+    w2c[:3, :3] = [[1, 0, 1e-9], [0, 1, 0], [-1e-9, 0, 1]]  # the last of the plane is the nearest
+    return g, [Camera(K=np.array([[16.0, 0, 12], [0, 16, 10], [0, 0, 1]]), w2c=w2c, width=24, height=20)]
 
 
 def _check(name, g, cameras, background, preset):
@@ -249,6 +273,61 @@ def test_our_own_presets_agree_with_the_oracle(preset):
     assert result.report["preset"] == preset
 
 
+@pytest.mark.parametrize(("contrast", "said"), [(0.05, "other convention"), (0.0, "model difference")])
+def test_near_ties_are_no_difference(contrast, said, monkeypatch):
+    """Where depths tie within float32 either order is right: it is no convention, and no other model.
+
+    Pixels without ties are compared as ever: there a wrong gradient is still found.
+    """
+    g, cameras = _tied(contrast)
+    ours = rasterizers.load("drgs:gsplat")
+    result = crossval(ours, g, cameras, "gsplat", {"background": BACKGROUND})
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert 0 < result.report["near_ties"] < 0.6 * result.report["pixels"]
+    assert "hang on near ties" in "\n".join(result.lines())
+
+    def halved(raw, camera, background):
+        raw = raw | {"sh": raw["sh"].detach() + 0.5 * (raw["sh"] - raw["sh"].detach())}
+        return ours.draw(raw, camera, background)
+
+    wrong = dataclasses.replace(ours, draw=halved)
+    found = crossval(wrong, g, cameras, "gsplat", {"background": BACKGROUND}).report["groups"]
+    assert [name for name, row in found.items() if row["verdict"] == "gradient bug"] == ["sh"]
+    assert "0.5 times" in found["sh"]["why"]
+
+    # If they were not left out, it would be said what is not so: this is what the test is about.
+    monkeypatch.setattr("drgs.conventions.Model.near_ties", lambda *_: torch.zeros(20, 24, dtype=torch.bool))
+    assert crossval(ours, g, cameras, "gsplat", {"background": BACKGROUND}).verdict == said
+
+
+def test_crops_show_something():
+    """Of a scene too large for the oracle, each view is looked at where most is seen, and the report says so."""
+    g, (camera,) = random_scene(0)
+    parts = {name: getattr(g, name) for name in GROUPS}
+    many = Gaussians(**{name: x.repeat(6, *[1] * (x.dim() - 1)) for name, x in parts.items()})  # six of each
+    many = many.replace(means=many.means + torch.randn(len(many), 3, generator=torch.manual_seed(0)) * 0.02)
+    # A view eight times as wide and high: what is seen lies in its lower right corner.
+    K = np.array(camera.K)
+    K[:2, 2] += 120, 96
+    wide = dataclasses.replace(camera, K=K, width=160, height=128)
+    w2c = np.array(camera.w2c)
+    w2c[0, 3] -= 0.5
+    away = np.diag([-1.0, 1, -1, 1]) @ np.array(camera.w2c)
+    away[2, 3] -= 1000
+    cameras = [dataclasses.replace(wide, w2c=x, name=n) for n, x in (("one", wide.w2c), ("empty", away), ("two", w2c))]
+    result = crossval(rasterizers.load("drgs:gsplat"), many, cameras, "auto", {"background": BACKGROUND})
+    report = result.report
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert report["cameras"] == ["one", "two"]
+    assert report["size"] == [32, 32]
+    assert [crop["of"] for crop in report["crops"]] == [[160, 128]] * 2
+    assert all(crop["x"] >= 80 and crop["y"] >= 64 for crop in report["crops"])
+    assert report["of_gaussians"] == len(many) >= report["gaussians"] > 0
+    assert all(float(image["rasterizer"].std()) > 0.05 for image in result.images)
+    text = "\n".join(report["scope"])
+    assert "a crop of 32x32 pixels of 2 views (1 more show nothing) of 160x128, at (" in text
+
+
 @pytest.mark.parametrize(
     "fields",
     [{"response": "integral"}, {"order": "center", "extent": 3.0}, {"traversal": "bvh", "sh_direction": "ray"}],
@@ -302,8 +381,10 @@ def test_command(folder):
     report = json.loads((folder / "out" / "crossval.json").read_text())
     assert report["verdict"] == "agreement"
     assert report["ladder"]
+    assert report["scope"] == ["compared: 1 view of 32x24 pixels, 40 Gaussians"]
     page = (folder / "out" / "report.html").read_text()
     assert "agreement" in page
+    assert report["scope"][0] in page
     assert "data:image/png;base64," in page
     assert "http://" not in page
     assert "https://" not in page
