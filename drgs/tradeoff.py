@@ -14,7 +14,9 @@ order is right, and single pixels jump); of gradient and information, the worst 
 the largest unit); of information, the larger of L1 and median.
 
 Times are medians over rounds in which all settings take turns on one view, everything included; ratios are to `exact`
-in the same round. With one thread it is the processor's time, else the clock's. What would take minutes (Mitsuba's
+in the same round. Errors, and a first look at all times, are of reduced views; the leading settings are timed again on
+views as large as they are drawn (tradeoff_full.py), and advice follows from these (tradeoff_advice.py). With one thread
+it is the processor's time, else the clock's. What would take minutes (Mitsuba's
 traversal without cut-offs, the oracle) is measured on a sample of rays, once, and its time scaled to the image.
 """
 
@@ -27,10 +29,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs import runtime, tables
+from drgs.active import at_most
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.outputs import claim, replacing
 from drgs.progress import Bar
 from drgs.render_command import described
+from drgs.tradeoff_advice import USES, recommend
+from drgs.tradeoff_full import measure_full
 from drgs.tradeoff_measure import measure
 from drgs.viewpoints import seen_views
 
@@ -38,16 +43,6 @@ if TYPE_CHECKING:
     from drgs.options import Tradeoff
 
 __all__ = ["USES", "VARIANTS", "Variant", "recommend", "run"]
-
-USES = {
-    "image": ("forward", ("image",)),
-    "gradients": ("forward_backward", ("gradient",)),
-    "information": ("fisher", ("information",)),
-    "everything": ("forward_backward", ("image", "gradient", "information")),
-}
-"""Use -> the time that counts, and the errors that must be within the budget."""
-
-_ALIKE = 0.1  # times this close are equal: those of exact and alpha_max=0.999, the same work, differ by up to 0.07
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +127,8 @@ def run(args: Tradeoff) -> None:
     if not args.max_error or not all(0 < x < math.inf for x in args.max_error):
         got = " ".join(f"{x:g}" for x in args.max_error) or "none"
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
+    if not 1 <= args.seconds <= 1e6:
+        raise ValueError(f"--seconds must be in [1, 1000000], got {args.seconds:g}; correct it")
     if not 1 <= args.repeats <= 1000:
         raise ValueError(f"--repeats must be in [1, 1000], got {args.repeats}; correct it")
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
@@ -139,8 +136,14 @@ def run(args: Tradeoff) -> None:
     gaussians, fields, cameras, source = seen_views(args)
     if not len(gaussians):
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")
-    with Bar("tradeoff", (args.repeats + 1) * sum(x.by == "view" for x in VARIANTS), not args.quiet) as bar:
-        measured = measure(gaussians, cameras, VARIANTS, fields, args.repeats, args.seed, bar.advance)
+    reduced = [at_most(camera, args.max_pixels) for camera in cameras]
+    turns = (args.repeats + 1) * (1 + sum(x.by == "view" for x in VARIANTS))
+    with Bar("tradeoff", turns, not args.quiet) as bar:
+        measured = measure(gaussians, reduced, VARIANTS, fields, args.repeats, args.seed, bar.advance)
+    with Bar("tradeoff", show=not args.quiet) as bar:
+        say = lambda label: bar.update(0, label=f"tradeoff, {label}")  # noqa: E731
+        budget = args.repeats, args.seconds, args.seed
+        full = measure_full(measured, gaussians, cameras, args.max_error, *budget, say)
     for row, variant in zip(measured["rows"], VARIANTS, strict=True):
         row["flags"] = None if variant.by == "oracle" else variant.flags(args.overrides)
     report = {
@@ -149,7 +152,8 @@ def run(args: Tradeoff) -> None:
         "scene": str(args.scene),
         "gaussians": len(gaussians),
         "source": source,
-        "views": [described(camera) for camera in cameras],
+        "views": [described(camera) for camera in reduced],
+        "full": full,
         "fields": fields,
         "seed": args.seed,
         "budgets": list(args.max_error),
@@ -168,38 +172,6 @@ def run(args: Tradeoff) -> None:
         print(f"{files}: {args.output}", flush=True)
         if not drawn:
             print("no plot: matplotlib is not installed; pip install 'drgs[report]'")
-
-
-def recommend(measured: dict, use: str, budgets) -> list[dict]:
-    """The fastest setting within each budget, the most exact one of those equally fast, or why there is none.
-
-    Args:
-        measured: Of `tradeoff_measure.measure`. Rows of a reduced resolution and rows that were measured on a sample of
-            the rays are no candidates.
-        use: One of `USES`.
-        budgets: > 0.
-    """
-    clock, kinds = USES[use]
-    rows = [r for r in measured["rows"] if r["skipped"] is None and r["share"] == 1 and r["by"] == "view"]
-    rows = [r for r in rows if all(r["errors"][k] is not None for k in kinds) and r["ratio"][clock] is not None]
-    largest = {r["name"]: max(r["errors"][k] for k in kinds) for r in rows}
-    picks = []
-    for budget in budgets:
-        pick = {"use": use, "budget": budget, "clock": clock, "name": None, "reason": None}
-        within = [r for r in rows if largest[r["name"]] <= budget]
-        if within:
-            least = min(r["ratio"][clock] for r in within)
-            alike = [r for r in within if r["ratio"][clock] <= least * (1 + _ALIKE)]
-            best = min(alike, key=lambda r: largest[r["name"]])
-            pick |= {"name": best["name"], "kind": best["kind"], "flags": best.get("flags")}
-            pick |= {"error": largest[best["name"]], "ratio": best["ratio"][clock]}
-        elif largest:
-            least = min(largest, key=largest.get)
-            pick["reason"] = f"no setting is within it, the least error is {largest[least]:.1e} ({least})"
-        else:
-            pick["reason"] = f"there is no setting whose {' and '.join(kinds)} error could be measured"
-        picks.append(pick)
-    return picks
 
 
 def _short(value) -> str:
@@ -228,6 +200,8 @@ def _print(report: dict) -> None:
     columns = ("setting", "kind", *(f"time\n{x}" for x in times), *(f"error\n{x}" for x in errors))
     tables.show(f"{title} ({report['source']})", columns, rows, texts=("kind",))
     for line in _notes(report):
+        print(line)
+    for line in _full_lines(report):
         print(line)
     print("\nFastest within a budget:")
     for pick in report["recommended"]:
@@ -264,13 +238,13 @@ def _page(report: dict, drawn: bool) -> str:
         ]
         lines.append(f"| {row['name']} | {row['kind']} | " + " | ".join(cells) + " |")
     lines += ["", *(f"- {line}" for line in _notes(report)), ""]
+    lines += [*_full_table(report), ""]
     lines += ["| use | budget | fastest setting within it | time | error |", "|---|---|---|---|---|"]
     for pick in report["recommended"]:
-        found = (
-            f"`{pick['flags']}` | {pick['ratio']:.2f} | {pick['error']:.1e}"
-            if pick["name"]
-            else f"{pick['reason']} | | "
-        )
+        found = f"{pick['reason']} | | "
+        if pick["name"]:
+            why = f" ({pick['reason']})" if pick["reason"] else ""
+            found = f"`{pick['flags']}`{why} | {_span(pick)} | {pick['error']:.1e}"
         lines.append(f"| {pick['use']} | {pick['budget']:g} | {found} |")
     if drawn:
         lines += ["", "![error against time](tradeoff.png)"]
@@ -282,7 +256,10 @@ def _notes(report: dict) -> list[str]:
     exact, own = report["rows"][0], report["own"]
     seconds = exact["seconds"]
     took = [_milliseconds(seconds[key]) for key in ("forward", "forward_backward", "fisher")]
-    lines = [f"exact: {took[0]} forward, {took[1]} forward + backward, {took[2]} the Fisher diagonal of a view"]
+    size = "{width}x{height}".format(**report["views"][0])
+    lines = [
+        f"at {size}, exact: {took[0]} forward, {took[1]} forward + backward, {took[2]} the Fisher diagonal of a view"
+    ]
     if own["image"] is not None:
         oracle = next(row for row in report["rows"] if row["by"] == "oracle")
         lines.append(
@@ -292,6 +269,9 @@ def _notes(report: dict) -> list[str]:
         )
     else:
         lines.append("exact itself was not compared with float64; budgets hold relative to it")
+    scatter = [f"{_title(clock)} {_span(found)}" for clock, found in report["scatter"].items() if found]
+    if scatter:
+        lines.append("exact against itself, the scatter of equal work: " + ", ".join(scatter))
     for row in report["rows"]:
         if row["skipped"] is not None:
             lines.append(f"skipped {row['name']}: {row['skipped']}")
@@ -302,11 +282,57 @@ def _notes(report: dict) -> list[str]:
     return lines
 
 
+def _full_lines(report: dict) -> list[str]:
+    """Times at full size, one line a clock."""
+    lines = []
+    for clock, found in report["full"].items():
+        rows = {row["name"]: row["full"].get(clock) for row in report["rows"]}
+        exact = rows[found["names"][0]]
+        others = [f"{name} {_span(rows[name])}" for name in found["names"][1:]]
+        where = f"{_title(clock)} at {_size(found)}, {found['rounds']} rounds"
+        lines.append(f"{where}: exact {_seconds(exact['seconds'])}; times it: {', '.join(others)}")
+    return lines
+
+
+def _full_table(report: dict) -> list[str]:
+    """The same for the page."""
+    lines = ["| at the size of the views as drawn | size | rounds | setting | seconds | times exact's |"]
+    lines.append("|---|---|---:|---|---:|---:|")
+    for clock, found in report["full"].items():
+        for name in found["names"]:
+            times = next(row for row in report["rows"] if row["name"] == name)["full"][clock]
+            cells = _title(clock), _size(found), str(found["rounds"]), name, f"{times['seconds']:.3g}", _span(times)
+            lines.append("| " + " | ".join(cells) + " |")
+    return lines if report["full"] else []
+
+
+def _title(clock: str) -> str:
+    return {"forward": "forward", "forward_backward": "forward + backward", "fisher": "Fisher diagonal"}[clock]
+
+
+def _size(found: dict) -> str:
+    text = "{}x{}".format(*found["size"])
+    return text if found["size"] == found["drawn"] else text + " (of {}x{}: --seconds)".format(*found["drawn"])
+
+
+def _span(times: dict) -> str:
+    """A ratio and its interval."""
+    digits = 3 if times["ratio"] < 0.1 else 2
+    if times["low"] == times["high"]:
+        return f"{times['ratio']:.{digits}f}"
+    return f"{times['ratio']:.{digits}f} [{times['low']:.{digits}f}, {times['high']:.{digits}f}]"
+
+
+def _seconds(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds >= 1 else _milliseconds(seconds)
+
+
 def _advice(pick: dict) -> str:
     where = f"{pick['use']}, {pick['budget']:g}: "
     if pick["name"] is None:
         return where + pick["reason"]
-    return f"{where}{pick['ratio']:.2f}x the time, error {pick['error']:.1e}:  {pick['flags']}"
+    why = f" ({pick['reason']})" if pick["reason"] else f" {_span(pick)} times exact's time"
+    return f"{where}{pick['flags']}{why}, error {pick['error']:.1e}"
 
 
 def _time(row: dict, key: str) -> str:

@@ -16,13 +16,14 @@ import torch
 import drgs
 from drgs import runtime
 from drgs.settings import RenderSettings
+from drgs.tradeoff_advice import interval
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.tradeoff import Variant
 
-__all__ = ["measure"]
+__all__ = ["clocked", "measure", "placed"]
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
 _AT_LEAST = 3  # but not before so many
@@ -53,18 +54,20 @@ def measure(
         advance: Called after each turn.
     Returns:
         `rows`, in the order of `variants` (name, kind, settings, share, by, skipped; image, gradient, information,
-        errors, seconds, ratio, first_call), `own` (errors of the truth against the oracle), `pixels` (of one view on
+        errors, seconds, ratio, times (intervals of the ratios, see tradeoff_advice.py), first_call), `scatter` (of the
+        truth's times against itself), `own` (errors of the truth against the oracle), `pixels` (of one view on
         average), `rounds`, `clock` (wall or processor). Where there is no number there is None, and the reason in
         `skipped` or `notes`.
     Raises:
         ValueError: If no view shows a Gaussian, or the truth cannot be computed.
     """
-    device = "cuda" if runtime.backend().name == "cuda" else "cpu"
-    gaussians = gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
+    gaussians = placed(gaussians)
     stage = _Stage(gaussians, cameras, seed)
     rows = _rows_of(variants, fields or {})
     turns = [_Turn(row, stage) for row in rows if row["skipped"] is None and row["by"] == "view"]
     truth, others = turns[0], turns[1:]
+    again = _Turn(dict(truth.row), stage)  # the truth once more in every round: how much equal work scatters
+    others.append(again)
     order, done = random.Random(seed), 0
     began = time.perf_counter(), time.process_time()
     # The first pass compiles. Every view has a turn, so that errors are of all of them.
@@ -81,13 +84,26 @@ def measure(
             advance()
         advance()
         done += timed
-    for turn in turns:
+    for turn in (*turns, again):
         turn.finish(truth)
     own = _sampled(rows, stage, truth, seed)
     for row in rows:
         row["errors"] = _bound(row, own)
     pixels = statistics.mean(camera.width * camera.height for camera in cameras)
-    return {"rows": rows, "own": own, "pixels": pixels, "rounds": done, "clock": _clock_name()}
+    return {
+        "rows": rows,
+        "own": own,
+        "scatter": again.row["times"],
+        "pixels": pixels,
+        "rounds": done,
+        "clock": _clock_name(),
+    }
+
+
+def placed(gaussians: Gaussians) -> Gaussians:
+    """Where they are rendered, without a graph."""
+    device = "cuda" if runtime.backend().name == "cuda" else "cpu"
+    return gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
 
 
 class _Stage:
@@ -173,17 +189,17 @@ class _Turn:
         stage, view, share = self.stage, number % len(self.stage.cameras), self.row["share"]
         camera, took = stage.cameras[view], {}
         with torch.no_grad():
-            _, took["forward"] = _clock(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
+            _, took["forward"] = clocked(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
 
         def both():
             image = stage.image(stage.moving, camera, self.settings, share)
             return image.detach().cpu(), stage.pull(image, stage.cotangents[view])
 
-        (image, slopes), took["forward_backward"] = _clock(both)
+        (image, slopes), took["forward_backward"] = clocked(both)
         parts = None
         if "information" not in self.row["notes"]:
             try:
-                parts, took["fisher"] = _clock(lambda: stage.information(camera, self.settings, share))
+                parts, took["fisher"] = clocked(lambda: stage.information(camera, self.settings, share))
             except NotImplementedError as error:
                 self.row["notes"]["information"] = _line(error)
         if number == 0:
@@ -226,12 +242,13 @@ class _Turn:
                 }
             worst = max(names, key=lambda name: max(groups[name].values()), default=None)
             self.row["information"] = {"groups": groups, "group": worst, **(groups[worst] if worst else {})}
-        warm, ratio = {}, {}
+        warm, times = {}, {}
         for name, x in self.seconds.items():
             both = x.keys() & truth.seconds[name].keys()
             warm[name] = statistics.median(x.values()) if x else None
-            ratio[name] = statistics.median(x[k] / truth.seconds[name][k] for k in both) if both else None
-        self.row["seconds"], self.row["ratio"] = warm, ratio
+            times[name] = interval([x[k] / truth.seconds[name][k] for k in both])
+        self.row["seconds"], self.row["times"] = warm, times
+        self.row["ratio"] = {name: x and x["ratio"] for name, x in times.items()}
         self.row["first_call"] = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
 
 
@@ -241,7 +258,7 @@ def _rows_of(variants, fields: dict) -> list[dict]:
     for variant in variants:
         row = {"name": variant.name, "kind": variant.kind, "share": variant.share, "by": variant.by, "skipped": None}
         row |= {"settings": None, "image": None, "gradient": None, "information": None, "notes": {}}
-        row |= {"seconds": None, "ratio": None, "first_call": None}
+        row |= {"seconds": None, "ratio": None, "times": None, "first_call": None, "full": {}}
         try:
             settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
         except (ValueError, NotImplementedError) as error:
@@ -288,11 +305,11 @@ def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
     if not oracle:
         # The acceleration structure does not grow with the number of rays. The first call compiles.
         few = _tracer(stage, RenderSettings(**row["settings"]), chosen[:1], oracle)
-        start = sum(_clock(work)[1] for work in few)
-        fixed = [_clock(work)[1] for work in few]
-    out, first = _clock(forward)
+        start = sum(clocked(work)[1] for work in few)
+        fixed = [clocked(work)[1] for work in few]
+    out, first = clocked(forward)
     good = ~out.ambiguous if oracle else torch.ones(len(chosen), dtype=torch.bool)
-    slopes, second = _clock(lambda: both(good))
+    slopes, second = clocked(lambda: both(good))
     off = (out.rgb.cpu().double() - stage.truth[stage.sampled][0].reshape(-1, 3)[chosen].double()).abs()
     row["image"] = _image_errors(off[good].numpy().reshape(-1))
     u = torch.zeros_like(whole)
@@ -397,7 +414,7 @@ def _reduced(camera: Camera, share: float) -> Camera:
     return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
-def _clock(work: Callable):
+def clocked(work: Callable):
     """What it returns, and the seconds until it was computed."""
     import drjit as dr
 
