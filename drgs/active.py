@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from drgs.arguments import check_fields
+from drgs.data.guided import Matches
 from drgs.files import SCHEMA, Run, write_json
 from drgs.frames import Frame, load_frames, reduced_size
 from drgs.progress import Bar
@@ -43,6 +44,7 @@ PICK_POINTS = ("auto", "uncovered", "none")
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
+_ALL = 1_000_000  # points of all seen views, before those where there is nothing yet are chosen
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 
 
@@ -131,6 +133,7 @@ class ActiveViews:
         grows = {"auto": not self.pool_leak, "uncovered": True, "none": False}[active.pick_points]
         self._share = config.max_gaussians // (active.initial + active.add) if grows else 0
         self._generator = torch.Generator().manual_seed(config.seed)
+        self._matches = Matches()
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
 
     @property
@@ -170,16 +173,19 @@ class ActiveViews:
             return nothing
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None
-        wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share) if dense else self._share
+        wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share) if dense else _ALL
+        seed = self._config.seed + len(self.picks)
         with Bar("points of the new view") as bar:
             points, colors, _ = initial_points(
-                seen[-1:] if dense else seen, self._config.seed + len(self.picks), wanted, bar.stage
+                seen[-1:] if dense else seen, seed, wanted, bar.stage, None if dense else self._matches
             )
         pixels, depth = frame.camera.project(points)
         inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (frame.camera.width, frame.camera.height)).all(1)
         columns, rows = pixels[inside].astype(int).T
         inside[inside] = is_open[rows, columns]
-        kept = np.flatnonzero(inside)[: self._share]
+        kept = np.flatnonzero(inside)
+        if len(kept) > self._share:
+            kept = kept[: self._share] if dense else np.random.default_rng(seed).permutation(kept)[: self._share]
         if len(kept) < _FEWEST:
             return nothing
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense

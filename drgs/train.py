@@ -199,6 +199,7 @@ def _start(
         points, colors, source = initial_points(
             dataset if given else views, config.seed, config.max_gaussians - reserved, bar.stage
         )
+        bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
     dense = not given and any(view.depth_path is not None for view in views)
     model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))

@@ -43,7 +43,6 @@ def extract(
     *,
     camera_model: str,
     shared_camera: bool,
-    masks: Path | None = None,
     max_image_size: int = 0,
     wide_baseline: bool = False,
     progress: Progress | None = None,
@@ -55,7 +54,6 @@ def extract(
         folder, names: the images, relative to the folder.
         camera_model: COLMAP's name.
         shared_camera: one camera for all images, or one each.
-        masks: folder of ``NAME.EXT.png``; features on black are dropped. Every image needs one.
         max_image_size: pixels on the longer side above which images are shrunk; 0 for never.
         wide_baseline: affine shapes and pooled scales: connects views further apart, at 2.5 times
             the cost.
@@ -71,8 +69,6 @@ def extract(
     options.sift.domain_size_pooling = wide_baseline
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
-    if masks is not None:
-        reader.mask_path = masks
     mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
     for start in range(0, len(names), _IMAGES_A_STEP):
         if progress:

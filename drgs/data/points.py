@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.matching import extract, match, nearby_pairs, quiet
+from drgs.capture import Focus
+from drgs.data.guided import Matches, detect
+from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
-from drgs.progress import Bar
-from drgs.unfinished import temporary_folder
 
 __all__ = ["initial_points", "read_point_ply", "scene_extent"]
 
 _EXTENT_MARGIN = 1.1
 _MIN_TRIANGULATED = 50
 _MAX_RANDOM = 20_000
-_NEIGHBORS = 20
+_NEIGHBORS = 10
 _FEATURE_SIZE = 1600
 _MASK_KEEP = 0.5
 _MAX_PLY_HEADER = 65536
@@ -59,6 +59,7 @@ def initial_points(
     seed: int = 0,
     max_points: int = 100_000,
     progress: Callable[[str, int, int], None] | None = None,
+    matches: Matches | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points to start Gaussians from, by the first way that works.
 
@@ -71,6 +72,7 @@ def initial_points(
         seed: of all random choices.
         max_points: at most so many.
         progress: called with (stage, done, total) while triangulating.
+        matches: what was found in the first ones of these views by an earlier call; is added to.
 
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
@@ -91,7 +93,7 @@ def initial_points(
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.image_path is not None for view in views):
-        points, colors = _triangulated(views, seed, progress)
+        points, colors = _triangulated(views, matches or Matches(), progress)
         if len(points) >= _MIN_TRIANGULATED:
             keep = _subset(len(points), max_points, rng)
             source = f"triangulated from {len(views)} given poses, {len(points)} points"
@@ -222,103 +224,29 @@ def _back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.n
 
 
 def _triangulated(
-    views: list[View], seed: int, progress: Callable[[str, int, int], None] | None
+    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """SIFT features inside the masks, matched and triangulated with the given poses."""
+    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated."""
     import cv2
 
-    from drgs.data.native import pycolmap
-
-    with temporary_folder("points") as base, quiet():
-        for name in ("images", "masks", "model"):
-            (base / name).mkdir()
-        names, cameras = [], []
-        masked = any(view.mask_path is not None or view.mask(1, 1) is not None for view in views)
-        for index, view in enumerate(views):
-            if progress:
-                progress("photographs for features", index, len(views))
-            camera = view.camera.undistorted()
-            scale = min(1.0, _FEATURE_SIZE / max(camera.width, camera.height))
-            camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-            image, mask = (
-                view.image(camera.width, camera.height),
-                view.mask(camera.width, camera.height),
-            )
-            name = f"{index:06d}.png"
-            _write_png(base / "images" / name, np.round(image[..., ::-1] * 255).astype(np.uint8))
-            if masked:
-                # COLMAP skips images without a mask as soon as there is a mask folder, so that all
-                # get one.
-                mask = np.ones(image.shape[:2]) if mask is None else mask
-                # Features reach past their center; a few pixels of margin keep the outline itself
-                # out.
-                inside = cv2.erode((mask > _MASK_KEEP).astype(np.uint8), np.ones((5, 5), np.uint8))
-                _write_png(base / "masks" / f"{name}.png", inside * 255)
-            names.append(name)
-            cameras.append(camera)
-        database = base / "database.db"
-        extract(
-            database,
-            base / "images",
-            names,
-            camera_model="PINHOLE",
-            shared_camera=False,
-            masks=base / "masks" if masked else None,
-            progress=progress,
-        )
-        reconstruction = _posed_model(database, names, cameras)
-        centers = np.stack([camera.center for camera in cameras])
-        axes = np.stack([camera.c2w[:3, 2] for camera in cameras])
-        pairs = [(names[i], names[j]) for i, j in nearby_pairs(centers, axes, _NEIGHBORS)]
-        match(database, pairs, seed=seed, progress=progress)
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = seed
-        with Bar("triangulation"):
-            result = pycolmap.triangulate_points(
-                reconstruction, database, base / "images", base / "model", options=options
-            )
-        entries = [result.points3D[key] for key in sorted(result.point3D_ids())]
-    points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(-1, 3) / np.float32(255)
-    keep = np.isfinite(points).all(axis=1)
-    return points[keep], colors[keep]
-
-
-def _posed_model(database: Path, names: list[str], cameras: list[Camera]) -> object:
-    """A reconstruction with the given poses, its numbers those of the database, whose intrinsics
-    are set too.
-    """
-    from drgs.data.native import pycolmap
-
-    reconstruction = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as handle:
-        images = {image.name: image for image in handle.read_all_images()}
-        for name, camera in zip(names, cameras, strict=True):
-            image_id, camera_id = images[name].image_id, images[name].camera_id
-            K = camera.K
-            known = pycolmap.Camera(
-                model="PINHOLE",
-                width=camera.width,
-                height=camera.height,
-                params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-                camera_id=camera_id,
-            )
-            known.has_prior_focal_length = True
-            handle.update_camera(known)
-            reconstruction.add_camera_with_trivial_rig(known)
-            pose = np.linalg.inv(camera.c2w)
-            reconstruction.add_image_with_trivial_frame(
-                pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id),
-                pycolmap.Rigid3d(pose[:3]),
-            )
-    return reconstruction
-
-
-def _write_png(path: Path, data: np.ndarray) -> None:
-    import cv2
-
-    if not cv2.imwrite(str(path), data, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"{path}: the temporary image must be writable, the write failed; free some disk space")
+    new = views[len(matches.pictures) :]
+    for done, view in enumerate(new):
+        if progress:
+            progress("features", done, len(new))
+        camera = view.camera.undistorted()
+        scale = min(1.0, _FEATURE_SIZE / max(camera.width, camera.height))
+        camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        mask = view.mask(camera.width, camera.height)
+        if mask is not None:
+            # Features reach past their center; a few pixels of margin keep the outline itself out.
+            mask = cv2.erode((mask > _MASK_KEEP).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        matches.pictures.append(detect(camera, view.image(camera.width, camera.height), mask))
+    if progress:
+        progress("features", len(new), len(new))
+    poses = np.stack([picture.camera.c2w for picture in matches.pictures])
+    matches.match(nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS), progress)
+    points, colors, _ = matches.triangulate()
+    return points, colors
 
 
 # -------------------------------------------------- random
@@ -364,17 +292,8 @@ def _random(views: list[View], count: int, rng: np.random.Generator) -> tuple[np
 
 
 def _focus_distance(cameras: list[Camera]) -> float:
-    """How far the cameras look: to the point nearest to all optical axes, if it lies before them,
-    else their extent.
-    """
-    centers = np.stack([camera.center for camera in cameras])
-    axes = np.stack([camera.c2w[:3, 2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(axis=0)
-    # Parallel axes have no such point: the system is singular.
-    if len(cameras) > 1 and np.linalg.cond(total) < 1e3:
-        focus = np.linalg.solve(total, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
-        depth = float(np.median(((focus - centers) * axes).sum(axis=1)))
-        if depth > 0:
-            return depth
+    """How far the cameras look: to the point that they look at, if there is one, else their extent."""
+    focus = Focus.of(cameras)
+    if focus is not None:
+        return float(np.median(np.linalg.norm(focus.eyes - focus.center, axis=1)))
     return scene_extent(cameras) * (1.0 if len(cameras) == 1 else 3.0)
