@@ -90,7 +90,7 @@ class Bar:
         if self.total and steps > 0 and self.done < self.total:
             each = (self._reached - self.began) / steps
             left = each * (self.total - self.done) - (now - self._reached)
-            parts += [f"about {left:.0f} s left"] if left > 0 else []
+            parts += [f"about {left:.0f} s left"] if left >= 1 else []
         return f"{self.label}: {', '.join(parts)}"
 
 

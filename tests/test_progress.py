@@ -42,8 +42,22 @@ def test_lines_of_steps(soon, capsys):
         bar.update(4)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "features: 0 of 4, 0 s"
-    assert any(line.startswith("features: 1 of 4, good, ") and line.endswith(" s left") for line in lines)
+    assert any(line.startswith("features: 1 of 4, good, ") for line in lines)
     assert lines[-1] == "features: 4 of 4, good, 0 s"
+
+
+def test_time_that_is_left(monkeypatch):
+    """Of the steps done so far, and less while the next one is being done; nothing once that is over."""
+    now = [100.0]
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    with Bar("features", 10, show=False, done=2) as bar:
+        now[0] = 106.0
+        bar.update(4)
+        assert bar.line() == "features: 4 of 10, 6 s, about 18 s left"
+        now[0] = 116.0
+        assert bar.line() == "features: 4 of 10, 16 s, about 8 s left"
+        now[0] = 130.0
+        assert bar.line() == "features: 4 of 10, 30 s"
 
 
 def test_short_stages_are_silent(monkeypatch, capsys):
