@@ -90,7 +90,7 @@ def test_first_lines():
     assert picture.stat().st_size < 300_000
     first = re.search(r"```\n(.*?)```", README, flags=re.S)
     assert [line.split()[:2] for line in first[1].splitlines()] == [["make", "demo"], ["make", "test"]]
-    assert README[: first.start()].count("\n") < 12
+    assert README[: first.start()].count("\n") < 15
     makefile = (ROOT / "Makefile").read_text()
     assert all(re.search(rf"^{name}:", makefile, flags=re.M) for name in ("demo", "test", "smoke"))
 
