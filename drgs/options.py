@@ -332,7 +332,7 @@ class Tradeoff(_Seen):
     """Budgets: one setting is recommended for each, the fastest whose errors are all below it."""
     repeats: int = 5
     """Interleaved rounds of timing."""
-    seconds: float = 120.0
+    seconds: float = 300.0
     """For timing the leading settings on views as large as they are drawn; less time, smaller views."""
     output: _Output = Path("out/tradeoff")
     """Folder for tradeoff.json, tradeoff.md and the plot."""

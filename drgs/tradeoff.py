@@ -286,6 +286,11 @@ def _full_lines(report: dict) -> list[str]:
     """Times at full size, one line a clock."""
     lines = []
     for clock, found in report["full"].items():
+        if not found["names"]:
+            lines.append(
+                f"{_title(clock)}: no time for larger views, what counts are those above; --seconds gives more"
+            )
+            continue
         rows = {row["name"]: row["full"].get(clock) for row in report["rows"]}
         exact = rows[found["names"][0]]
         others = [f"{name} {_span(rows[name])}" for name in found["names"][1:]]
@@ -303,7 +308,7 @@ def _full_table(report: dict) -> list[str]:
             times = next(row for row in report["rows"] if row["name"] == name)["full"][clock]
             cells = _title(clock), _size(found), str(found["rounds"]), name, f"{times['seconds']:.3g}", _span(times)
             lines.append("| " + " | ".join(cells) + " |")
-    return lines if report["full"] else []
+    return lines if len(lines) > 2 else []
 
 
 def _title(clock: str) -> str:

@@ -20,7 +20,6 @@ USES = {
 }
 """Use -> the time that counts, and the errors that must be within the budget."""
 
-_LEADERS = 2  # a budget whose times at full size are taken: the fastest ones at the reduced size
 _SURE = 0.05  # two-sided; of the interval, by the sign test
 
 
@@ -40,13 +39,12 @@ def interval(ratios: list[float]) -> dict | None:
 
 
 def leaders(measured: dict, clock: str, budgets) -> list[str]:
-    """Names of the rows that are worth timing at full size: the fastest within a budget, and preset `fast`."""
+    """Names of the rows that are worth timing at full size: the fastest within each budget, and preset `fast`."""
     names = []
     for use, (its, _) in USES.items():
         for budget in budgets if its == clock else ():
             rows = [row for row, _ in _within(measured, use, budget) if row["times"][clock]["ratio"] < 1]
-            rows.sort(key=lambda row: row["times"][clock]["ratio"])
-            names += [row["name"] for row in rows[:_LEADERS]]
+            names += [min(rows, key=lambda row: row["times"][clock]["ratio"])["name"]] if rows else []
     fast = [r["name"] for r in measured["rows"] if r["name"] == "fast" and r["skipped"] is None and r["times"][clock]]
     return list(dict.fromkeys([*fast, *names]))
 

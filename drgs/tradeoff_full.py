@@ -2,7 +2,8 @@
 
 Ratios change with the size of an image: what a setting does once a Gaussian weighs less in a large one. So the settings
 that lead at the reduced size are timed again on the cameras themselves, within a number of seconds that the user gives.
-Where three rounds of `exact` would take longer, views are reduced just so far that they do not, and the report says so.
+Where one round would take longer, views are reduced just so far that it does not, and the report says so. Where there
+is no time for three rounds, intervals are as wide as the scatter of equal work at the reduced size.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from drgs.tradeoff_measure import clocked, placed
 
 __all__ = ["measure_full"]
 
-_ROUNDS = 3  # at least
+_ROUNDS = 3  # that say how much times scatter
+_FORWARD = 0.6  # of the seconds are for images, which is what is drawn at full size
 _GROW = 4  # times as many pixels are tried next, on the way to full size
 
 
@@ -40,7 +42,8 @@ def measure_full(
         seed: Of the order within a round.
         say: Called with what is being timed, before each.
     Returns:
-        Clock -> `size` of the first view as it was timed, `drawn`, its own size, `rounds` and `names` of the rows.
+        Clock -> `size` of the first view as it was timed, None where there was no time; `drawn`, its own size;
+        `rounds` and `names` of the rows.
     """
     rows = {row["name"]: row for row in measured["rows"]}
     exact, order, report = measured["rows"][0], random.Random(seed), {}
@@ -49,14 +52,19 @@ def measure_full(
     chosen = {clock: names for clock, names in chosen.items() if names}
     for k, (clock, names) in enumerate(chosen.items()):
         work = _Work(clock, gaussians, seed)
-        share = seconds / (len(chosen) - k)
+        share = seconds * (_FORWARD if clock == "forward" and len(chosen) > 1 else 1 / (len(chosen) - k))
         # What a round takes, in units of exact's time: at full size the others take a smaller share of it, if any.
         units = 1 + sum(rows[name]["times"][clock]["ratio"] for name in names)
-        views, spent = _sized(work, cameras, exact, measured["pixels"], share / (_ROUNDS * units), say)
+        views, spent = _sized(work, cameras, exact, measured["pixels"], share, units, say)
+        if not views:
+            seconds = max(seconds - spent, 0.0)
+            drawn = [cameras[0].width, cameras[0].height]
+            report[clock] = {"size": None, "drawn": drawn, "rounds": 0, "names": []}
+            continue
         took: dict[str, list[float]] = {name: [] for name in (exact["name"], *names)}
         for number in range(max(repeats, _ROUNDS)):
             a_round = sum(x[-1] for x in took.values()) if number else 0.0
-            if number >= _ROUNDS and spent + a_round > share:
+            if number and spent + a_round > share:
                 break
             camera = views[number % len(views)]
             for name in (exact["name"], *order.sample(names, len(names))):
@@ -65,8 +73,12 @@ def measure_full(
                 spent += took[name][-1]
         seconds = max(seconds - spent, 0.0)
         for name, times in took.items():
-            ratios = [a / b for a, b in zip(times, took[exact["name"]], strict=True)]
-            rows[name]["full"][clock] = {**interval(ratios), "seconds": statistics.median(times)}
+            found = interval([a / b for a, b in zip(times, took[exact["name"]], strict=True)])
+            if found["rounds"] < _ROUNDS and name != exact["name"]:
+                scatter = measured["scatter"][clock]
+                found["low"] = min(found["low"], found["ratio"] * scatter["low"])
+                found["high"] = max(found["high"], found["ratio"] * scatter["high"])
+            rows[name]["full"][clock] = {**found, "seconds": statistics.median(times)}
         report[clock] = {
             "size": [views[0].width, views[0].height],
             "drawn": [cameras[0].width, cameras[0].height],
@@ -102,23 +114,26 @@ class _Work:
         return drgs.fisher.diagonal(self.gaussians, camera, settings)
 
 
-def _sized(work: _Work, cameras: list, exact: dict, pixels: float, allowed: float, say) -> tuple[list, float]:
-    """The cameras, reduced until one of `exact` takes no longer than allowed; and the seconds that finding out took.
+def _sized(work: _Work, cameras: list, exact: dict, pixels: float, seconds: float, units: float, say) -> tuple:
+    """The cameras, reduced until a round fits into the seconds, and how many of these finding out took.
 
-    Four times as many pixels are tried each time, so that nothing far too large is ever begun.
+    No cameras if a round fits at no more than the pixels that all rows were measured with already. Four times as many
+    pixels are tried each time, so that nothing far too large is ever begun.
     """
     whole, spent = max(camera.width * camera.height for camera in cameras), 0.0
+    least = pixels = min(pixels, whole)
     while True:
-        camera = at_most(cameras[0], int(min(pixels, whole)))
+        camera = at_most(cameras[0], int(pixels))
         say(_said(work.clock, camera, "exact"))
         took = work(camera, exact)
         spent += took
-        if pixels >= whole or took * _GROW > allowed:
+        # Time grows with the pixels at most. What is tried on the way is spent, too.
+        fits = pixels * (seconds - spent) / (units * took)
+        following = min(whole, _GROW * pixels)
+        if following * _GROW >= fits or following >= whole:
             break
-        pixels *= _GROW
-    # Time grows with the pixels at most.
-    pixels = min(whole, pixels * max(allowed / took, 1.0 if took <= allowed else 0.0))
-    return [at_most(camera, max(1, int(pixels))) for camera in cameras], spent
+        pixels = following
+    return [at_most(camera, int(min(whole, fits))) for camera in cameras if fits >= least], spent
 
 
 def _said(clock: str, camera, name: str) -> str:

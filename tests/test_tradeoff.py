@@ -227,11 +227,20 @@ def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     assert [(view["width"], view["height"]) for view in report["views"]] == [(20, 16)] * 2
     assert report["full"]["forward"]["size"] == report["full"]["forward"]["drawn"] == [80, 64]
 
-    monkeypatch.setattr("drgs.tradeoff_full.clocked", lambda work: (None, 100.0))  # seconds, whatever is done
-    found = measure_full(report, load_ply(place / "scene.ply"), large, BUDGETS, 1, 60.0, 0, lambda text: None)
-    assert found["forward"]["size"] < [20, 16]
-    assert found["forward"]["drawn"] == [80, 64]
-    assert tradeoff._size(found["forward"]).endswith("(of 80x64: --seconds)")
+    def timed(seconds):
+        monkeypatch.setattr("drgs.tradeoff_full.clocked", lambda work: (None, seconds))  # whatever is done
+        found = measure_full(report, load_ply(place / "scene.ply"), large, BUDGETS, 1, 60.0, 0, lambda text: None)
+        return found["forward"]
+
+    smaller = timed(8.0)
+    assert [20, 16] < smaller["size"] < smaller["drawn"] == [80, 64]
+    assert 1 <= smaller["rounds"] < 3
+    assert tradeoff._size(smaller).endswith("(of 80x64: --seconds)")
+    row = rows(report)["fast"]
+    scatter = report["scatter"]["forward"]
+    assert row["full"]["forward"]["low"] <= scatter["low"]  # a ratio of 1, as wide as equal work scatters
+    assert row["full"]["forward"]["high"] >= scatter["high"]
+    assert timed(100.0)["names"] == []
 
 
 def test_intervals_of_the_median():
