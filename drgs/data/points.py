@@ -15,6 +15,7 @@ from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
+from drgs.progress import Bar
 
 __all__ = ["initial_points", "read_point_ply", "scene_extent"]
 
@@ -245,7 +246,8 @@ def _triangulated(
         progress("features", len(new), len(new))
     poses = np.stack([picture.camera.c2w for picture in matches.pictures])
     matches.match(nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS), progress)
-    points, colors, _ = matches.triangulate()
+    with Bar("triangulation"):
+        points, colors, _ = matches.triangulate()
     return points, colors
 
 
