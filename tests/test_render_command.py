@@ -42,8 +42,15 @@ def camera():
 
 
 def _read_exr(path) -> dict[str, np.ndarray]:
-    mi = drgs.runtime.mitsuba()
-    bitmap = mi.Bitmap(str(path))
+    import drjit as dr
+
+    mi, threads = drgs.runtime.mitsuba(), dr.thread_count()
+    try:
+        # The decoder waits for the thread pool, with a pool of one for ever.
+        dr.set_thread_count(max(2, threads))
+        bitmap = mi.Bitmap(str(path))
+    finally:
+        dr.set_thread_count(threads)
     data = np.array(bitmap)
     return {field.name: data[..., i] for i, field in enumerate(bitmap.struct_())}
 
