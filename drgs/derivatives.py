@@ -165,7 +165,9 @@ class Tangent:
             live = active & (st["alive"] != 0)
             # The primal wrote what it decided: the weight is what T lost, and 0 where there was no hit.
             a0, depth0, ok = m.hit(loaded["record"], ray, live)
-            if m.s.stop != "after":
+            if m.s.max_hits:  # a ray's last hit counts, and ends it
+                ok &= new["count"] != st["count"]
+            elif m.s.stop != "after":
                 ok &= new["alive"] != 0
             T, w = st["T"], dr.select(ok, st["T"] * a0, 0)
             values0 = self.source.values(m, loaded, ray)

@@ -83,7 +83,6 @@ def diagonal(
         Group -> float64 tensor on the CPU.
     Raises:
         ValueError: If a method, group or weight is unknown or wrong, or a parameter is not finite.
-        NotImplementedError: For SH along each ray, by `exact` and `fisherrf` (use `columns` or `probes`).
     """
     check_scene("fisher.diagonal", gaussians, settings)
     settings = settings or RenderSettings.preset("exact")

@@ -84,10 +84,8 @@ GROUPS = {
     "sh": Group(
         shape=lambda g: tuple(g.sh.shape),
         entries=(GEOMETRY,),
-        collect=lambda sums, replay, weights: (
-            sums[:, :, None] * replay.squared_basis()[:, :, None] * (replay.unclamped() * weights)[:, None, :]
-        ),
-        spread=lambda values, replay: (replay.squared_basis()[:, :, None] * values).sum(1) * replay.unclamped(),
+        collect=lambda sums, replay, weights: replay.sh_information(sums) * weights,
+        spread=lambda values, replay: replay.sh_spread(values),
         input="sh",
     ),
     "features": Group(

@@ -14,6 +14,8 @@ notation of kernels.py, dC_c = T (c_c - B_c) da + w dc_c: channels are summed ov
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import drjit as dr
 
 from drgs import projection as layout
@@ -134,6 +136,26 @@ class _Geometry:
         return [*slopes, a * extra[_OPACITY]]
 
 
+class Row(NamedTuple):
+    """What a hit says about its Gaussian on one ray.
+
+    Attributes:
+        slopes: d a / d geometry; None without geometry.
+        g: Per channel, dC / da, 0 where the ray has no such hit; None without geometry.
+        w: Weight of the hit, 0 likewise.
+        turned: (channel, axis) w dc/dmu, or None where the color does not depend on the mean.
+        color: RGB of the Gaussian on this ray; None where no sink needs it.
+        basis: SH basis along the ray; empty where SH are evaluated towards the mean.
+    """
+
+    slopes: list | None
+    g: list | None
+    w: Any
+    turned: list | None
+    color: list | None
+    basis: list
+
+
 class Rows:
     """Replay of a primal pass that hands the Jacobian's rows of every hit to a sink.
 
@@ -147,6 +169,7 @@ class Rows:
     def __init__(self, model, source, buffer, sink, finals, color: bool):
         self.m, self.source, self.sink, self.finals = model, source, sink, finals
         self.geometry, self.color = buffer is not None and _Geometry(model, buffer), color
+        self.colors = buffer is not None or getattr(sink, "bands", 0) > 0
         self.pending = iter(finals)
 
     def init(self, alive, place) -> dict:
@@ -166,10 +189,9 @@ class Rows:
         m, t, rows, out = self.m, self.m.t, [], []
         D = t.Float64
         going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
-        record = self.source.load(t, index, rays[0], going, only="record")["record"]
+        loaded = self.source.load(t, index, rays[0], going, only=None if self.colors else "record")
+        record, hits = loaded["record"], t.Bool(False)
         extra = self.geometry.load(index, going) if self.geometry else None
-        first = layout.W_RGB if m.world else layout.RGB
-        color, hits = record[first : first + 3], t.Bool(False)
         for ray, st, final, place in zip(rays, states, self.finals, places, strict=True):
             a, _, ok = m.hit(record, ray, active & (st["alive"] != 0))
             T, left, new, at_end = st["T"], 1 - a, dict(st), ok
@@ -179,6 +201,7 @@ class Rows:
                 at_end = at_end & (p == q)
             new["alive"] = dr.select(at_end, 0, st["alive"])
             slopes = g = turned = None
+            color = self.source.values(m, loaded, ray) if self.colors else None
             if self.geometry:
                 rest = [r - D(w) * D(c) for r, c in zip(st["rest"], color, strict=True)]
                 new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
@@ -191,7 +214,7 @@ class Rows:
                 slopes = [dr.select(moves, x, 0) for x in self.geometry.slopes(record, extra, ray)]
                 if self.color:
                     turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
-            rows.append((slopes, g, w, turned))
+            rows.append(Row(slopes, g, w, turned, color, ray.lane[: ray.basis]))
             hits |= ok
             out.append(new)
         return self.sink.take(t, index, hits, rows, out)
@@ -204,19 +227,20 @@ def _entry(slopes, g, turned, j, c):
 
 
 class Diagonal:
-    """Sums of squares into a buffer of WIDTH floats a Gaussian: geometry, then sum w^2.
+    """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, then by band and channel.
 
     Args:
         weights: Of the channels.
-        groups: Entries that are wanted.
+        entries: Those that are wanted.
+        bands: SH coefficients whose sums (w Y_k)^2 over the rays where a channel is not clamped are wanted as well:
+            where SH are evaluated along each ray, they are no multiple of sum w^2.
         summed: Sum the channels before squaring, as FisherRF does.
     """
 
-    WIDTH = GEOMETRY + 1
-
-    def __init__(self, t, count: int, weights, entries, mode, summed: bool = False):
-        self.buffer = dr.zeros(t.Float, count * self.WIDTH)
-        self.weights, self.entries, self.mode, self.summed = weights, entries, mode, summed
+    def __init__(self, t, count: int, weights, entries, mode, bands: int = 0, summed: bool = False):
+        self.width = GEOMETRY + 1 + 3 * bands
+        self.buffer = dr.zeros(t.Float, count * self.width)
+        self.weights, self.entries, self.mode, self.bands, self.summed = weights, entries, mode, bands, summed
 
     def init(self) -> dict:
         """Nothing is kept per ray."""
@@ -226,17 +250,23 @@ class Diagonal:
         """Add a hit's rows."""
         for k in self.entries:
             total = t.Float(0)
-            for slopes, g, w, turned in rows:
+            for row in rows:
                 if k == GEOMETRY:
-                    total = dr.fma(w, w, total)
+                    total = dr.fma(row.w, row.w, total)
                 else:
-                    total += squares(slopes, g, turned, k, self.weights, self.summed)
-            dr.scatter_add(self.buffer, total, index * self.WIDTH + k, hits, mode=self.mode)
+                    total += squares(row, k, self.weights, self.summed)
+            dr.scatter_add(self.buffer, total, index * self.width + k, hits, mode=self.mode)
+        for k in range(self.bands):
+            for c in range(3):
+                slopes = [dr.select(row.color[c] > 0, row.w * row.basis[k], 0) for row in rows]
+                at = index * self.width + (GEOMETRY + 1 + 3 * k + c)
+                dr.scatter_add(self.buffer, sum(x * x for x in slopes), at, hits, mode=self.mode)
         return states
 
 
-def squares(slopes, g, turned, j, weights, summed=False):
+def squares(row: Row, j: int, weights, summed=False):
     """sum_c weight_c (dC_c / d(geometry j))^2."""
+    slopes, g, turned = row.slopes, row.g, row.turned
     if summed:
         value = sum(_entry(slopes, g, turned, j, c) for c in range(3))
         return value * value
@@ -252,10 +282,9 @@ class Blocks:
     SIZE = GEOMETRY + 3
     WIDTH = SIZE * (SIZE + 1) // 2
 
-    def __init__(self, t, count: int, weights, mode, lit):
-        """`lit`: per channel, d color / d sh_0 of a Gaussian: 0 where it is clamped."""
+    def __init__(self, t, count: int, weights, mode):
         self.buffer = dr.zeros(t.Float, count * self.WIDTH)
-        self.weights, self.mode, self.lit = weights, mode, lit
+        self.weights, self.mode = weights, mode
 
     def init(self) -> dict:
         """Nothing is kept per ray."""
@@ -263,18 +292,19 @@ class Blocks:
 
     def take(self, t, index, hits, rows, states):
         """Add a hit's rows."""
-        lit = [dr.gather(t.Float, x, index, hits) for x in self.lit]
         full = []
-        for slopes, g, w, turned in rows:
+        for row in rows:
             for c in range(3):
-                row = [_entry(slopes, g, turned, j, c) for j in range(GEOMETRY)]
-                full.append((self.weights[c], [*row, *(w * lit[c] if k == c else None for k in range(3))]))
+                entries = [_entry(row.slopes, row.g, row.turned, j, c) for j in range(GEOMETRY)]
+                # d color / d sh_0, 0 where the color is clamped.
+                lit = dr.select(row.color[c] > 0, row.w * float(layout._SH[0]), 0)
+                full.append((self.weights[c], [*entries, *(lit if k == c else None for k in range(3))]))
         for i in range(self.SIZE):
             for j in range(i + 1):
                 total = t.Float(0)
-                for weight, row in full:
-                    if row[i] is not None and row[j] is not None:
-                        total = dr.fma(weight * row[i], row[j], total)
+                for weight, entries in full:
+                    if entries[i] is not None and entries[j] is not None:
+                        total = dr.fma(weight * entries[i], entries[j], total)
                 at = index * self.WIDTH + (i * (i + 1) // 2 + j)
                 dr.scatter_add(self.buffer, total, at, hits, mode=self.mode)
         return states
@@ -286,10 +316,11 @@ class Variance:
     Args:
         buffer: 16 floats a Gaussian: the weights of the geometry, then of w^2 in each channel.
         weights: Of the channels.
+        light: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
     """
 
-    def __init__(self, buffer, weights):
-        self.buffer, self.weights = buffer, weights
+    def __init__(self, buffer, weights, light=None):
+        self.buffer, self.weights, self.light = buffer, weights, light
 
     def init(self) -> dict:
         """The sum along a ray."""
@@ -299,9 +330,17 @@ class Variance:
         """Add a hit's rows to their rays."""
         v = list(dr.gather(t.ArrayXf, self.buffer, index, hits, shape=(16, dr.width(index))))
         out = []
-        for (slopes, g, w, turned), state in zip(rows, states, strict=True):
-            total = sum(v[j] * squares(slopes, g, turned, j, self.weights) for j in range(GEOMETRY))
-            total += w * w * sum(v[GEOMETRY + c] * self.weights[c] for c in range(3))
+        light = []
+        if self.light is not None:
+            K = len(rows[0].basis)
+            light = [dr.gather(t.Float, self.light, index * (3 * K) + k, hits) for k in range(3 * K)]
+        for row, state in zip(rows, states, strict=True):
+            total = sum(v[j] * squares(row, j, self.weights) for j in range(GEOMETRY))
+            shares = [v[GEOMETRY + c] for c in range(3)]
+            for k, weight in enumerate(light):
+                band, c = row.basis[k // 3], k % 3
+                shares[c] = shares[c] + dr.select(row.color[c] > 0, band * band * weight, 0)
+            total += row.w * row.w * sum(x * weight for x, weight in zip(shares, self.weights, strict=True))
             new = dict(state)
             new["variance"] = state["variance"] + total
             out.append(new)

@@ -46,6 +46,7 @@ class Model:
         self.alpha_min = dr.opaque(t.Float, settings.alpha_min)
         self.alpha_max = dr.opaque(t.Float, settings.alpha_max)
         self.stop_at = dr.opaque(t.Float, settings.transmittance_min)
+        self.max_hits = dr.opaque(t.UInt32, settings.max_hits or 0)
         self.background = [dr.opaque(t.Float, b) for b in settings.background]
 
     def slots(self, depth: bool) -> list[int]:
@@ -240,7 +241,7 @@ class Primal:
         for name in ("depth", "median"):
             if name in self.want:
                 state[name] = Sum(0) if name == "depth" else t.Float(0)
-        if "count" in self.want:
+        if "count" in self.want or self.m.s.max_hits:
             state["count"] = t.UInt32(0)
         if "replay" in self.want:
             state["place"] = [type(x)(x) for x in place]
@@ -272,6 +273,8 @@ class Primal:
                 new["median"] = dr.select(ok & (T > 0.5) & (rest <= 0.5), depth, st["median"])
             if "count" in st:
                 new["count"] = st["count"] + dr.select(ok, m.t.UInt32(1), 0)
+                if m.s.max_hits:
+                    new["alive"] = dr.select(new["count"] >= m.max_hits, 0, new["alive"])
             if "place" in st:
                 new["place"] = [dr.select(ok, p, q) for p, q in zip(place, st["place"], strict=True)]
             if self.visibility is not None:

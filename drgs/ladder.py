@@ -37,7 +37,7 @@ __all__ = ["GROUPS", "RUNGS", "Pictures", "ladder", "sequences", "table"]
 RUNGS = {
     "float32": (),
     "alpha cut-offs": ("alpha_min", "alpha_max", "alpha_max_gradient"),
-    "early stop": ("transmittance_min", "stop"),
+    "early stop": ("transmittance_min", "stop", "max_hits"),
     "near plane": ("near",),
     "culling": ("culling", "extent"),
     "dilation": ("dilation",),

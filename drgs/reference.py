@@ -276,7 +276,9 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
     stops = tested < s.transmittance_min
     if s.stop == "before_eq":
         stops = tested <= s.transmittance_min
-    alive = exists & ~stops
+    alive, rank = exists & ~stops, exists.cumsum(dim=1)
+    if s.max_hits:
+        alive &= rank <= s.max_hits
     w = torch.where(alive, a * before, 0.0)
     half = alive & (after <= 0.5) & (before > 0.5)
     weights = torch.zeros_like(w).scatter(1, order, w)  # back in the caller's order
@@ -297,6 +299,8 @@ def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, toleran
         doubt |= alive & ((after - 0.5).abs() <= slack * after)
         if s.alpha_max < 1:
             doubt |= matters & (to_max <= tolerance)
+        if s.max_hits:  # a hit more or less in front decides which one is the last
+            doubt |= (rank[:, -1:] >= s.max_hits) & candidate & (rank <= s.max_hits) & (margin.abs() <= tolerance)
         # The previous hit that matters; equal keys are safe, the index decides in any precision.
         last, place = torch.where(matters, key, -math.inf).cummax(dim=1)
         place = _previous(place, 0)

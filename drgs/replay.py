@@ -13,7 +13,7 @@ import drjit as dr  # isort: skip  (after the scene, which chooses libLLVM)
 from drgs import projection  # noqa: E402
 from drgs.composite import Composite  # noqa: E402
 from drgs.groups import GROUPS, Information  # noqa: E402
-from drgs.jacobian import Blocks, Diagonal, Rows, Variance, extras  # noqa: E402
+from drgs.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras  # noqa: E402
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -27,10 +27,6 @@ class Replay:
     """A view rendered once, to be replayed for information."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True):
-        if geometry and settings.sh_direction == "ray":
-            raise NotImplementedError(
-                "fisher: sh_direction must be 'gaussian' here, got 'ray'; use method 'columns' or 'probes'"
-            )
         self.scene = scene = Scene(gaussians.detach().replace(features=None), camera, settings, frozenset())
         self.t, self.settings, self.count = scene.t, settings, len(gaussians)
         t = self.t
@@ -40,13 +36,17 @@ class Replay:
         with dr.suspend_grad():
             self.operation.eval(*arguments[:-1], True)
         p = {name: x.array for name, x in self.inputs.items()}
-        self.color, self.extras = False, None
+        self.along_ray = settings.sh_direction == "ray"
+        self.color, self.extras, self.light = False, None, None
         if not geometry:
             return
-        self.lit, self.basis, moved_color = self._colors(p)
+        moved_color = None
+        if not self.along_ray:  # there colors do not depend on the mean, but on the pixel
+            self.lit, self.basis, moved_color = self._colors(p)
+            dr.eval(self.lit, self.basis)
         self.color = moved_color is not None
         self.extras = extras(t, settings, p, view.projected, self._moved_records(), moved_color)
-        dr.eval(self.extras, self.lit, self.basis)
+        dr.eval(self.extras)
 
     def _colors(self, p):
         """Per channel where the color is not clamped, the SH basis, and dc/dmu (None for degree 0)."""
@@ -113,12 +113,15 @@ class Replay:
                 yield part, part.run(rows), sink
 
     def sums(self, entries, weights, summed: bool = False) -> torch.Tensor:
-        """(N, 11) float64: squares of the geometry, and sum w^2."""
-        total = torch.zeros(self.count, Diagonal.WIDTH, dtype=torch.float64)
-        for _, states, sink in self._run(lambda mode: Diagonal(self.t, self.count, weights, entries, mode, summed)):
+        """(N, 11) float64: squares of the geometry, and sum w^2; those of SH along each ray are kept in `light`."""
+        bands = self.scene.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
+        total = torch.zeros(self.count, GEOMETRY + 1 + 3 * bands, dtype=torch.float64)
+        made = lambda mode: Diagonal(self.t, self.count, weights, entries, mode, bands, summed)  # noqa: E731
+        for _, states, sink in self._run(made):
             dr.eval(states, sink.buffer)
             total += _torch(sink.buffer).reshape(total.shape)
-        return total
+        self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
+        return total[:, : GEOMETRY + 1]
 
     def diagonal(self, groups: dict, weights, fisherrf: bool) -> Information:
         """`fisher.diagonal` of one view."""
@@ -134,10 +137,8 @@ class Replay:
     def blocks(self, weights) -> torch.Tensor:
         """`blocks` of one view."""
         t, size = self.t, Blocks.SIZE
-        lit = [x * float(projection._SH[0]) for x in self.lit]
-        dr.eval(lit)
         total = torch.zeros(self.count, Blocks.WIDTH, dtype=torch.float64)
-        for _, states, sink in self._run(lambda mode: Blocks(t, self.count, weights, mode, lit)):
+        for _, states, sink in self._run(lambda mode: Blocks(t, self.count, weights, mode)):
             dr.eval(states, sink.buffer)
             total += _torch(sink.buffer).reshape(total.shape)
         row, column = torch.tril_indices(size, size)
@@ -160,19 +161,31 @@ class Replay:
             raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
         buffer = to_drjit(t, table.float().reshape(-1).to(self.scene.home)).array
         image = dr.zeros(t.Float, camera.width * camera.height)
-        for part, states, _ in self._run(lambda mode: Variance(buffer, weights)):
+        light = None if self.light is None else to_drjit(t, self.light.float().reshape(-1).to(self.scene.home)).array
+        for part, states, _ in self._run(lambda mode: Variance(buffer, weights, light)):
             for state, at, inside in zip(states, part.flat, part.inside, strict=True):
                 dr.scatter(image, state["variance"], at, inside)
         dr.eval(image)
         return image.torch().cpu().reshape(camera.height, camera.width)
 
-    def squared_basis(self) -> torch.Tensor:
-        """(N, K) squares of the SH basis towards the Gaussians."""
-        return torch.stack([_torch(x) for x in self.basis], 1).square()
+    def sh_information(self, squares: torch.Tensor) -> torch.Tensor:
+        """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2; call after `sums`."""
+        if self.along_ray:
+            return self.light
+        basis, lit = self._squared_basis()
+        return squares[:, :, None] * basis[:, :, None] * lit[:, None, :]
 
-    def unclamped(self) -> torch.Tensor:
-        """(N, 3) 1 where a color channel is above 0, else 0."""
-        return torch.stack([_torch(x) for x in self.lit], 1)
+    def sh_spread(self, weights: torch.Tensor) -> torch.Tensor:
+        """(N, 3) weights of w^2 in each channel, from (N, K, 3) of SH; along rays they stay with the pixel."""
+        if self.along_ray:
+            self.light = weights
+            return torch.zeros(self.count, 3, dtype=torch.float64)
+        basis, lit = self._squared_basis()
+        return (basis[:, :, None] * weights).sum(1) * lit
+
+    def _squared_basis(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(N, K) squares of the SH basis towards the Gaussians, and (N, 3) 1 where a channel is above 0, else 0."""
+        return torch.stack([_torch(x) for x in self.basis], 1).square(), torch.stack([_torch(x) for x in self.lit], 1)
 
 
 def by_probes(gaussians, camera, settings, groups: dict, weights, probes: int, seed: int) -> Information:

@@ -33,6 +33,7 @@ _RANGES = {
     "transmittance_min": (0.0, 1.0),
     "dilation": (0.0, 1e3),
     "near": (0.0, 1e30),  # float32 holds it
+    "max_hits": (1, 1 << 30),
     "background": (-1e30, 1e30),
 }
 
@@ -56,6 +57,7 @@ class RenderSettings:
         transmittance_min: A ray ends once T falls below it; see `stop`.
         stop: `after` composites the hit, then tests T; `before` tests T (1 - a) < transmittance_min and drops the hit
             (INRIA), `before_eq` the same with <= (gsplat).
+        max_hits: A ray ends behind so many hits, whatever is left of T; None is no limit.
         dilation: Added to the diagonal of the projected covariance, in px^2 (`ewa` only).
         near: Gaussians whose mean has camera z <= near are left out; 0 leaves none out.
         fov_clamp: Clamp of x/z and y/z in the `ewa` Jacobian: `none`, `inria` (symmetric) or `gsplat` (off-center).
@@ -75,6 +77,7 @@ class RenderSettings:
     alpha_max_gradient: str = "zero"
     transmittance_min: float = 1e-10
     stop: str = "after"
+    max_hits: int | None = None
     dilation: float = 0.0
     near: float = 0.0
     fov_clamp: str = "none"
@@ -96,9 +99,9 @@ class RenderSettings:
         """Settings of a named system.
 
         `exact` is the claim of this package: within 1e-5 of the float64 oracle. `fast` has the cut-offs of Mitsuba's
-        `volprim_rf_basic` and is the default for training; `mitsuba` is the same on its acceleration structure and in
-        its order. `inria` and `gsplat` are those rasterizers' models, constant by constant (docs/conventions.md lists
-        each one's source line).
+        `volprim_rf_basic` and is the default for training; `mitsuba` is that integrator's model: its acceleration
+        structure, order of entry points, SH along each ray, 64 hits a ray, without the hits that it loses. `inria` and
+        `gsplat` are those rasterizers' models. docs/conventions.md lists the source of every constant.
 
         Args:
             name: One of `PRESETS`.
@@ -115,6 +118,8 @@ class RenderSettings:
                 "extent": 3.0,
                 "transmittance_min": 0.01,
                 "alpha_max": 0.9999,
+                "max_hits": 64,
+                "sh_direction": "ray",
             },
             "inria": {
                 "response": "ewa",

@@ -113,7 +113,7 @@ VARIANTS = (
     *_rows("approximation", "fast", "alpha_max", 1.0),
     *_rows("approximation", "fast", "transmittance_min", 1e-4, 1e-3),
     *_rows("model", "fast", "response", "integral"),
-    Variant("approximation", "mitsuba"),
+    Variant("model", "mitsuba"),
     Variant("model", "inria"),
     Variant("model", "gsplat"),
     *(Variant("resolution", preset, share=share) for preset in ("exact", "fast") for share in (0.5, 0.25)),

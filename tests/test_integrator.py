@@ -49,11 +49,11 @@ KINDS = {
     ),
     ("peak", "ray"): (
         ((24, 22), 25, 9, 0, {"background": (0.2, 0.5, 0.9)}),
-        ((9, 7), 15, 4, 5, {"sh_direction": "ray", "extent": 4.0}),
+        ((9, 7), 15, 4, 5, {"sh_direction": "ray", "extent": 4.0, "max_hits": 4}),
     ),
     ("peak", "entry"): (
         ((9, 7), 20, 1, 1, {"transmittance_min": 1e-4}),
-        ((13, 8), 12, 4, 0, {**CUTS, "sh_direction": "ray"}),
+        ((13, 8), 12, 4, 0, {**CUTS, "sh_direction": "ray", "max_hits": 3}),
     ),
     ("integral", "center"): (
         ((13, 8), 15, 4, 1, {"sh_direction": "ray", "depth_key": "z"}),
@@ -69,7 +69,7 @@ KINDS = {
     ),
     ("ewa", "center"): (
         ((24, 22), 25, 1, 5, {"dilation": 0.3, "sh_direction": "ray"}),
-        ((9, 7), 15, 16, 0, {**CUTS, "fov_clamp": "gsplat", "depth_key": "z", "stop": "before_eq"}),
+        ((9, 7), 15, 16, 0, {**CUTS, "fov_clamp": "gsplat", "depth_key": "z", "stop": "before_eq", "max_hits": 3}),
     ),
 }
 SCENES = 15  # of each kind: 7 x 2 x 15 = 210
@@ -163,6 +163,44 @@ def test_far(rng, response, ratio):
         oracle = Oracle(g, cam, settings, rng, 1e-6, colors, skip=count != oracle.out.count)
         check(compare(g, cam, world, oracle), max(IMAGE, bound), max(GRADIENT, 4 * bound))
     assert np.mean(lost) < 0.01
+
+
+def test_images_jump_where_gaussians_change_places():
+    """Two spheres, one behind the other: as their order turns around the pixel jumps, and no derivative tells of it.
+
+    The gradient is that of either side, where differences agree with it; across, they grow as 1 / step. The oracle
+    marks the pixel.
+    """
+    colors = torch.tensor([[[0.95, 0.05, 0.2]], [[0.05, 0.05, 0.95]]]) - 0.5
+    cam = Camera(K=np.array([[8.0, 0, 0.5], [0, 8.0, 0.5], [0, 0, 1]]), w2c=np.eye(4), width=1, height=1)
+
+    def at(offset, grad=False):
+        means = torch.tensor([[0.05, 0.0, 4.0 + offset], [0.0, 0.05, 4.0]], dtype=torch.float64, requires_grad=grad)
+        return Gaussians(
+            means=means,
+            quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+            log_scales=torch.full((2, 3), math.log(0.3)),
+            logit_opacities=torch.full((2,), 0.8),
+            sh=colors / math.sqrt(1 / (4 * math.pi)),
+        )
+
+    def red(offset):
+        return float(render(at(offset), cam, outputs=()).rgb[0, 0, 0])
+
+    front, behind = red(-1e-3), red(1e-3)
+    assert front - behind > 0.3
+    for eps in (1e-1, 1e-2, 1e-4):
+        across = (red(-eps) - red(eps)) / (2 * eps)
+        assert across == pytest.approx((front - behind) / (2 * eps), rel=0.05)
+    for offset in (-0.1, 0.1):
+        g = at(offset, True)
+        render(g, cam, outputs=()).rgb[0, 0, 0].backward()
+        slope = (red(offset + 0.03) - red(offset - 0.03)) / 0.06
+        assert abs(float(g.means.grad[0, 2])) < 0.1
+        assert float(g.means.grad[0, 2]) == pytest.approx(slope, abs=1e-4)  # float32 images, 6e-8 / 0.06, and curvature
+    settings = RenderSettings.preset("exact")
+    assert bool(reference.render(at(1e-6), cam, settings).ambiguous.all())
+    assert not bool(reference.render(at(1e-2), cam, settings).ambiguous.any())
 
 
 def test_deep_stacks(rng):

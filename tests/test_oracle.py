@@ -33,7 +33,7 @@ SETTINGS = {
     "peak ray": {"order": "ray", "background": (0.1, 0.9, 0.3)},
     "peak center": {"extent": 3.0, "sh_direction": "ray"},
     "peak center z, cut": {**CUTS, "depth_key": "z", "stop": "before"},
-    "peak entry": {"order": "entry", "extent": 3.0, "traversal": "bvh"},
+    "peak entry": {"order": "entry", "extent": 3.0, "traversal": "bvh", "max_hits": 2},
     "integral ray": {"response": "integral", "order": "ray", "sh_direction": "ray"},
     "integral center, cut": {**CUTS, "response": "integral"},
     "ewa": {"response": "ewa", "dilation": 0.3},
@@ -123,6 +123,8 @@ def naive(p: dict, K, w2c, size, s: RenderSettings, pixel_to_plane=None) -> dict
                 if T > 0.5 >= T * (1 - a):
                     out["median_depth"][row, column] = t
                 T *= 1 - a
+                if out["count"][row, column] == s.max_hits:
+                    break
             out["rgb"][row, column] += T * np.array(s.background)
             out["depth"][row, column] /= max(out["alpha"][row, column], 1e-10)
     return out
@@ -178,7 +180,9 @@ def lens(rng, size) -> np.ndarray:
     """(3, 3) K with nothing left at its default: fx, fy, skew, a principal point outside of the middle."""
     f = size[0] * rng.uniform(0.8, 1.2)
     cx, cy = size * rng.uniform(0.1, 0.9, 2)
-    return np.array([[f, f * rng.uniform(-0.4, 0.4), cx], [0, f * rng.uniform(0.7, 1.4), cy], [0, 0, 1]])
+    return np.array(
+        [[f, f * rng.choice([-1, 1]) * rng.uniform(0.2, 0.4), cx], [0, f * rng.uniform(0.7, 1.4), cy], [0, 0, 1]]
+    )
 
 
 def parameters(rng, n=6) -> dict:
@@ -220,7 +224,7 @@ def test_images(rng, fields):
         # Without the skew it is another picture, or this would not show that it is read.
         straight = np.where([[True, False, True]] + [[True] * 3] * 2, K, 0.0)
         assert abs(naive(p, straight, w2c, SIZE, s)["rgb"] - want["rgb"]).max() > 1e-3
-    assert seen > 50
+    assert seen > 20
 
 
 @pytest.mark.parametrize("fields", SETTINGS.values(), ids=SETTINGS)

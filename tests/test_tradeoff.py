@@ -74,7 +74,7 @@ def test_rows_are_complete(report):
         assert row["ratio"]["forward_backward"] > 0
         assert (row["information"] is None) == ("information" in row["notes"])
     without = {row["name"] for row in report["rows"] if row["by"] == "view" and row["information"] is None}
-    assert without == {"sh_direction=ray"}
+    assert without == set()
     assert all(row["information"] is None for row in report["rows"] if row["by"] != "view")
 
 
