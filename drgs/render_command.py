@@ -313,12 +313,12 @@ def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tupl
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     pixels = largest.width * largest.height
     pictures_need = max(memory.PICTURES[name] for name in formats)
-    size = f"view {largest.name!r} of {largest.width}x{largest.height} pixels"
+    where, what = f"view {largest.name!r}", f"its {largest.width}x{largest.height} pixels"
     needed = memory.frame_bytes(pixels, settings)
     if runtime.backend().name == "cuda":
-        memory.require("render", needed, size, "lower --width or --height", cuda=True)
+        memory.require(where, needed, what, "lower --width or --height", cuda=True)
         needed = 0
-    memory.require("render", needed + pictures_need * pixels, size, "lower --width or --height")
+    memory.require(where, needed + pictures_need * pixels, what, "lower --width or --height")
 
 
 # ----------------------------------------------------------------------------------------- outputs

@@ -82,24 +82,25 @@ def test_address_space_counts(tmp_path):
 
 
 def test_frames_take_what_is_said(gaussians):
-    """The estimate is no loose one: a frame of 1448^2 pixels grows a process by 0.8 to 2 times it (measured: 0.9).
+    """The estimate is a bound, and no loose one: a frame of 1448^2 pixels grows a process by 0.9 to 1.6 times it.
 
-    Part of the frame goes to pages that the process held before, hence not 1.
+    (Part of the frame may go to pages that the process held before, hence not 1. Measured: 0.94.)
     """
     code = (
         "import sys, drgs, torch; from drgs.cameras import orbit\n"
         "g = drgs.Gaussians.from_arrays(torch.zeros(1, 3), torch.eye(4)[:1], torch.ones(1, 3), torch.ones(1) / 2,"
         " torch.zeros(1, 3))\n"
-        "def peak(): return next(int(x.split()[1]) for x in open('/proc/self/status') if x.startswith('VmPeak'))\n"
+        "def peak(): return next(int(x.split()[1]) for x in open('/proc/self/status') if x.startswith('VmHWM'))\n"
         "settings = drgs.RenderSettings.preset('fast')\n"
         "render = lambda side: drgs.render(g, orbit((0, 0, 0), 9.0, 1, width=side, height=side)[0], settings)\n"
         "out = render(64); before = peak(); out = render(1448); print(1024 * (peak() - before))"
     )
     if not os.path.exists("/proc/self/status"):
         pytest.skip("no /proc to read the peak from")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    environ = {**os.environ, "DRGS_THREADS": "1"}  # each thread has buffers of its own
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environ)
     estimate = memory.frame_bytes(1448**2, TILES)
-    assert 0.8 < int(done.stdout) / estimate < 2
+    assert 0.9 < int(done.stdout) / estimate < 1.6
 
 
 def test_render_refuses_what_does_not_fit(gaussians, one_gigabyte):
@@ -120,11 +121,11 @@ def test_tile_lists_that_do_not_fit(gaussians, monkeypatch):
     """Many wide Gaussians on an image that would fit by itself: counted before they are listed."""
     monkeypatch.setattr(memory, "_SMALL", 0)
     monkeypatch.setattr(memory, "_OTHER", 0)
-    monkeypatch.setattr(memory, "available", lambda: 68 * 64 * 64 + 1)
+    monkeypatch.setattr(memory, "available", lambda: memory.frame_bytes(64 * 64, TILES) + 1)
     wide = gaussians.replace(log_scales=gaussians.log_scales + 4).take(torch.arange(400) % 20)
     with pytest.raises(ValueError, match=r"entries of tile lists \(400 Gaussians, 64x64 pixels\).*; lower extent"):
         drgs.render(wide, camera(64), TILES)
-    monkeypatch.setattr(memory, "available", lambda: 113 * 64 * 64 + 1)
+    monkeypatch.setattr(memory, "available", lambda: memory.frame_bytes(64 * 64, TILES, gradients=True) + 1)
     with pytest.raises(ValueError, match="entries of tile lists"):
         drgs.render(wide.replace(means=wide.means.clone().requires_grad_()), camera(64), TILES)
 
@@ -175,5 +176,5 @@ def test_ulimit_is_an_error_and_no_crash(gaussians, tmp_path):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (6_000_000 << 10, 6_000_000 << 10)),
     )
     assert done.returncode == 2, done.stderr
-    assert "there must be memory for view" in done.stderr
+    assert "view 'orbit_0000': there must be memory for its 16384x16384 pixels" in done.stderr
     assert done.stderr.count("\n") == 1
