@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -126,7 +128,9 @@ def test_triangulates_with_the_given_poses(tmp_path, rng):
 
 
 def test_triangulates_views_far_apart(tmp_path, rng):
-    """Two views 70 degrees apart: known poses say where to look for each feature's partner."""
+    """Two views 70 degrees apart: known poses say where to look for each feature's partner; random points where both
+    look make up for the few that there are.
+    """
     image, views = texture(rng), []
     for index, angle in enumerate(np.radians([-35.0, 35.0])):
         w2c = look_at((4 * np.sin(angle), -0.6, 4 * np.cos(angle)), (0, 0, 0), (0, 1, 0))
@@ -135,9 +139,17 @@ def test_triangulates_views_far_apart(tmp_path, rng):
         color, _ = render_plane(camera, image)
         assert cv2.imwrite(str(views[-1].image_path), np.round(color[..., ::-1] * 255).astype(np.uint8))
     points, _, source = initial_points(views)
-    assert source.startswith("triangulated from 2 given poses")
-    assert len(points) > 200
-    assert on_plane(points) > 0.9
+    found, random = re.fullmatch(
+        r"triangulated from 2 given poses, (\d+) points, and (\d+) random where they look", source
+    ).groups()
+    assert int(found) > 200
+    assert on_plane(points[: int(found)]) > 0.9
+    assert len(points) == int(found) + int(random) == 2000
+    for view in views:
+        pixels, depth = view.camera.project(points)
+        assert ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all()
+        assert (depth > 0).all()
+    assert len(initial_points(views, max_points=100)[0]) == 100
 
 
 def test_one_view_more_costs_its_own_pairs(tmp_path, rng):

@@ -21,6 +21,7 @@ __all__ = ["initial_points", "read_point_ply", "scene_extent"]
 
 _EXTENT_MARGIN = 1.1
 _MIN_TRIANGULATED = 50
+_ENOUGH = 2_000  # triangulated points that need no random ones beside them
 _MAX_RANDOM = 20_000
 _NEIGHBORS = 10
 _FEATURE_SIZE = 1600
@@ -98,7 +99,14 @@ def initial_points(
         if len(points) >= _MIN_TRIANGULATED:
             keep = _subset(len(points), max_points, rng)
             source = f"triangulated from {len(views)} given poses, {len(points)} points"
-            return points[keep], colors[keep], source
+            points, colors = points[keep], colors[keep]
+            missing = min(max_points, _ENOUGH) - len(points)
+            if missing > 0:
+                # What no two views show would stay empty: density control does not leave what there is.
+                more, more_colors = _random(views, missing, rng)
+                points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+                source += f", and {len(more)} random where they look"
+            return points, colors, source
         tried = f" (triangulation gave {len(points)})"
     points, colors = _random(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
@@ -255,8 +263,8 @@ def _triangulated(
 
 
 def _random(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points along random pixels' rays, kept where at least half as many cameras look as look at
-    the best point.
+    """Points along random pixels' rays, kept where at least half as many cameras look as look at the best point, and
+    two if two look anywhere.
     """
     cameras = [view.camera.undistorted() for view in views]
     distance = _focus_distance(cameras)
@@ -288,7 +296,7 @@ def _random(views: list[View], count: int, rng: np.random.Generator) -> tuple[np
             columns, rows = pixels[inside].astype(np.int64).T
             inside[inside] = mask[rows, columns] > _MASK_KEEP
         seen += inside
-    candidates = np.flatnonzero(2 * seen >= seen.max())
+    candidates = np.flatnonzero(seen >= max(seen.max() / 2, min(2, seen.max())))
     keep = candidates[_subset(len(candidates), count, rng)]
     return points[keep], colors[keep]
 
