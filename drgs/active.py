@@ -44,7 +44,6 @@ PICK_POINTS = ("auto", "uncovered", "none")
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
-_ALL = 1_000_000  # points of all seen views, before those where there is nothing yet are chosen
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 
 
@@ -62,9 +61,10 @@ class ActiveConfig:
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
         prior: lambda, the prior precision of every parameter.
         relative_prior: lambda is `prior` times the median of the group's positive information.
-        pick_points: `uncovered`: a picked view brings points of its own where the Gaussians are transparent in it, for
-            density control never leaves what it has covered; the budget is divided evenly among the views. `none`: no
-            points after the start [1]. `auto`: `none` with initial points of the whole data set, else `uncovered`.
+        pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
+            Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
+            evenly among the views. `none`: no points after the start [1]. `auto`: `none` with initial points of the
+            whole data set, else `uncovered`.
     """
 
     policy: str = "fisher"
@@ -152,7 +152,8 @@ class ActiveViews:
         return self._share * (self.active.add - len(self.picks))
 
     def points(self, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, torch.Tensor, bool]:
-        """Points of the view that was picked last, where the Gaussians leave its pixels more than half transparent.
+        """Points of the view that was picked last: those triangulated with it, and where the Gaussians leave its pixels
+        more than half transparent also random ones; of a view with a depth map only there, from the map.
 
         Args:
             frame: Its photograph.
@@ -161,7 +162,7 @@ class ActiveViews:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
         import drgs
-        from drgs.data import initial_points
+        from drgs.data import added_points, initial_points
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
         with torch.no_grad():
@@ -169,23 +170,28 @@ class ActiveViews:
         is_open = alpha < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED
-        if not self._share or is_open.mean() < _WORTH:
-            return nothing
+        worth = is_open.mean() >= _WORTH
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None
-        wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share) if dense else _ALL
+        if not self._share or (dense and not worth):
+            return nothing
         seed = self._config.seed + len(self.picks)
         with Bar("points of the new view") as bar:
-            points, colors, _ = initial_points(
-                seen[-1:] if dense else seen, seed, wanted, bar.stage, None if dense else self._matches
-            )
+            if dense:
+                wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share)
+                points, colors, _ = initial_points(seen[-1:], seed, wanted, bar.stage)
+                found = 0
+            else:
+                points, colors, found = added_points(seen, seed, self._matches, bar.stage)
         pixels, depth = frame.camera.project(points)
         inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (frame.camera.width, frame.camera.height)).all(1)
-        columns, rows = pixels[inside].astype(int).T
-        inside[inside] = is_open[rows, columns]
-        kept = np.flatnonzero(inside)
-        if len(kept) > self._share:
-            kept = kept[: self._share] if dense else np.random.default_rng(seed).permutation(kept)[: self._share]
+        # What is triangulated goes in where Gaussians are, too: it knows where things are, and they may have begun at
+        # random.
+        guessed = np.flatnonzero(inside[found:]) + found
+        columns, rows = pixels[guessed].astype(int).T
+        guessed = guessed[is_open[rows, columns]] if worth else guessed[:0]
+        sure = np.random.default_rng(seed).permutation(np.flatnonzero(inside[:found]))
+        kept = np.concatenate([sure, guessed])[: self._share]
         if len(kept) < _FEWEST:
             return nothing
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense

@@ -7,10 +7,14 @@ import re
 import numpy as np
 import pytest
 
+import drgs
+from drgs.active import ActiveConfig, ActiveViews
 from drgs.cameras import Camera, intrinsics, look_at
-from drgs.data import Dataset, View, initial_points, load
+from drgs.data import Dataset, View, added_points, initial_points, load
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
+from drgs.frames import load_frames
+from drgs.trainer import FitConfig
 
 cv2 = pytest.importorskip("cv2")
 WIDTH, HEIGHT = 320, 240
@@ -153,16 +157,39 @@ def test_triangulates_views_far_apart(tmp_path, rng):
 
 
 def test_one_view_more_costs_its_own_pairs(tmp_path, rng):
-    """What was found in earlier views is kept: the same points as from all at once, without opening them again."""
+    """What was found in earlier views is kept: the same points as from all at once, and only those that the last view
+    shows; random ones after them.
+    """
     views, matches, done = plane_views(tmp_path, rng, count=4), Matches(), []
-    all_at_once = initial_points(views)[0]
-    initial_points(views[:3], matches=matches)
-    for view in views[:3]:
-        view.image_path.unlink()
-    later = initial_points(views, progress=lambda *step: done.append(step), matches=matches)[0]
+    all_at_once, _, count = added_points(views, 0, Matches())
+    added_points(views[:3], 0, matches)
+    later, colors, found = added_points(views, 0, matches, lambda *step: done.append(step))
     assert ("features", 1, 1) in done
     assert ("matching", 3, 3) in done
+    assert 200 < count == found < len(later)
     np.testing.assert_array_equal(later, all_at_once)
+    assert on_plane(later[:found]) > 0.95 > on_plane(later[found:])
+    pixels, _ = views[3].camera.project(later[:found])
+    columns, rows = pixels.astype(int).T
+    # A track's color is the mean of its pictures', at features: edges, where half a pixel changes it.
+    assert np.median(np.abs(views[3].image()[rows, columns] - colors[:found])) < 0.1
+
+
+def test_picked_views_bring_triangulated_points(tmp_path, rng):
+    """A wall that hides everything, as random points may grow to, keeps no triangulated points out; views that are not
+    picked are not read.
+    """
+    views = plane_views(tmp_path, rng, count=5)
+    views[1].image_path.unlink()
+    config = FitConfig(max_pixels=10**6, max_gaussians=600, max_steps=10)
+    plan = ActiveViews(ActiveConfig(initial=2, add=1, every=1), views, config)
+    plan.chosen.append(2)
+    wall = drgs.Gaussians.from_arrays([[0.0, 0, 1.5]], [[1.0, 0, 0, 0]], [[9, 9, 0.1]], [0.99], np.zeros((1, 1, 3)))
+    (frame,) = load_frames([views[2]], config.max_pixels)
+    points, colors, dense = plan.points(frame, wall)
+    assert not dense
+    assert len(points) == len(colors) == 200
+    assert on_plane(points.numpy()) > 0.95
 
 
 def test_triangulation_stays_inside_the_masks(tmp_path, rng):

@@ -10,12 +10,12 @@ from pathlib import Path
 from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
-from drgs.data.points import initial_points, scene_extent
+from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
 
-__all__ = ["Dataset", "View", "initial_points", "load", "scene_extent"]
+__all__ = ["Dataset", "View", "added_points", "initial_points", "load", "scene_extent"]
 
 
 def load(

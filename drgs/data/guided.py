@@ -113,12 +113,12 @@ class Matches:
         """What belongs together as one point.
 
         Returns:
-            Points (P, 3) float64, colors (P, 3) float32, and the number of pictures (P,) that agree with each.
+            Points (P, 3) float64, colors (P, 3) float32, and whether the last picture shows each (P,) bool.
         """
         starts = np.cumsum([0] + [len(picture.pixels) for picture in self.pictures])
         found = sorted(self._found.items())
         if not sum(len(points) for _, (_, _, points) in found):
-            return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty(0, int)
+            return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty(0, bool)
         edges = [np.stack([a + starts[i], b + starts[j]], axis=-1) for (i, j), (a, b, _) in found]
         points = [points for _, (_, _, points) in found]
         return _tracks(self.pictures, starts, np.concatenate(edges), np.concatenate(points))
@@ -231,7 +231,7 @@ def _tracks(pictures: list[Features], starts: np.ndarray, edges: np.ndarray, poi
     np.maximum.at(most, edges.ravel(), np.repeat(support, 2))
     kept = np.flatnonzero((support >= 3) | ((support == 2) & (most[edges] == 2).all(axis=1)))
     if not len(kept):
-        return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty(0, int)
+        return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty(0, bool)
     label = _components(edges[kept], len(pixels))[edges[kept, 0]]
     order = np.lexsort((-support[kept], label))
     chosen = kept[order[np.append(True, np.diff(label[order]) > 0)]]
@@ -248,7 +248,9 @@ def _tracks(pictures: list[Features], starts: np.ndarray, edges: np.ndarray, poi
     np.add.at(b, match, (across @ eyes[:, :, None])[:, :, 0])
     np.add.at(color, match, np.concatenate([picture.colors for picture in pictures])[member])
     made = np.linalg.solve(A, b[:, :, None])[:, :, 0]
-    return made, color / np.bincount(match)[:, None].astype(np.float32), support[chosen]
+    in_last = np.zeros(len(chosen), bool)
+    in_last[match[picture_of[member] == len(pictures) - 1]] = True
+    return made, color / np.bincount(match)[:, None].astype(np.float32), in_last
 
 
 def _components(edges: np.ndarray, count: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from drgs.data.views import Dataset, View
 from drgs.foreign import refuse_foreign
 from drgs.progress import Bar
 
-__all__ = ["initial_points", "read_point_ply", "scene_extent"]
+__all__ = ["added_points", "initial_points", "read_point_ply", "scene_extent"]
 
 _EXTENT_MARGIN = 1.1
 _MIN_TRIANGULATED = 50
@@ -61,7 +61,6 @@ def initial_points(
     seed: int = 0,
     max_points: int = 100_000,
     progress: Callable[[str, int, int], None] | None = None,
-    matches: Matches | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points to start Gaussians from, by the first way that works.
 
@@ -74,7 +73,6 @@ def initial_points(
         seed: of all random choices.
         max_points: at most so many.
         progress: called with (stage, done, total) while triangulating.
-        matches: what was found in the first ones of these views by an earlier call; is added to.
 
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
@@ -95,7 +93,7 @@ def initial_points(
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.image_path is not None for view in views):
-        points, colors = _triangulated(views, matches or Matches(), progress)
+        points, colors, _ = _triangulated(views, Matches(), progress)
         if len(points) >= _MIN_TRIANGULATED:
             keep = _subset(len(points), max_points, rng)
             source = f"triangulated from {len(views)} given poses, {len(points)} points"
@@ -110,6 +108,30 @@ def initial_points(
         tried = f" (triangulation gave {len(points)})"
     points, colors = _random(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
+
+
+def added_points(
+    views: list[View],
+    seed: int,
+    matches: Matches,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Points that the last view adds to what those before it show, without depth maps.
+
+    Args:
+        views: at least one; nothing but these is read.
+        seed: of all random choices.
+        matches: what was found in the first ones of these views by earlier calls; is added to.
+        progress: as for `initial_points`.
+
+    Returns:
+        points (P,3) float64 and colors (P,3) float32: first those triangulated with the last view, whose number is the
+        third value, then random ones where the views look.
+    """
+    points, colors, in_last = _triangulated(views, matches, progress)
+    more, more_colors = _random(views, _MAX_RANDOM, np.random.default_rng(seed))
+    found = int(in_last.sum())
+    return np.concatenate([points[in_last], more]), np.concatenate([colors[in_last], more_colors]), found
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -234,8 +256,10 @@ def _back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.n
 
 def _triangulated(
     views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated; and which
+    points the last view shows.
+    """
     import cv2
 
     new = views[len(matches.pictures) :]
@@ -255,8 +279,7 @@ def _triangulated(
     poses = np.stack([picture.camera.c2w for picture in matches.pictures])
     matches.match(nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS), progress)
     with Bar("triangulation"):
-        points, colors, _ = matches.triangulate()
-    return points, colors
+        return matches.triangulate()
 
 
 # -------------------------------------------------- random
