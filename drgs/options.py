@@ -217,7 +217,7 @@ class Fit(_Policy, _Data):
     every: int = 200
     """Steps before the first of them, and between two."""
     pick_points: Literal["auto", "uncovered", "none"] = "auto"
-    """New points of a picked view: triangulated, and where nothing is yet (uncovered); auto: none with --init-points all."""
+    """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
 
     def settings(self):
         """As for every command, with the background that the photographs are composited on."""
