@@ -156,7 +156,7 @@ def test_diagonal_picks_against_mutual_information(world):
 
 
 @pytest.mark.parametrize("policy", ["fisher", "fisherrf", "coverage", "farthest"])
-def test_batch_is_single_picks(world, policy):
+def test_batch_is_single_picks(world, policy, one_thread):
     """k at once are k calls that move each pick to the training views: same picks, scores and margins."""
     g, train, candidates, _ = world
     batch = select(g, candidates, train, 4, policy)
@@ -173,7 +173,7 @@ def test_batch_is_single_picks(world, policy):
 
 
 @pytest.mark.parametrize("prior", [Prior(0.0), Prior(1e-2, relative=True)])
-def test_batch_with_a_prior_that_moves(world, prior):
+def test_batch_with_a_prior_that_moves(world, prior, one_thread):
     """lambda = 0 and relative lambda follow H from pick to pick, as single calls do; nothing is scored lazily then."""
     g, train, candidates, _ = world
     batch = select(g, candidates, train[:1], 4, prior=prior)
