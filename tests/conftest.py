@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import sys
 import zlib
 from pathlib import Path
@@ -99,3 +100,13 @@ def data_dir():
     if not folder.is_dir():
         pytest.skip(f"no real data: {folder} does not exist (set DRGS_DATA)")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_ignored():
+    """Tests that run in the background, or under nohup, ignore signals, and so would the processes that they start."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)

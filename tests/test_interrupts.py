@@ -55,16 +55,6 @@ except KeyboardInterrupt as error:
 """
 
 
-@pytest.fixture(autouse=True)
-def _nothing_is_ignored():
-    """Tests that run in the background, or under nohup, ignore signals, and so would the processes that they start."""
-    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
-    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
 @pytest.fixture
 def start(tmp_path):
     """Starts the command in a place; it is waiting when this returns."""
