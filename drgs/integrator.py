@@ -166,22 +166,33 @@ class _Reverse(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, scene, names, *values):
-        inputs = {n: to_drjit(scene.t, x) for n, x in zip(names, values, strict=True)}
-        needed = ctx.needs_input_grad[2:]
-        ctx.scene, ctx.inputs = scene, [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
-        dr.enable_grad([x for x in ctx.inputs if x is not None])
-        images = scene.trace(**inputs)
-        scene.result_names, ctx.images = list(images), list(images.values())
-        return tuple(x.torch() for x in ctx.images)
+        ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
+        ctx.scene, ctx.names, ctx.needed = scene, names, ctx.needs_input_grad[2:]
+        ctx.graph, images = _traced(scene, names, values, ctx.needed)
+        scene.result_names = list(images)
+        return tuple(x.torch() for x in images.values())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     @runtime.alone
     def backward(ctx, *cotangents):
-        for image, g in zip(ctx.images, cotangents, strict=True):
+        values, graph = ctx.saved_tensors, ctx.graph
+        # A traversal takes the edges of the graph with it; through what is left, another would find the old gradients.
+        ctx.graph = None
+        inputs, images = graph or _traced(ctx.scene, ctx.names, values, ctx.needed)[0]
+        for image, g in zip(images, cotangents, strict=True):
             dr.set_grad(image, to_drjit(ctx.scene.t, g).array)
-        slopes = iter(dr.backward_to([x for x in ctx.inputs if x is not None]))
-        return None, None, *(None if x is None else next(slopes).torch() for x in ctx.inputs)
+        slopes = iter(dr.backward_to([x for x in inputs if x is not None]))
+        return None, None, *(None if x is None else next(slopes).torch() for x in inputs)
+
+
+def _traced(scene: Scene, names, values, needed) -> tuple[tuple[list, list], dict]:
+    """The ends of a graph, inputs (None where no gradient is needed) and images, and the images by name."""
+    inputs = {n: to_drjit(scene.t, x) for n, x in zip(names, values, strict=True)}
+    ends = [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
+    dr.enable_grad([x for x in ends if x is not None])
+    images = scene.trace(**inputs)
+    return (ends, list(images.values())), images
 
 
 class _Bridge(torch.autograd.Function):

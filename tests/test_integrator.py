@@ -572,3 +572,26 @@ def test_float64_parameters_have_gradients(rng, traversal):
     for name, x in found[0].items():
         assert x.norm() > 0
         assert (x - found[1][name]).norm() <= 1e-5 * x.norm(), name
+
+
+@pytest.mark.parametrize("traversal", ["tiles", "bvh"])
+def test_graph_that_is_retained(rng, traversal):
+    """A second backward pass has the gradient of its own output, not the first one's again; torch refuses one through a
+    graph that was not retained.
+    """
+    g, cam = gaussians(rng, 20, 1, scale=0.3).detach(), camera(rng)
+    settings = RenderSettings.preset("exact", traversal=traversal)
+    means = g.means.clone().requires_grad_()
+
+    def fresh(name):
+        out = render(g.replace(means=means), cam, settings)
+        return torch.autograd.grad(getattr(out, name).sum(), means)[0]
+
+    wanted = {name: fresh(name) for name in ("rgb", "alpha", "depth")}
+    out = render(g.replace(means=means), cam, settings)
+    for name in ("rgb", "alpha", "depth", "rgb"):
+        (found,) = torch.autograd.grad(getattr(out, name).sum(), means, retain_graph=True)
+        torch.testing.assert_close(found, wanted[name], rtol=1e-4, atol=1e-4 * float(wanted[name].abs().max()))
+    out.rgb.sum().backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        out.alpha.sum().backward()
