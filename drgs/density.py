@@ -14,7 +14,7 @@ import math
 
 import torch
 
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, semi_axes
 
 __all__ = ["Model", "add_gaussians", "divide", "explore", "relocate"]
 
@@ -211,7 +211,7 @@ def explore(model: Model, rate: float, extent: float, strength: float, generator
     gate = torch.sigmoid(100 * (0.005 - t["logit_opacities"].sigmoid()))
     moving = (gate > 1e-3).nonzero()[:, 0]
     noise = torch.randn(len(model), 3, generator=generator)[moving]
-    axes = _axes(t["quats"][moving], t["log_scales"][moving])
+    axes = semi_axes(t["quats"][moving], t["log_scales"][moving].exp())
     shaped = (axes @ (axes.transpose(1, 2) @ noise[..., None]))[..., 0]
     scale = strength * rate * _UNIT**2 / extent
     t["means"][moving] += gate[moving, None] * scale * shaped
@@ -230,7 +230,8 @@ def _copies(
     copies = model.take(source)
     # Coincident Gaussians get equal gradients and would stay one Gaussian for ever.
     noise = jitter * torch.randn(len(source), 3, generator=generator)
-    copies["means"] = copies["means"] + (_axes(copies["quats"], copies["log_scales"]) @ noise[..., None])[..., 0]
+    axes = semi_axes(copies["quats"], copies["log_scales"].exp())
+    copies["means"] = copies["means"] + (axes @ noise[..., None])[..., 0]
     return copies
 
 
@@ -240,20 +241,6 @@ def _draw(weights: torch.Tensor, count: int, generator: torch.Generator) -> torc
     total = weights.double().cumsum(0)
     uniform = torch.rand(count, generator=generator, dtype=torch.float64) * total[-1]
     return torch.searchsorted(total, uniform).clamp(max=len(weights) - 1)
-
-
-def _axes(quats: torch.Tensor, log_scales: torch.Tensor) -> torch.Tensor:
-    """(N, 3, 3) R S: columns are the semi-axes."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rotation = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        dim=1,
-    ).reshape(-1, 3, 3)  # fmt: skip
-    return rotation * log_scales.exp()[:, None, :]
 
 
 def _spacing(points: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ import torch
 
 from drgs.arguments import ArgumentError, kind_of, must_be
 
-__all__ = ["Gaussians", "ellipsoids_shape", "sh_degree_of"]
+__all__ = ["Gaussians", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
 
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
 # float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
@@ -30,6 +30,17 @@ def sh_degree_of(coefficients: int) -> int:
     if degree not in (0, 1, 2, 3) or (degree + 1) ** 2 != coefficients:
         raise ValueError(f"Gaussians: sh must have 1, 4, 9 or 16 coefficients (degree 0..3), got {coefficients}")
     return degree
+
+
+def semi_axes(quats: torch.Tensor, scales: torch.Tensor) -> torch.Tensor:
+    """(N, 3, 3) R S of (N, 4) wxyz quaternions of any length and (N, 3) scales: columns are the semi-axes."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3) * scales[:, None, :]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, semi_axes
 from drgs.integrator import EPS_ALPHA, render
 from drgs.settings import RenderSettings
 
@@ -32,6 +32,19 @@ _SH0 = 0.28209479177387814  # Y_00
 _LEAST_SCALE, _LEAST_OPACITY, _MOST_OPACITY = 1e-20, 1e-12, 1 - 2.0**-26
 # Defaults of gsplat's signature: another preset's own constants hold unless an argument differs from these.
 _NEAR, _FAR, _DILATION = 0.01, 1e10, 0.3
+# What to do instead of an option that does not exist here.
+_RAYS = "use drgs.integrator.render_rays with your own rays"
+_LENSES = "lenses are traced by drgs.render with traversal='bvh'"
+_INSTEAD = {
+    "sparse_grad": "gradients are dense here; drop it",
+    "absgrad": "there are no gradients of projected means; use gsplat's MCMCStrategy, which needs none",
+    "distributed": "one process renders; split the cameras among processes yourself",
+    "covars": "pass quats and scales, e.g. from an eigendecomposition",
+    "with_ut": "there is no unscented transform; preset='exact' evaluates along true rays",
+    "with_eval3d": "preset='exact' or 'fast' evaluates the response in 3D",
+    "radial_coeffs": _LENSES,
+    "tangential_coeffs": _LENSES,
+}
 
 
 def rasterization(
@@ -112,27 +125,24 @@ def rasterization(
         V. Ye et al., gsplat, JMLR 26, 2025; Z. Yu et al., Mip-Splatting, CVPR 2024 (antialiased).
     """
     _refuse(
-        sparse_grad=(sparse_grad, "gradients are dense here; drop it"),
-        absgrad=(absgrad, "there are no gradients of projected means; use gsplat's MCMCStrategy, which needs none"),
-        distributed=(distributed, "one process renders; split the cameras among processes yourself"),
-        covars=(covars is not None, "pass quats and scales, e.g. from an eigendecomposition"),
-        with_ut=(with_ut, "no unscented transform; preset='exact' evaluates along true rays"),
-        with_eval3d=(with_eval3d, "preset='exact' or 'fast' evaluates the response in 3D"),
-        radial_coeffs=(radial_coeffs is not None, "lenses are traced by drgs.render(..., traversal='bvh')"),
-        tangential_coeffs=(tangential_coeffs is not None, "lenses are traced by drgs.render(..., traversal='bvh')"),
-        thin_prism_coeffs=(thin_prism_coeffs is not None, "use drgs.integrator.render_rays with your own rays"),
-        ftheta_coeffs=(ftheta_coeffs is not None, "use drgs.integrator.render_rays with your own rays"),
-        viewmats_rs=(viewmats_rs is not None, "use drgs.integrator.render_rays with your own rays"),
-        rolling_shutter=(
-            rolling_shutter is not None and getattr(rolling_shutter, "name", "") != "GLOBAL",
-            "use drgs.integrator.render_rays with your own rays",
-        ),
-        camera_model=(camera_model != "pinhole", "use drgs.integrator.render_rays with your own rays"),
+        sparse_grad=sparse_grad,
+        absgrad=absgrad,
+        distributed=distributed,
+        covars=covars is not None,
+        with_ut=with_ut,
+        with_eval3d=with_eval3d,
+        radial_coeffs=radial_coeffs is not None,
+        tangential_coeffs=tangential_coeffs is not None,
+        thin_prism_coeffs=thin_prism_coeffs is not None,
+        ftheta_coeffs=ftheta_coeffs is not None,
+        rolling_shutter=rolling_shutter is not None and getattr(rolling_shutter, "name", "") != "GLOBAL",
+        viewmats_rs=viewmats_rs is not None,
+        camera_model=camera_model != "pinhole",
     )
     _one_of("render_mode", render_mode, RENDER_MODES)
     _one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     settings = _settings(preset, near_plane, eps2d, rasterize_mode)
-    lead, count, cameras = _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
+    lead, cameras = _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
     _check_values(scales, opacities)
     scales, opacities = _inside(scales, _LEAST_SCALE, math.inf), _inside(opacities, _LEAST_OPACITY, _MOST_OPACITY)
     by_camera = colors.ndim == len(lead) + (3 if sh_degree is None else 4)
@@ -263,7 +273,11 @@ def _projected(splats: _Splats, camera: Camera, settings: RenderSettings, antial
             u, v = (a.clamp(-0.65 * n / f, 0.65 * n / f) for a, n, f in ((u, camera.width, fx), (v, camera.height, fy)))
         zero = torch.zeros_like(z)
         rows = [fx / z, skew / z + zero, -(fx * u + skew * v) / z, zero, fy / z, -fy * v / z]
-        half_axes = torch.stack(rows, 1).reshape(-1, 2, 3) @ w2c[:3, :3] @ _half_axes(splats, like)
+        half_axes = (
+            torch.stack(rows, 1).reshape(-1, 2, 3)
+            @ w2c[:3, :3]
+            @ semi_axes(splats.quats.to(**like), splats.scales.to(**like))
+        )
         a, b = half_axes.unbind(1)
         # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.
         sharp = torch.linalg.cross(a, b).square().sum(1)
@@ -290,15 +304,6 @@ def _projected(splats: _Splats, camera: Camera, settings: RenderSettings, antial
             "conics": conics.detach().to(kind),
         }
     return meta, compensation
-
-
-def _half_axes(splats: _Splats, like: dict) -> torch.Tensor:
-    """(N, 3, 3): columns are the semi-axes, rotation times scale."""
-    w, x, y, z = torch.nn.functional.normalize(splats.quats.to(**like), dim=1).unbind(1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, 1).reshape(-1, 3, 3) * splats.scales.to(**like)[:, None, :]
 
 
 def _z_of_rays(camera: Camera) -> torch.Tensor:
@@ -328,10 +333,11 @@ def _inside(x: torch.Tensor, low: float, high: float) -> torch.Tensor:
     return x + (x.detach().double().clamp(low, high) - x.detach()) if x.numel() else x
 
 
-def _refuse(**asked) -> None:
-    for name, (is_asked, instead) in asked.items():
+def _refuse(**asked: bool) -> None:
+    """Raise NotImplementedError for the first option of gsplat's that is asked for."""
+    for name, is_asked in asked.items():
         if is_asked:
-            raise NotImplementedError(f"rasterization: {name} is not supported; {instead}")
+            raise NotImplementedError(f"rasterization: {name} is not supported; {_INSTEAD.get(name, _RAYS)}")
 
 
 def _one_of(name: str, value, allowed: Sequence[str]) -> None:
@@ -340,7 +346,7 @@ def _one_of(name: str, value, allowed: Sequence[str]) -> None:
 
 
 def _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, degree, backgrounds):
-    """Leading axes, number of Gaussians, number of cameras."""
+    """Leading axes, and the number of cameras."""
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     tensors |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
     for name, x in tensors.items():
@@ -379,7 +385,7 @@ def _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, degree,
             f"rasterization: colors must have at least {(degree + 1) ** 2} coefficients for sh_degree {degree}, got "
             f"{colors.shape[-2]}"
         )
-    return lead, n, cameras
+    return lead, cameras
 
 
 def _fits(got: tuple, wanted: tuple) -> bool:
