@@ -239,7 +239,7 @@ def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings,
         return None
     frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
     values = {"psnr": viewers, "own_psnr": settings}
-    with Bar("held-out views as viewers draw them", len(values) * len(frames)) as bar:
+    with Bar("views as viewers of PLY files draw them", len(values) * len(frames)) as bar:
         for name, model in values.items():
             found = []
             for frame in frames:
