@@ -17,7 +17,7 @@ import numpy as np
 import studies
 from studies import ROOT, SCALES
 
-from drgs.active import ActiveConfig
+from drgs.fitting.active import ActiveConfig
 from drgs.train import FitConfig, fit
 
 BEGIN, END = "<!-- active: begin -->", "<!-- active: end -->"

@@ -31,15 +31,15 @@ sys.path[:0] = [str(ROOT / "tests")]
 import torch_rasterizer  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs.active import at_most  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
-from drgs.crops import crops  # noqa: E402
-from drgs.crossval import VERDICTS, crossval  # noqa: E402
+from drgs.commands.orbits import Wish, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
-from drgs.orbits import Wish, scene_orbit  # noqa: E402
-from drgs.rasterizers import GROUPS, cotangents, function, load, raw_of  # noqa: E402
+from drgs.fitting.active import at_most  # noqa: E402
+from drgs.lab.crops import crops  # noqa: E402
+from drgs.lab.crossval import VERDICTS, crossval  # noqa: E402
+from drgs.lab.rasterizers import GROUPS, cotangents, function, load, raw_of  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 

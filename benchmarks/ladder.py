@@ -24,15 +24,15 @@ import studies
 from studies import ROOT
 
 import drgs
-from drgs.active import at_most
 from drgs.cameras import intrinsics_from_fov
+from drgs.commands.orbits import Wish, scene_orbit
+from drgs.commands.viewpoints import evenly
 from drgs.data import load
 from drgs.files import Run, atomic_write
-from drgs.ladder import GROUPS, Pictures, ladder, table
-from drgs.orbits import Wish, scene_orbit
-from drgs.run_records import fit_record
+from drgs.fitting.active import at_most
+from drgs.fitting.records import fit_record
+from drgs.lab.ladder import GROUPS, Pictures, ladder, table
 from drgs.settings import RenderSettings
-from drgs.viewpoints import evenly
 
 BEGIN, END = "<!-- ladder: begin -->", "<!-- ladder: end -->"
 FOVS = (20, 45, 70, 95, 120)

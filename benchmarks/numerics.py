@@ -18,9 +18,10 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
-from drgs import runtime, stress  # noqa: E402
-from drgs.extremes import CASES  # noqa: E402
-from drgs.refusals import REFUSALS  # noqa: E402
+from drgs import runtime  # noqa: E402
+from drgs.lab import stress  # noqa: E402
+from drgs.lab.extremes import CASES  # noqa: E402
+from drgs.lab.refusals import REFUSALS  # noqa: E402
 
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 

@@ -75,7 +75,7 @@ def run(name: str, data: Path, runs: Path) -> dict:
 
 def cross(runs: Path, data: Path, models: list[str]) -> list[tuple[str, list[float]]]:
     """Held-out PSNR of the small runs, each seen through every model."""
-    from drgs.frames import load_frames
+    from drgs.fitting.frames import load_frames
 
     _, test = load(data / "banana").split(8)
     frames, rows = load_frames(test, SMALL["max_pixels"], "auto"), []

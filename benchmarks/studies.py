@@ -20,12 +20,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import numpy as np  # noqa: E402
 
 from drgs import runtime  # noqa: E402
-from drgs.active import initial_views  # noqa: E402
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
-from drgs.density import Model  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
-from drgs.frames import load_frames  # noqa: E402
-from drgs.trainer import FitConfig, Trainer  # noqa: E402
+from drgs.fitting.active import initial_views  # noqa: E402
+from drgs.fitting.density import Model  # noqa: E402
+from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.trainer import FitConfig, Trainer  # noqa: E402
 
 __all__ = [
     "SCALES",

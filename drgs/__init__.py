@@ -33,7 +33,6 @@ _MODULES = frozenset(
         "cli",
         "crossval",
         "data",
-        "demo",
         "ellipsoids",
         "files",
         "fisher",
@@ -45,9 +44,7 @@ _MODULES = frozenset(
         "runtime",
         "select",
         "settings",
-        "sfm",
         "testing",
-        "tiles",
         "train",
     }
 )

@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from drgs.arguments import must_be
-from drgs.camera_checks import (
+from drgs.guards.arguments import must_be
+from drgs.guards.camera_checks import (
     IMAGE_MAX,
     as_numpy,
     check_distance,

@@ -24,9 +24,9 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
-from drgs import interrupts
-from drgs.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Select, Sfm, Stress, Tradeoff
-from drgs.progress import Bar
+from drgs.commands.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Select, Sfm, Stress, Tradeoff
+from drgs.display.progress import Bar
+from drgs.guards import interrupts
 
 __all__ = ["main"]
 
@@ -34,16 +34,16 @@ __all__ = ["main"]
 # Command -> (its options, module, function). Modules load only when their command runs.
 _RUN = {
     "info": (Info, "drgs.cli", "_run_info"),
-    "render": (Render, "drgs.render_command", "run"),
+    "render": (Render, "drgs.commands.render", "run"),
     "fit": (Fit, "drgs.train", "run_fit"),
     "eval": (Eval, "drgs.metrics", "run_eval"),
-    "select": (Select, "drgs.select_command", "run"),
-    "fisher": (Fisher, "drgs.fisher_command", "run"),
-    "crossval": (Crossval, "drgs.crossval_command", "run"),
-    "tradeoff": (Tradeoff, "drgs.tradeoff", "run"),
-    "stress": (Stress, "drgs.stress", "run"),
-    "sfm": (Sfm, "drgs.sfm", "run_command"),
-    "demo": (Demo, "drgs.demo", "run"),
+    "select": (Select, "drgs.commands.select", "run"),
+    "fisher": (Fisher, "drgs.commands.fisher", "run"),
+    "crossval": (Crossval, "drgs.commands.crossval", "run"),
+    "tradeoff": (Tradeoff, "drgs.commands.tradeoff", "run"),
+    "stress": (Stress, "drgs.lab.stress", "run"),
+    "sfm": (Sfm, "drgs.data.sfm", "run_command"),
+    "demo": (Demo, "drgs.commands.demo", "run"),
 }
 
 
@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"drgs {drgs.__version__}")
         return 0
     args = _parse_arguments(argv)
-    from drgs import outputs  # not for --help
+    from drgs.guards import outputs  # not for --help
 
     name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])

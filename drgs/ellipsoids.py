@@ -15,7 +15,7 @@ import warnings
 import numpy as np
 import torch
 
-from drgs.arguments import ArgumentError, kind_of, must_be
+from drgs.guards.arguments import ArgumentError, kind_of, must_be
 
 __all__ = ["Gaussians", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
 

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from drgs import outputs
-from drgs.arguments import ArgumentError
-from drgs.foreign import refuse_foreign
-from drgs.json_files import parse_json, read_json
+from drgs.guards import outputs
+from drgs.guards.arguments import ArgumentError
+from drgs.guards.foreign import refuse_foreign
+from drgs.guards.json_files import parse_json, read_json
 
 if TYPE_CHECKING:
     import torch
@@ -71,8 +71,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     import plyfile
     import torch
 
-    from drgs.doors import check_path
     from drgs.ellipsoids import Gaussians
+    from drgs.guards.doors import check_path
 
     path = check_path("load_ply", path)
     names = _check_ply(path)
@@ -130,7 +130,7 @@ def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
     """
     import plyfile
 
-    from drgs.doors import check_path, check_scene
+    from drgs.guards.doors import check_path, check_scene
 
     if isinstance(g, str | os.PathLike):
         raise ArgumentError("save_ply: gaussians must come first and the path second, got a path first; swap them")

@@ -22,15 +22,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from drgs.arguments import must_be
 from drgs.cameras import Camera
-from drgs.doors import camera_list, check_scene, check_view
 from drgs.ellipsoids import Gaussians
 from drgs.gain import Prior, information_gain
-from drgs.groups import GROUPS, Information, groups_of
+from drgs.guards.arguments import must_be
+from drgs.guards.doors import camera_list, check_scene, check_view
+from drgs.information.groups import GROUPS, Information, groups_of
+from drgs.information.jacobian import GEOMETRY
+from drgs.information.replay import Replay, by_probes
 from drgs.integrator import render_jvp
-from drgs.jacobian import GEOMETRY
-from drgs.replay import Replay, by_probes
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 
 import torch
 
-from drgs.arguments import must_be
+from drgs.guards.arguments import must_be
 
 __all__ = [
     "BLOCK_LAYOUT",

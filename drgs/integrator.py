@@ -15,12 +15,12 @@ from collections.abc import Iterable, Iterator, Mapping
 import torch
 
 from drgs import runtime
-from drgs.arguments import must_be
 from drgs.cameras import Camera
-from drgs.doors import check_scene, check_view
 from drgs.ellipsoids import Gaussians
-from drgs.scene import EPS_ALPHA, Output, Scene, to_drjit
+from drgs.guards.arguments import must_be
+from drgs.guards.doors import check_scene, check_view
 from drgs.settings import RenderSettings
+from drgs.tracing.call import EPS_ALPHA, Output, Scene, to_drjit
 
 import drjit as dr  # isort: skip  (after the scene, which chooses libLLVM)
 

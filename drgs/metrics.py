@@ -14,16 +14,16 @@ import numpy as np
 import torch
 
 import drgs
-from drgs import tables
+from drgs.display import tables
+from drgs.display.pictures import file_names, write_png
+from drgs.display.progress import Bar
 from drgs.files import SCHEMA, Run, load_ply, write_json
-from drgs.pictures import file_names, write_png
-from drgs.progress import Bar
-from drgs.resume import claim_run
+from drgs.fitting.resume import claim_run
 
 if TYPE_CHECKING:
+    from drgs.commands.options import Eval
     from drgs.ellipsoids import Gaussians
-    from drgs.frames import Frame
-    from drgs.options import Eval
+    from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
 
 __all__ = [
@@ -262,8 +262,8 @@ def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fie
 def run_eval(args: Eval) -> None:
     """`drgs eval RUN`."""
     from drgs.data import load
-    from drgs.frames import load_frames
-    from drgs.run_records import fit_record, fitted_views
+    from drgs.fitting.frames import load_frames
+    from drgs.fitting.records import fit_record, fitted_views
 
     run = Run(args.run)
     recorded = fit_record(run)
@@ -328,6 +328,6 @@ def _viewers_line(viewers: dict) -> str:
 
 
 def _ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    from drgs.losses import ssim_map
+    from drgs.fitting.losses import ssim_map
 
     return ssim_map(image.double(), target.double())

@@ -1,7 +1,7 @@
 """The Mitsuba integrator plugin `drgs`: `bvh` traversal under `mi.load_dict`, `mi.render` and Mitsuba's AD.
 
     import mitsuba as mi; mi.set_variant("llvm_ad_rgb")
-    from drgs import plugin                           # registers the integrator
+    from drgs import plugin  # registers the integrator
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "drgs", "preset": "exact"},
                           "shape": drgs.ellipsoids.ellipsoids_shape(gaussians), "sensor": {...}})
     image = mi.render(scene, params=mi.traverse(scene), spp=16)
@@ -16,10 +16,11 @@ import dataclasses
 
 import drjit as dr
 
-from drgs import bvh, runtime
-from drgs.composite import Composite, View
-from drgs.projection import project_world, sh_basis
+from drgs import runtime
 from drgs.settings import RenderSettings
+from drgs.tracing import bvh
+from drgs.tracing.composite import Composite, View
+from drgs.tracing.projection import project_world, sh_basis
 
 mi = runtime.mitsuba()
 from mitsuba.python.ad.integrators.common import RBIntegrator  # noqa: E402 - needs a variant

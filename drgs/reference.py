@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from drgs.doors import check_oracle
+from drgs.guards.doors import check_oracle
 from drgs.oracle import (
     activate,
     cull_near,

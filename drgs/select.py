@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.doors import camera_list, check_scene
 from drgs.gain import BLOCKS, CRITERIA, Information, Prior
-from drgs.greedy import Cache, Pick, Selection, Source, greedy
+from drgs.guards.doors import camera_list, check_scene
+from drgs.information.greedy import Cache, Pick, Selection, Source, greedy
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

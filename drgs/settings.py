@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from drgs.arguments import check_fields, must_be
+from drgs.guards.arguments import check_fields, must_be
 
 __all__ = ["PRESETS", "RenderSettings", "legal"]
 

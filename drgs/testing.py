@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera, look_at
-from drgs.crossval import VERDICTS, Result, crossval
 from drgs.ellipsoids import Gaussians
-from drgs.rasterizers import function, load
+from drgs.lab.crossval import VERDICTS, Result, crossval
+from drgs.lab.rasterizers import function, load
 
 __all__ = ["assert_matches", "random_scene"]
 

@@ -1,6 +1,7 @@
 """`drgs fit`: Gaussians from photographs with known cameras (static scenes, color).
 
-The loop around `drgs.trainer`: run folder, checkpoints, progress, previews, and metrics of held-out views at the end.
+The loop around `drgs.fitting.trainer`: run folder, checkpoints, progress, previews, and metrics of held-out views at
+the end.
 """
 
 from __future__ import annotations
@@ -18,22 +19,23 @@ import numpy as np
 import torch
 
 import drgs
-from drgs import interrupts, metrics
-from drgs.active import ActiveConfig, ActiveViews
+from drgs import metrics
 from drgs.data.views import check_parallax
-from drgs.density import Model
+from drgs.display.pictures import file_names, write_png
+from drgs.display.progress import Bar
 from drgs.files import Run, save_ply, save_state
-from drgs.frames import Frame, load_frames
-from drgs.outputs import claim
-from drgs.pictures import file_names, write_png
-from drgs.progress import Bar
-from drgs.resume import claim_run, keep_previous, last_checkpoint
-from drgs.trainer import FitConfig, Trainer
+from drgs.fitting.active import ActiveConfig, ActiveViews
+from drgs.fitting.density import Model
+from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
+from drgs.fitting.trainer import FitConfig, Trainer
+from drgs.guards import interrupts
+from drgs.guards.outputs import claim
 
 if TYPE_CHECKING:
+    from drgs.commands.options import Fit
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
-    from drgs.options import Fit
 
 __all__ = ["FitConfig", "FitResult", "Trainer", "fit", "run_fit"]
 

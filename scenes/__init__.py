@@ -12,8 +12,8 @@ import json
 
 import numpy as np
 
-from drgs.outputs import claim
-from drgs.unfinished import temporary_folder
+from drgs.guards.outputs import claim
+from drgs.guards.unfinished import temporary_folder
 
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",

@@ -70,7 +70,7 @@ def _isolated(request):
 @pytest.fixture(autouse=True)
 def _no_lines_of_progress(monkeypatch):
     """They come with time: on a busy machine they would get in between what tests expect on stderr."""
-    from drgs import progress
+    from drgs.display import progress
 
     for name in ("FIRST", "EVERY", "LEAST_OFTEN"):
         monkeypatch.setattr(progress, name, 3600.0)

@@ -1,4 +1,4 @@
-"""The dense Jacobian of the float64 oracle (`drgs.accuracy`), and what tests of Fisher information make of it."""
+"""The dense Jacobian of the float64 oracle (`drgs.lab.accuracy`), and what tests of Fisher information make of it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import torch
 from scenes_random import camera, gaussians
 
 from drgs import reference
-from drgs.accuracy import entry_error as error
-from drgs.accuracy import jacobian, squares, turn, twist_basis
+from drgs.lab.accuracy import entry_error as error
+from drgs.lab.accuracy import jacobian, squares, turn, twist_basis
 
 __all__ = ["GROUPS", "error", "jacobian", "pose_jacobian", "scene", "squares", "stacked", "turn"]
 

@@ -1,4 +1,4 @@
-"""The cases of `drgs.extremes`, and crowds in which the acceleration structure may lose hits."""
+"""The cases of `drgs.lab.extremes`, and crowds in which the acceleration structure may lose hits."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from scenes_random import camera, gaussians
 
-from drgs.extremes import CASES, Case
+from drgs.lab.extremes import CASES, Case
 
 __all__ = ["CASES", "CROWDS", "Case", "crowd"]
 

@@ -1,10 +1,12 @@
-"""Random scenes and their comparison with the float64 oracle: `drgs.accuracy`, under the names that tests use."""
+"""Random scenes and their comparison with the float64 oracle: `drgs.lab.accuracy`, under the names that tests use."""
 
 from __future__ import annotations
 
 import torch
 
-from drgs.accuracy import (
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.lab.accuracy import (
     FIELDS,
     Errors,
     Oracle,
@@ -17,10 +19,8 @@ from drgs.accuracy import (
     rotation,
     twist_basis,
 )
-from drgs.accuracy import random_camera as camera
-from drgs.accuracy import random_gaussians as gaussians
-from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.lab.accuracy import random_camera as camera
+from drgs.lab.accuracy import random_gaussians as gaussians
 
 __all__ = [
     "FIELDS",

@@ -14,11 +14,11 @@ from test_data import HEIGHT, WIDTH, gradient, poses, save, write_colmap, write_
 
 import drgs
 from drgs import cli
-from drgs.active import ActiveConfig, ActiveViews, initial_views
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
-from drgs.run_records import fitted_views
+from drgs.fitting.active import ActiveConfig, ActiveViews, initial_views
+from drgs.fitting.records import fitted_views
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 24

@@ -11,10 +11,11 @@ import pytest
 from test_data import gradient, poses, save, write_image, write_transforms
 
 import drgs
-from drgs import cli, pictures
+from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.data.views import View, check_parallax
+from drgs.display import pictures
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from drgs import runtime
-from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.cameras import (
     Camera,
     c2w_from_llff,
@@ -22,6 +21,7 @@ from drgs.cameras import (
     look_at,
     orbit,
 )
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 
 POSE = look_at((1.0, 2.0, 3.0), (0.2, -0.1, 0.3))
 OPENCV = (-0.2, 0.05, 1e-3, -2e-3, 0.01)

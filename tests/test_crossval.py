@@ -16,15 +16,16 @@ import torch_rasterizer
 from torch_rasterizer import DEFECTS
 
 import drgs
-from drgs import cli, rasterizers
-from drgs.camera_lists import save_cameras_json
+from drgs import cli
 from drgs.cameras import Camera
-from drgs.crossval import crossval
-from drgs.differences import _extrapolated, central
+from drgs.commands.orbits import Wish, scene_orbit
+from drgs.data.camera_lists import save_cameras_json
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, save_ply
-from drgs.orbits import Wish, scene_orbit
-from drgs.rasterizers import GROUPS, function, raw_of
+from drgs.lab import rasterizers
+from drgs.lab.crossval import crossval
+from drgs.lab.differences import _extrapolated, central
+from drgs.lab.rasterizers import GROUPS, function, raw_of
 from drgs.testing import assert_matches, random_scene
 
 BACKGROUND = (0.3, 0.6, 0.2)
@@ -296,7 +297,7 @@ def test_near_ties_are_no_difference(contrast, said, monkeypatch):
     assert "0.5 times" in found["sh"]["why"]
 
     # If they were not left out, it would be said what is not so: this is what the test is about.
-    monkeypatch.setattr("drgs.conventions.Model.near_ties", lambda *_: torch.zeros(20, 24, dtype=torch.bool))
+    monkeypatch.setattr("drgs.lab.conventions.Model.near_ties", lambda *_: torch.zeros(20, 24, dtype=torch.bool))
     assert crossval(ours, g, cameras, "gsplat", {"background": BACKGROUND}).verdict == said
 
 

@@ -8,7 +8,8 @@ import json
 
 import pytest
 
-from drgs import cli, demo
+from drgs import cli
+from drgs.commands import demo
 
 
 @pytest.fixture(scope="module")

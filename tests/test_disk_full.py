@@ -11,7 +11,9 @@ import os, resource, sys
 from pathlib import Path
 import numpy as np, torch
 import drgs
-from drgs import camera_lists, files, pictures
+from drgs import files
+from drgs.data import camera_lists
+from drgs.display import pictures
 from drgs.cameras import orbit
 
 folder = Path(sys.argv[1])

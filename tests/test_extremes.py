@@ -1,6 +1,6 @@
 """The extremes of the renderer: everything finite, and as close to the float64 oracle as anywhere else.
 
-The cases are in drgs/extremes.py and drgs/refusals.py; `drgs stress` runs them on any machine, and
+The cases are in drgs/lab/extremes.py and drgs/lab/refusals.py; `drgs stress` runs them on any machine, and
 `python benchmarks/numerics.py` prints their errors for docs/numerics.md.
 """
 
@@ -17,11 +17,12 @@ import torch
 from scenes_extreme import CASES, CROWDS, crowd
 from scenes_random import camera, gaussians, gradients
 
-from drgs import bvh, reference
+from drgs import reference
 from drgs.integrator import render, render_jvp, render_rays
-from drgs.refusals import REFUSALS
+from drgs.lab.refusals import REFUSALS
+from drgs.lab.stress import measure, refused, truth_of
 from drgs.settings import RenderSettings
-from drgs.stress import measure, refused, truth_of
+from drgs.tracing import bvh
 
 
 @functools.lru_cache(maxsize=1)

@@ -11,13 +11,13 @@ import torch
 from test_active import SIZE, config, lazily, plan, write_still
 
 from drgs import cli, fisher
-from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.cameras import Camera, look_at, orbit
+from drgs.commands.fisher import map_weights
 from drgs.data import load
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
+from drgs.display.pictures import map_picture
 from drgs.files import load_ply, load_state, save_ply
-from drgs.fisher_command import map_weights
 from drgs.gain import Prior
-from drgs.pictures import map_picture
 from drgs.train import fit
 
 

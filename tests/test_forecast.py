@@ -7,8 +7,10 @@ import types
 import pytest
 import torch
 
-from drgs import cli, forecast, render_command
+from drgs import cli
 from drgs.cameras import orbit
+from drgs.commands import forecast
+from drgs.commands import render as render_command
 from drgs.files import save_ply
 from drgs.settings import RenderSettings
 

@@ -1,4 +1,4 @@
-"""Claims of drgs.foreign: a file of another kind is named as what it is, with the way round, wherever it is read."""
+"""Claims of drgs.guards.foreign: a file of another kind is named as what it is, with the way round."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 from test_data import save, write_colmap, write_llff, write_transforms
 
 from drgs import cli
-from drgs.camera_lists import load_cameras_json
+from drgs.commands.render import load_scene
 from drgs.data import load
+from drgs.data.camera_lists import load_cameras_json
 from drgs.data.checks import read_image
 from drgs.files import load_ply, load_state
-from drgs.render_command import load_scene
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n"
 CONVERT = r"convert it with `npx @playcanvas/splat-transform .*scene.* .*\.ply`, or open it in SuperSplat"

@@ -343,9 +343,9 @@ def test_one_default_criterion():
     """Everything that scores views does so by `eig` unless asked otherwise, from Python and on the command line."""
     import inspect
 
-    from drgs.active import ActiveConfig
+    from drgs.commands.options import Fit, Select
+    from drgs.fitting.active import ActiveConfig
     from drgs.gain import check
-    from drgs.options import Fit, Select
     from drgs.select import select
 
     scoring = (information_gain, scorer, check, select)

@@ -1,4 +1,4 @@
-"""Claims of drgs.interrupts: signals end a command soon and cleanly, wherever it is, and a fit at a step's end."""
+"""Claims of drgs.guards.interrupts: signals end a command soon and cleanly, and a fit at a step's end."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from drgs import interrupts
+from drgs.guards import interrupts
 
 # A command that waits in Python, or in native code that no signal ends, which takes minutes.
 _COMMAND = """
 import hashlib, sys, time
 from pathlib import Path
-from drgs import interrupts, outputs, unfinished
+from drgs.guards import interrupts
+from drgs.guards import outputs
+from drgs.guards import unfinished
 
 def native():
     hashlib.pbkdf2_hmac("sha256", b"x", b"y", 10**9)
@@ -154,7 +156,7 @@ def test_ignored_signals_stay_ignored():
 def test_pycolmap_does_not_take_sigterm(tmp_path):
     """Imported where drgs imports it, SIGTERM is still ours; by itself it prints a stack of C++ frames."""
     code = (
-        "import signal, os; from drgs import interrupts\n"
+        "import signal, os; from drgs.guards import interrupts\n"
         "with interrupts.between_steps() as is_interrupted:\n"
         "    from drgs.data.native import pycolmap\n"
         "    os.kill(os.getpid(), signal.SIGTERM); print(is_interrupted(), flush=True)\n"

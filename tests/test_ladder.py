@@ -11,7 +11,7 @@ import scenes_random
 import torch
 
 from drgs import integrator, reference
-from drgs.ladder import GROUPS, Pictures, _detached, ladder, sequences, table
+from drgs.lab.ladder import GROUPS, Pictures, _detached, ladder, sequences, table
 from drgs.settings import RenderSettings
 
 Preset = RenderSettings.preset

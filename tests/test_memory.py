@@ -1,4 +1,4 @@
-"""Claims of drgs.memory: what cannot fit is refused before it starts, whoever sets the limit and whoever the size."""
+"""Claims of drgs.guards.memory: what cannot fit is refused before it starts, whoever sets limit and size."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ import pytest
 import torch
 
 import drgs
-from drgs import cli, memory
-from drgs.camera_lists import save_cameras_json
+from drgs import cli
 from drgs.cameras import orbit
+from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
+from drgs.guards import memory
 
 TILES = drgs.RenderSettings.preset("fast")
 TOLD = r"there must be memory for .*, which takes at least [0-9.]+ GiB, got [0-9.]+ GiB available; "
@@ -69,7 +70,7 @@ def test_the_tightest_limit_counts(tmp_path, monkeypatch):
 
 def test_address_space_counts(tmp_path):
     """`ulimit -v` is a limit too."""
-    code = "from drgs import memory; print(memory.available())"
+    code = "from drgs.guards import memory; print(memory.available())"
     limit = 3 << 30
     done = subprocess.run(
         [sys.executable, "-c", code],

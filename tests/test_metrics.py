@@ -9,7 +9,7 @@ import torch
 
 from drgs import metrics
 from drgs.cameras import orbit
-from drgs.frames import Frame
+from drgs.fitting.frames import Frame
 from drgs.settings import RenderSettings
 
 

@@ -13,16 +13,16 @@ import torch
 from mutations import damaged_bytes, damaged_json
 from test_data import write_colmap, write_image, write_llff, write_transforms
 
-from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.cameras import orbit
 from drgs.data import load
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.checks import read_image
 from drgs.data.points import read_point_ply
-from drgs.density import Model
 from drgs.files import SCHEMA, Run, load_ply, load_state, save_ply, save_state
-from drgs.frames import Frame
-from drgs.run_records import check_checkpoint, fitted_views
-from drgs.trainer import FitConfig, Trainer
+from drgs.fitting.density import Model
+from drgs.fitting.frames import Frame
+from drgs.fitting.records import check_checkpoint, fitted_views
+from drgs.fitting.trainer import FitConfig, Trainer
 
 
 def attempt(read, path, versions) -> None:

@@ -10,8 +10,9 @@ import types
 
 import pytest
 
-from drgs import cli, progress
-from drgs.progress import Bar
+from drgs import cli
+from drgs.display import progress
+from drgs.display.progress import Bar
 
 
 @pytest.fixture
@@ -138,7 +139,7 @@ def test_bar_on_a_terminal():
     import os
 
     code = (
-        "import time\nfrom drgs.progress import Bar\n"
+        "import time\nfrom drgs.display.progress import Bar\n"
         "with Bar('root', show=True, lines_only=True), Bar('fit', 3000, done=1500) as bar:\n"
         "    for i in range(1500, 1520):\n"
         "        bar.update(i, text='27.13 dB, 123456 Gaussians')\n        time.sleep(0.02)\n"

@@ -13,9 +13,11 @@ import pytest
 import torch
 
 import drgs
-from drgs import cli, orbits, pictures
-from drgs.camera_lists import load_cameras_json, save_cameras_json
+from drgs import cli
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
+from drgs.commands import orbits
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
+from drgs.display import pictures
 from drgs.files import save_ply
 
 N = 60
@@ -257,7 +259,7 @@ def test_bad_input(scene, gaussians, camera, tmp_path, capsys, line, expected):
 @pytest.mark.parametrize("name", ["view.png", "render.json", "turntable.webm", "cameras.json"])
 def test_files_of_others_stay(scene, camera, tmp_path, capsys, monkeypatch, name):
     """Whatever -o is: what is there and was not rendered here is refused before the first frame."""
-    monkeypatch.setattr("drgs.render_command.render_views", lambda *_, **__: pytest.fail("rendered"))
+    monkeypatch.setattr("drgs.commands.render.render_views", lambda *_, **__: pytest.fail("rendered"))
     save_cameras_json(tmp_path / "other.json", [dataclasses.replace(camera, name="view")])
     (tmp_path / name).write_text("[1, 2]")
     cameras = "orbit" if name.endswith("webm") else tmp_path / "other.json"
@@ -285,7 +287,7 @@ def test_input_is_no_output(scene, camera, tmp_path, capsys, monkeypatch):
 
 def test_names_that_repeat_or_escape(gaussians, camera, tmp_path):
     """Names become file names inside the folder, each its own."""
-    from drgs.render_command import render_views
+    from drgs.commands.render import render_views
 
     cameras = [dataclasses.replace(camera, name=name) for name in ("../x", "../x", "", "..")]
     report = render_views(gaussians, cameras, drgs.RenderSettings.preset("fast"), tmp_path / "out")

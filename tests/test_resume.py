@@ -1,4 +1,4 @@
-"""Claims of drgs.resume: a run is never lost, to a second fit, to a damaged file, or by following what messages say."""
+"""Claims of drgs.fitting.resume: a run is never lost, to a second fit, a damaged file, or what messages say."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import pytest
 from test_train import config, dataset  # noqa: F401 (a fixture)
 
 import drgs
-from drgs import cli, locks
+from drgs import cli
 from drgs.files import Run, load_state, save_ply
-from drgs.resume import FILES, PREVIOUS, last_checkpoint
+from drgs.fitting.resume import FILES, PREVIOUS, last_checkpoint
+from drgs.guards import locks
 from drgs.train import Trainer, fit
 
 

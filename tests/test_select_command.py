@@ -10,13 +10,13 @@ from test_active import SIZE, config, lazily, plan, write_still
 
 import drgs
 from drgs import cli, fisher
-from drgs.camera_lists import load_cameras_json, save_cameras_json
 from drgs.cameras import Camera, look_at, orbit
+from drgs.commands.viewpoints import dome
 from drgs.data import load
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import Run, load_ply, save_ply
 from drgs.gain import Prior, information_gain
 from drgs.train import fit
-from drgs.viewpoints import dome
 
 
 @pytest.fixture(scope="module")

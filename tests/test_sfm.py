@@ -10,7 +10,7 @@ from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
-from drgs.sfm import run_sfm
+from drgs.data.sfm import run_sfm
 
 pytest.importorskip("pycolmap")
 cv2 = pytest.importorskip("cv2")

@@ -11,7 +11,8 @@ import pytest
 import torch
 from scenes_random import camera
 
-from drgs import accuracy, cli, extremes, fisher, refusals, stress
+from drgs import cli, fisher
+from drgs.lab import accuracy, extremes, refusals, stress
 
 TWO = "Gaussian, `gsplat`"  # two cases, on tiles
 NAMES = {"1 Gaussian, `gsplat`", "camera inside a Gaussian, `gsplat`"}

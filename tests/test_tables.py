@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drgs import tables
+from drgs.display import tables
 
 LONG = "IMG_20231012_123456_a_name_that_is_rather_long_[bold].JPG"
 

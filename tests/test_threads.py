@@ -13,8 +13,8 @@ import torch
 from scenes_random import camera, gaussians
 
 from drgs.integrator import render, render_jvp
-from drgs.scene import Scene
 from drgs.settings import RenderSettings
+from drgs.tracing.call import Scene
 
 HERE = Path(__file__).parent
 SETTINGS = RenderSettings.preset("fast")
@@ -73,9 +73,9 @@ def _run(script: str) -> subprocess.CompletedProcess:
 SCENE = """
 import os, sys
 import numpy as np
-from drgs.accuracy import random_camera, random_gaussians
+from drgs.lab.accuracy import random_camera, random_gaussians
 from drgs.integrator import render
-from drgs.scene import Scene
+from drgs.tracing.call import Scene
 from drgs.settings import RenderSettings
 
 def draw():

@@ -10,16 +10,17 @@ import pytest
 import torch
 from scenes_random import around_camera, camera, gaussians
 
-from drgs import reference, runtime, tiles
+from drgs import reference, runtime
 from drgs.integrator import render
-from drgs.scene import Scene, to_drjit
 from drgs.settings import RenderSettings
+from drgs.tracing import tiles
+from drgs.tracing.call import Scene, to_drjit
 
 runtime.backend()
 import drjit as dr  # noqa: E402
 
-from drgs.composite import _pack  # noqa: E402
-from drgs.tiles import TILE, build  # noqa: E402
+from drgs.tracing.composite import _pack  # noqa: E402
+from drgs.tracing.tiles import TILE, build  # noqa: E402
 
 
 def _scene(g, cam, settings):
@@ -142,7 +143,7 @@ def test_image_smaller_than_a_tile_and_larger(rng):
 
 def test_too_many_pairs(monkeypatch):
     """2^32 list entries are refused before anything of that size is allocated, however much memory there is."""
-    monkeypatch.setattr("drgs.memory.available", lambda: None)
+    monkeypatch.setattr("drgs.guards.memory.available", lambda: None)
     rng = np.random.default_rng(0)
     cam, g = camera(rng, (2**15, 2**15)), gaussians(rng, 300, 1, scale=1e3)
     with pytest.raises(ValueError, match="fewer than 2\\^32 entries.*lower extent or image size"):

@@ -10,15 +10,16 @@ import pytest
 import torch
 from scenes_random import gaussians
 
-from drgs import cli, fisher, reference, tradeoff
-from drgs.camera_lists import load_cameras_json, save_cameras_json
+from drgs import cli, fisher, reference
 from drgs.cameras import orbit
+from drgs.commands import tradeoff
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import load_ply, save_ply
 from drgs.integrator import render
+from drgs.lab.tradeoff import measure
+from drgs.lab.tradeoff_advice import interval, recommend
+from drgs.lab.tradeoff_full import measure_full
 from drgs.settings import RenderSettings
-from drgs.tradeoff_advice import interval, recommend
-from drgs.tradeoff_full import measure_full
-from drgs.tradeoff_measure import measure
 
 BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
 
@@ -228,7 +229,7 @@ def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     assert report["full"]["forward"]["size"] == report["full"]["forward"]["drawn"] == [80, 64]
 
     def timed(seconds):
-        monkeypatch.setattr("drgs.tradeoff_full.clocked", lambda work: (None, seconds))  # whatever is done
+        monkeypatch.setattr("drgs.lab.tradeoff_full.clocked", lambda work: (None, seconds))  # whatever is done
         found = measure_full(report, load_ply(place / "scene.ply"), large, BUDGETS, 1, 60.0, 0, lambda text: None)
         return found["forward"]
 

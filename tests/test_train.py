@@ -1,4 +1,4 @@
-"""Claims of drgs.train, drgs.trainer, drgs.density and drgs.losses on a tiny scene that is made of Gaussians."""
+"""Claims of drgs.train and drgs.fitting (trainer, density, losses) on a tiny scene that is made of Gaussians."""
 
 import dataclasses
 import json
@@ -14,12 +14,12 @@ import drgs
 from drgs import metrics
 from drgs.cameras import orbit
 from drgs.data.views import Dataset, View
-from drgs.density import Model, add_gaussians, divide, explore, relocate
+from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state
-from drgs.frames import Frame, load_frames
-from drgs.losses import photometric_loss, ssim, ssim_map
-from drgs.pictures import write_png
+from drgs.fitting.density import Model, add_gaussians, divide, explore, relocate
+from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.losses import photometric_loss, ssim, ssim_map
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 32
@@ -99,7 +99,7 @@ def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
 
 def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys):
     """`drgs eval` measures from the files what `fit` measured."""
-    from drgs.options import Eval
+    from drgs.commands.options import Eval
 
     result = fit(dataset, tmp_path / "run", config(max_steps=5), progress=False)
     monkeypatch.setattr("drgs.data.load", lambda path, **_: dataset)

@@ -13,7 +13,7 @@ from drgs.data.llff import load_llff
 from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.views import Dataset, View
-from drgs.foreign import refuse_foreign
+from drgs.guards.foreign import refuse_foreign
 
 __all__ = ["Dataset", "View", "added_points", "initial_points", "load", "scene_extent"]
 

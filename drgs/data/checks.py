@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from drgs import memory
-from drgs.foreign import refuse_foreign
+from drgs.guards import memory
+from drgs.guards.foreign import refuse_foreign
 
 __all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_npy"]
 

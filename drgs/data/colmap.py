@@ -11,8 +11,8 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
-from drgs.foreign import refuse_foreign
-from drgs.unfinished import temporary_folder
+from drgs.guards.foreign import refuse_foreign
+from drgs.guards.unfinished import temporary_folder
 
 __all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
 

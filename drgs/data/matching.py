@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs import interrupts
-from drgs.unfinished import temporary_folder
+from drgs.guards import interrupts
+from drgs.guards.unfinished import temporary_folder
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs"]
 

@@ -2,7 +2,7 @@
 
 import pycolmap
 
-from drgs import interrupts
+from drgs.guards import interrupts
 
 __all__ = ["pycolmap"]
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.capture import Focus
+from drgs.data.capture import Focus
 from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
-from drgs.foreign import refuse_foreign
-from drgs.progress import Bar
+from drgs.display.progress import Bar
+from drgs.guards.foreign import refuse_foreign
 
 __all__ = ["added_points", "initial_points", "read_point_ply", "scene_extent"]
 

@@ -14,7 +14,7 @@ from drgs.cameras import Camera, c2w_from_opengl, intrinsics, inverse_pose
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.points import read_point_ply
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
-from drgs.json_files import check_json, read_json
+from drgs.guards.json_files import check_json, read_json
 
 __all__ = ["find_transforms", "load_transforms"]
 

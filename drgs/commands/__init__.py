@@ -1,0 +1,1 @@
+"""The commands of `drgs`, one module each, and what they share."""

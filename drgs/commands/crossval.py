@@ -1,0 +1,83 @@
+"""`drgs crossval`: a rasterizer against the model that it claims to compute, as tables, JSON and an HTML report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from drgs import runtime
+from drgs.commands.viewpoints import seen_views
+from drgs.display import tables
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.fitting.active import at_most
+from drgs.guards.outputs import check_file, claim
+from drgs.lab import rasterizers
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Crossval
+    from drgs.lab.crossval import Result
+
+__all__ = ["run"]
+
+
+def run(args: Crossval) -> int:
+    """`drgs crossval SCENE`: 1 if a gradient is wrong, or, with --strict, if anything is not as the preset has it."""
+    from drgs.lab.crossval import crossval
+    from drgs.lab.report import html
+
+    inputs = [args.scene, args.cameras or "", args.rasterizer]
+    if args.export is None:
+        claim(args.output, "crossval", ["report.html", "crossval.json"], inputs)
+    elif args.export.suffix != ".npz":
+        raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
+    else:
+        check_file(args.export, "crossval", inputs, rasterizers.is_export)
+    g, fields, cameras, source = seen_views(args)
+    cameras = [at_most(camera, args.max_pixels) for camera in cameras]
+    if args.export is not None:
+        background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
+        rasterizers.export(args.export, g, cameras, background, args.seed)
+        if not args.quiet:
+            print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
+        return 0
+    rasterizer = rasterizers.load(args.rasterizer, g, cameras, fields)
+    with Bar("crossval", show=not args.quiet) as bar:
+
+        def advance(stage: str) -> None:
+            bar.update(0, label=f"crossval, {stage}")
+
+        result = crossval(rasterizer, g, cameras, args.preset, fields, seed=args.seed, advance=advance)
+        report = {"schema": SCHEMA, "command": "crossval", "scene": str(args.scene), "source": source} | result.report
+        table = ""
+        if args.ladder:
+            from drgs.lab import ladder
+
+            advance("ladder")
+            report["ladder"] = ladder.ladder(result.gaussians, result.cameras, result.model.settings, seed=args.seed)
+            table = ladder.table(report["ladder"])
+    report["env"] = runtime.info()
+    with atomic_write(args.output / "report.html") as file:
+        file.write(html(report, result.images, table).encode())
+    write_json(args.output / "crossval.json", report)
+    if not args.quiet:
+        _print(result, args)
+    bad = result.verdict == "gradient bug" or (args.strict and result.verdict != "agreement")
+    return int(bad)
+
+
+def _print(result: Result, args: Crossval) -> None:
+    """What was found, on stdout."""
+    report, rows = result.report, []
+    for name, row in report["groups"].items():
+        numbers = f"{row['relative']:.1e}", f"{row['cosine']:.6f}", f"{row['bias']:+.1e}"
+        rows.append((name, row["verdict"], *numbers, row["why"]))
+    title = f"{report['rasterizer']} against preset {report['preset']} ({report['reference']})"
+    tables.show(title, ("group", "verdict", "relative", "cosine", "bias", "why"), rows, texts=("verdict", "why"))
+    for line in report["scope"]:
+        print(line)
+    for line in result.lines():
+        if line.startswith(("convention:", "view ")):
+            print(line)
+    rms, share = (max(view[k] for view in report["image"]["views"]) for k in ("rms", "share"))
+    print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
+    print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json")

@@ -1,0 +1,340 @@
+"""`drgs demo`: photographs become Gaussians, and every claim about the renderer is measured on them.
+
+The still life is path traced from meshes by scenes/still_life.py, so nothing is downloaded and
+nothing in it is a Gaussian. Times are medians of interleaved runs with warm kernels on this machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+import drgs
+from drgs import metrics, runtime
+from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.display import pictures, tables
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, write_json
+from drgs.guards.outputs import Claim, claim
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Demo
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.frames import Frame
+
+__all__ = ["Plan", "make_demo", "run"]
+
+_PRESETS = {
+    "exact": "exact order along every ray, nothing cut off above 1e-5",
+    "fast": "one depth a Gaussian, cut at 3 sigma",
+    "inria": "INRIA's rasterizer: projected covariance, its cut-offs",
+    "gsplat": "gsplat's rasterizer, its cut-offs",
+    "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
+}
+_GAIN = 8  # of difference pictures
+_OWN = ("demo", "eval")  # commands whose files in the run may be replaced
+_TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
+_DISTANCE = 1.1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How much of everything; the defaults take minutes.
+
+    Attributes:
+        views, width, height, spp: Of the still life.
+        steps, gaussians: Of the fit.
+        crop: Width and height of the part that the float64 oracle renders.
+        repeats: Rounds of interleaved timing.
+        frames: Of the turntable.
+    """
+
+    views: int = 28
+    width: int = 240
+    height: int = 180
+    spp: int = 30
+    steps: int = 1500
+    gaussians: int = 24_000
+    crop: tuple[int, int] = (48, 36)
+    repeats: int = 5
+    frames: int = 48
+
+    @classmethod
+    def quick(cls) -> Plan:
+        """Half a minute, to see that everything runs; its pictures are poor."""
+        return cls(views=9, width=80, height=60, spp=4, steps=60, gaussians=1500, crop=(16, 12), repeats=2, frames=6)
+
+
+def run(args: Demo) -> None:
+    """`drgs demo`."""
+    make_demo(args.output, Plan.quick() if args.quick else Plan(), progress=not args.quiet)
+
+
+def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
+    """Make, fit, render, compare; writes pictures and demo.json.
+
+    Args:
+        out_dir: Its folders `still_life` (kept if it is there) and `run` (replaced) belong to the demo; a folder of
+            that name that an earlier demo did not make is refused.
+        plan: How much.
+        progress: Say what comes out, on stdout, and how far it is, on stderr.
+    Returns:
+        What demo.json holds.
+    Raises:
+        FileNotFoundError: If the package `scenes` is not installed.
+        ValueError: If something is in the way that an earlier demo did not make.
+    """
+    with (
+        claim(out_dir, "demo", ["comparison.png", "turntable.webm", "demo.json"]),
+        claim(Path(out_dir) / "run", "demo") as run_folder,
+    ):
+        return _make_demo(Path(out_dir), run_folder, plan, progress)
+
+
+def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> dict:
+    from drgs.fitting.frames import load_frames
+    from drgs.train import FitConfig, fit
+
+    run_folder.check_all(_OWN)
+    began, seconds = time.perf_counter(), {}
+
+    def say(text: str) -> None:
+        if progress:
+            print(text, flush=True)
+
+    def lap(stage: str, start: float) -> float:
+        seconds[stage] = time.perf_counter() - start
+        return seconds[stage]
+
+    start = time.perf_counter()
+    still_life = _still_life()
+    size = {"views": plan.views, "width": plan.width, "height": plan.height, "spp": plan.spp}
+    with Bar("path tracing", plan.views, progress) as bar:
+        data = still_life.generate(out_dir / "still_life", **size, progress=lambda done, total: bar.update(done, total))
+    took = lap("still life", start)
+    say(f"1. Still life: {plan.views} views of {plan.width}x{plan.height}, path traced from meshes ({took:.0f} s)")
+
+    start = time.perf_counter()
+    dataset = drgs.data.load(data)
+    config = FitConfig(
+        max_steps=plan.steps, max_gaussians=plan.gaussians, max_pixels=plan.width * plan.height, save_every=plan.steps
+    )
+    run_folder.clear(_OWN)
+    fitted = fit(dataset, out_dir / "run", config, progress=progress)
+    lap("fit", start)
+    g, mean = fitted.gaussians, fitted.metrics["mean"]
+    frames = load_frames(dataset.split()[1], config.max_pixels, config.mask)
+    say(
+        f"2. Fit: {len(g)} Gaussians, {plan.steps} steps in {fitted.seconds:.0f} s; {len(frames)} views that it never "
+        f"saw: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}, FLIP {mean['flip']:.3f}"
+    )
+
+    start = time.perf_counter()
+    with Bar("presets compared", show=progress):
+        images, rows = _compare(g, frames, plan.repeats)
+    lap("comparison", start)
+    say(f"3. The same Gaussians by the rules of other renderers ({len(frames)} held-out views)")
+    if progress:
+        _table(rows)
+
+    start = time.perf_counter()
+    with Bar("float64 oracle", show=progress):
+        oracle = _check(g, frames[0], images["exact"][0], plan.crop)
+    lap("oracle", start)
+    say(
+        f"4. Float64 oracle, {oracle['width']}x{oracle['height']} pixels of view {oracle['view']}: `exact` is off by "
+        f"at most {oracle['max_error']:.1e} (claimed: 1e-5) where no two of {oracle['hits_a_ray']:.0f} hits a ray tie "
+        f"({100 * oracle['ties']:.0f} % of the pixels do)"
+    )
+
+    start = time.perf_counter()
+    with Bar("Mitsuba's integrator", show=progress):
+        peer = _race(g, frames[0].camera, plan.repeats)
+    lap("peer", start)
+    say(
+        f"5. Mitsuba's own volprim_rf_basic: {1e3 * peer['volprim_rf_basic']:.0f} ms a view, `fast`: "
+        f"{1e3 * peer['fast']:.0f} ms, {peer['ratio']:.1f} times as fast (interleaved, {plan.repeats} rounds)"
+    )
+
+    start = time.perf_counter()
+    pictures.write_png(out_dir / "comparison.png", _sheet(frames, images))
+    _turntable(g, out_dir / "turntable.webm", plan, progress)
+    lap("pictures", start)
+    seconds["total"] = time.perf_counter() - began
+    say(f"6. Pictures: {out_dir / 'comparison.png'}, {out_dir / 'turntable.webm'}, {out_dir / 'run' / 'renders'}")
+    say(f"All of it took {seconds['total']:.0f} s; numbers: {out_dir / 'demo.json'}")
+    report = {
+        "schema": SCHEMA,
+        "command": "demo",
+        "plan": dataclasses.asdict(plan),
+        "fit": {"gaussians": len(g), "seconds": fitted.seconds, "split": fitted.metrics["split_rule"], "mean": mean},
+        "presets": rows,
+        "oracle": oracle,
+        "peer": peer,
+        "seconds": seconds,
+        "env": runtime.info(),
+    }
+    write_json(out_dir / "demo.json", report)
+    return report
+
+
+def _still_life():
+    try:
+        from scenes import still_life
+    except ImportError:
+        raise FileNotFoundError(
+            "demo: the package `scenes` must be installed, it is not; run `pip install -e .` in a checkout"
+        ) from None
+    return still_life
+
+
+def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str, list[torch.Tensor]], list[dict]]:
+    """Images of every preset, and one row of numbers each."""
+    settings = {name: RenderSettings.preset(name) for name in _PRESETS}
+    images = {name: [_draw(g, frame.camera, s) for frame in frames] for name, s in settings.items()}
+    times: dict[str, list[float]] = {name: [] for name in settings}
+    for i in range(repeats):
+        frame = frames[i % len(frames)]
+        for name, s in settings.items():
+            times[name].append(_seconds(lambda s=s, camera=frame.camera: _draw(g, camera, s)))
+    rows = []
+    for name in settings:
+        pairs = list(zip(images[name], images["exact"], strict=True))
+        photos = [metrics.psnr(a.clamp(0, 1), f.image()) for a, f in zip(images[name], frames, strict=True)]
+        same = name == "exact"
+        rows.append(
+            {
+                "preset": name,
+                "what": _PRESETS[name],
+                "psnr_to_photographs": statistics.mean(photos),
+                "psnr_to_exact": None if same else statistics.mean(metrics.psnr(a, b) for a, b in pairs),
+                "max_difference": None if same else max(float((a - b).abs().max()) for a, b in pairs),
+                "seconds": statistics.median(times[name]),
+                "time_of_exact": statistics.median(t / e for t, e in zip(times[name], times["exact"], strict=True)),
+            }
+        )
+    return images, rows
+
+
+def _draw(g: Gaussians, camera: Camera, settings: RenderSettings) -> torch.Tensor:
+    """(H, W, 3) on the CPU, computed when this returns."""
+    import drjit as dr
+
+    with torch.no_grad():
+        image = drgs.render(g, camera, settings, outputs=()).rgb.cpu()
+    dr.sync_thread()
+    return image
+
+
+def _seconds(work: Callable) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def _check(g: Gaussians, frame: Frame, image: torch.Tensor, crop: tuple[int, int]) -> dict:
+    """The middle of an `exact` image against the float64 oracle."""
+    camera, (width, height) = frame.camera, crop
+    x, y = (camera.width - width) // 2, (camera.height - height) // 2
+    K = camera.K.copy()
+    K[:2, 2] -= x, y
+    part = dataclasses.replace(camera, K=K, width=width, height=height)
+    with torch.no_grad():
+        truth = drgs.reference.render(g, part, RenderSettings.preset("exact"))
+    error = (image[y : y + height, x : x + width].double() - truth.rgb).abs()
+    # Where two peaks are nearer than float32 can tell, either order is right: the oracle marks such pixels.
+    error = error[~truth.ambiguous]
+    return {
+        "view": frame.name,
+        "width": width,
+        "height": height,
+        "max_error": float(error.max()),
+        "mean_error": float(error.mean()),
+        "ties": float(truth.ambiguous.double().mean()),
+        "hits_a_ray": float(truth.count.double().mean()),
+    }
+
+
+def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
+    """`fast` and Mitsuba's `volprim_rf_basic` at its defaults, in turn; seconds a view."""
+    mi = runtime.mitsuba()
+    from drgs.ellipsoids import ellipsoids_shape
+
+    settings = RenderSettings.preset("fast")
+    sensor = camera.to_mitsuba()
+    sensor["sampler"] = {"type": "stratified", "sample_count": 1, "jitter": False}  # pixel centers, as ours
+    # Its sRGB step is for colors in linear light; those of Gaussians are not.
+    integrator = {"type": "volprim_rf_basic", "srgb_primitives": False}
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, "shape": ellipsoids_shape(g)})
+
+    def peer() -> np.ndarray:
+        return np.asarray(mi.render(scene, spp=1))
+
+    def ours() -> np.ndarray:
+        return _draw(g, camera, settings).numpy()
+
+    theirs = peer()[..., :3]
+    mse = float(np.mean((np.clip(theirs, 0, 1) - np.clip(ours(), 0, 1)) ** 2))
+    times = [(_seconds(ours), _seconds(peer)) for _ in range(repeats)]
+    return {
+        "fast": statistics.median(a for a, _ in times),
+        "volprim_rf_basic": statistics.median(b for _, b in times),
+        "ratio": statistics.median(b / a for a, b in times),
+        "psnr_between": float(-10 * np.log10(max(mse, 1e-10))),
+        "note": "its defaults: 3 sigma, 64 hits a ray, transmittance 0.01; srgb_primitives off; 1 sample a pixel",
+    }
+
+
+def _sheet(frames: list[Frame], images: dict[str, list[torch.Tensor]]) -> np.ndarray:
+    """Rows of photograph, render and differences, for up to three views."""
+    rows = []
+    for i, frame in enumerate(frames[:3]):
+        exact, photo = images["exact"][i], frame.image()
+        parts = {f"view {frame.name}": photo, "exact": exact}
+        parts[f"|exact - photograph| x {_GAIN // 2}"] = (_GAIN // 2) * (exact.clamp(0, 1) - photo).abs()
+        for name in ("fast", "inria", "gsplat"):
+            parts[f"|{name} - exact| x {_GAIN}"] = _GAIN * (images[name][i] - exact).abs()
+        rows.append(np.concatenate([pictures.caption(x.numpy(), text) for text, x in parts.items()], axis=1))
+    return np.concatenate(rows, axis=0)
+
+
+def _turntable(g: Gaussians, path: Path, plan: Plan, progress: bool) -> None:
+    """A swing over the arc that the cameras cover: behind it, nothing was ever seen."""
+    settings = RenderSettings.preset("fast")
+    K = intrinsics_from_fov(50.0, plan.width, plan.height)
+    with pictures.Video(path) as movie, Bar("turntable", plan.frames, progress) as bar:
+        for i in range(plan.frames):
+            phase = 2 * np.pi * i / plan.frames
+            azimuth, rise = np.radians(-90 + 75 * np.sin(phase)), np.radians(30 + 10 * np.cos(phase))
+            level = np.cos(rise)
+            eye = _DISTANCE * np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(rise)])
+            camera = Camera(K=K, w2c=look_at(eye, _TARGET), width=plan.width, height=plan.height)
+            movie.write(_draw(g, camera, settings).numpy())
+            bar.advance()
+
+
+def _table(rows: list[dict]) -> None:
+    """On stdout."""
+    cells = []
+    for row in rows:
+        same = row["psnr_to_exact"] is None
+        cells.append(
+            (
+                row["preset"],
+                f"{row['psnr_to_photographs']:.2f}",
+                "-" if same else f"{row['psnr_to_exact']:.1f}",
+                "-" if same else f"{row['max_difference']:.3f}",
+                f"{1e3 * row['seconds']:.0f}",
+                f"{row['time_of_exact']:.2f}",
+            )
+        )
+    columns = ("preset", "dB to photos", "dB to exact", "most off", "ms a view", "time / exact")
+    tables.show("", columns, cells)

@@ -1,0 +1,165 @@
+"""`drgs fisher`: what known views say about every Gaussian, and what other views would still find uncertain.
+
+Two maps a view, both sums over the parameters k of squared derivatives J_pk of a pixel p, with H the information of the
+known views and Hc that of the view itself:
+
+    variance    sum_k J_pk^2 / (H_k + lambda): predictive variance of the pixel for unit noise; its sum is `eig`
+    share       sum_k J_pk^2 / Hc_k log(1 + Hc_k / (H_k + lambda)): the pixel's share of the view's `logdet`
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.commands.render import described
+from drgs.commands.viewpoints import evenly, known_views, other_views, scene_of
+from drgs.display import pictures, tables
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, save_state, write_json
+from drgs.gain import variances
+from drgs.guards.outputs import claim
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.options import Fisher
+    from drgs.commands.viewpoints import Scene
+    from drgs.fisher import Information
+    from drgs.gain import Prior
+
+__all__ = ["map_weights", "run"]
+
+
+def run(args: Fisher) -> None:
+    """`drgs fisher SCENE`."""
+    from drgs import fisher
+    from drgs.gain import Prior, check
+
+    if not 1 <= args.limit <= 10_000:
+        raise ValueError(f"fisher: --limit must be in [1, 10000], got {args.limit}; correct it")
+    prior = Prior(value=args.prior, relative=args.relative_prior)
+    inputs = [args.scene, args.train or "", args.cameras or ""]
+    output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
+    scene = scene_of(args)
+    text = args.train
+    if text is None and scene.run is None:
+        if args.cameras in (None, "orbit", "dome"):
+            raise ValueError(
+                "a PLY has no record of its views: --train or --cameras must name a data set, a run or a cameras.json"
+            )
+        text = args.cameras
+    known = known_views(text, scene)
+    views, source = known.cameras, known.source
+    if args.cameras is not None:
+        views, source = other_views("--cameras", args.cameras, args, scene, known, fresh=False)
+    views = evenly(views, args.limit)
+    names = pictures.file_names([camera.name for camera in views])
+    output.check(f"{name}.{kind}.png" for name in names for kind in ("variance", "share"))
+    with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
+        H: Information = {}
+        for camera in known.cameras:
+            part = fisher.diagonal(scene.gaussians, camera, scene.settings, args.method)
+            check(f"fisher: view {camera.name}", part)
+            H = {name: x + H[name] if H else x for name, x in part.items()}
+            bar.advance()
+        rows = []
+        for camera, name in zip(views, names, strict=True):
+            rows.append(_view(args, scene, camera, name, H, prior))
+            bar.advance()
+    header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": scene.settings}
+    save_state(args.output / "information.safetensors", H, header)
+    report = {
+        "schema": SCHEMA,
+        "command": "fisher",
+        "scene": str(args.scene),
+        "gaussians": len(scene.gaussians),
+        "method": args.method,
+        "prior": {"value": args.prior, "relative": args.relative_prior},
+        "settings": dataclasses.asdict(scene.settings),
+        "pixels": scene.pixels,
+        "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
+        "groups": {name: _summary(x) for name, x in H.items()},
+        "source": source,
+        "views": rows,
+    }
+    write_json(args.output / "fisher.json", report)
+    if not args.quiet:
+        _print(report, args)
+
+
+def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[Information, Information]:
+    """Weights of `drgs.fisher.variance_map` for the two maps of the module's text.
+
+    Args:
+        H, candidate: Information of the known views and of the view shown, same groups.
+        prior: lambda; parameters with H + lambda = 0 weigh nothing.
+    Returns:
+        Those of `variance` and of `share`.
+    """
+    variance, share = variances(H, prior), {}
+    for name in H:
+        Hc = candidate[name].double()
+        # log(1 + x) / Hc tends to the variance where the view says nothing about a parameter.
+        share[name] = torch.where(Hc > 0, (Hc * variance[name]).log1p() / Hc, variance[name])
+    return variance, share
+
+
+def _view(args: Fisher, scene: Scene, camera: Camera, name: str, H: Information, prior: Prior) -> dict:
+    """Maps of one view, and what it says."""
+    from drgs import fisher
+    from drgs.gain import information_gain
+
+    g, settings = scene.gaussians, scene.settings
+    Hc = fisher.diagonal(g, camera, settings, args.method)
+    row = {"name": camera.name, "camera": described(camera), "files": []}
+    row["gain"] = {c: information_gain(Hc, H, c, prior).total for c in ("logdet", "eig")}
+    # Maps are of the image's colors; features have an image of their own.
+    parts = map_weights(*({k: x for k, x in y.items() if k != "features"} for y in (H, Hc)), prior)
+    for kind, weights in zip(("variance", "share"), parts, strict=True):
+        values = fisher.variance_map(g, camera, weights, settings).numpy()
+        pictures.write_png(args.output / f"{name}.{kind}.png", pictures.map_picture(values))
+        row["files"].append(f"{name}.{kind}.png")
+        row[kind] = {
+            "sum": float(values.sum(dtype=np.float64)),
+            "mean": float(values.mean()),
+            "max": float(values.max()),
+        }
+    if args.pose:
+        pose = fisher.pose_information(g, camera, settings)
+        row["pose"] = {"information": pose.tolist(), "eigenvalues": torch.linalg.eigvalsh(pose).tolist()}
+    return row
+
+
+def _summary(x: torch.Tensor) -> dict:
+    positive = x[x > 0]
+    return {
+        "shape": list(x.shape),
+        "sum": float(x.sum()),
+        "median_of_positive": float(positive.median()) if positive.numel() else None,
+        "zero": int((x == 0).sum()),
+    }
+
+
+def _print(report: dict, args: Fisher) -> None:
+    """What was found, as tables on stdout."""
+    rows = []
+    for name, row in report["groups"].items():
+        share = f"{row['zero'] / max(int(np.prod(row['shape'])), 1):.1%}"
+        shape = "x".join(map(str, row["shape"]))
+        rows.append((name, shape, f"{row['sum']:.4g}", f"{row['median_of_positive'] or 0:.4g}", share))
+    title = f"information of {len(report['known']['names'])} views ({report['known']['source']})"
+    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known"), rows)
+    rows = []
+    for row in report["views"]:
+        values = row["pose"]["eigenvalues"] if args.pose else []
+        numbers = (row["gain"]["eig"], row["gain"]["logdet"], row["variance"]["mean"], *values[:1], *values[-1:])
+        rows.append((row["name"], *(f"{x:.3g}" for x in numbers)))
+    columns = ("view", "eig", "logdet", "mean variance", *(("pose: least", "most") if args.pose else ()))
+    tables.show(f"views ({report['source']})", columns, rows)
+    if args.pose:
+        print("pose: information about the least and the best known of its six directions; fisher.json has all six")
+    files = sum(len(row["files"]) for row in report["views"])
+    print(f"information.safetensors, fisher.json and {files} maps: {args.output}")

@@ -1,0 +1,412 @@
+"""The options of every command: a dataclass each, its docstrings the help texts.
+
+Imports nothing heavy: `drgs --help` reads them all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+__all__ = [
+    "Crossval",
+    "Demo",
+    "Eval",
+    "Fisher",
+    "Fit",
+    "Info",
+    "Render",
+    "Select",
+    "Sfm",
+    "Stress",
+    "Tradeoff",
+]
+
+_Output = Annotated[Path, arg(aliases=["-o"])]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Common:
+    """Options that every command has."""
+
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb"] = "auto"
+    """Backend; auto follows DRGS_VARIANT, then CUDA if it works, else LLVM."""
+    threads: int | None = None
+    """Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core."""
+    quiet: bool = False
+    """Print neither progress nor results, which are in the files; only warnings and errors."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Settings(_Common):
+    """Options of commands that render."""
+
+    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "exact"
+    """Render settings of a named system."""
+    overrides: Annotated[
+        tuple[str, ...],
+        arg(name="set", metavar="KEY=VALUE", help="Replace one render setting, e.g. order=ray."),
+        UseAppendAction,
+    ] = ()
+
+    def settings(self):
+        """The `RenderSettings` that --preset and --set describe.
+
+        Raises:
+            ValueError: If an override is no KEY=VALUE, names no field or has the wrong type.
+        """
+        from drgs.settings import RenderSettings
+
+        return RenderSettings.preset(self.preset, **self.replaced())
+
+    def replaced(self) -> dict:
+        """The fields that --set replaces.
+
+        Raises:
+            ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
+        """
+        from drgs.settings import RenderSettings
+
+        hints = typing.get_type_hints(RenderSettings)
+        values = {}
+        for text in self.overrides:
+            key, equals, value = text.partition("=")
+            if not equals or key not in hints:
+                what = "KEY=VALUE" if not equals else "a render setting"
+                raise ValueError(f"--set: must be {what}, got {text!r}; known: {', '.join(hints)}")
+            values[key] = _parse(key, hints[key], value)
+        if "background" in values:
+            check_color("--set background", values["background"])
+        return values
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Data:
+    """Options of commands that load data sets."""
+
+    strict: bool = False
+    """Refuse a data set that lists images which are not there; else at least 3 must be, and the others are left out."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Around:
+    """Options of commands that can make cameras around a scene; what is not given is as a run's photographs or the
+    known views have it, where there are any.
+    """
+
+    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
+    """World direction that is up on an orbit or a dome; auto: as the photographs, else minus-y."""
+    center: tuple[float, float, float] | None = None
+    """World point that an orbit or a dome looks at; default as the photographs, else the middle of the Gaussians."""
+    distance: float | None = None
+    """From that point, in scene units; default the photographs' median, else so that all is in the frame."""
+    elevation: float | None = None
+    """Degrees of an orbit above its center; default the photographs' median, else 20."""
+    span: float | None = None
+    """Degrees of an orbit; default as the photographs (select, fisher: 360 if they look at a point), else 360."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Information(_Settings):
+    """Options of commands that compute Fisher information."""
+
+    method: Literal["exact", "columns", "probes", "fisherrf"] = "exact"
+    """How information is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
+    prior: float = 1e-6
+    """How firmly every parameter counts as known beforehand (lambda); 0 leaves out what no training view has seen."""
+    relative_prior: bool = False
+    """lambda is --prior times the median information of a parameter's group, where it is not 0."""
+    info_pixels: int | None = None
+    """Information is computed on views of at most this many pixels; default as in the fit."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Policy(_Information):
+    """Options of commands that choose views."""
+
+    policy: Literal["fisher", "fisherrf", "coverage", "farthest", "uniform", "random"] = "fisher"
+    """How the next view is chosen (docs/information.md)."""
+    criterion: Literal["eig", "logdet", "trace_cov", "block_logdet"] = "eig"
+    """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Info(_Common):
+    """Report backend, libLLVM, CUDA, threads and package versions."""
+
+    json: bool = False
+    """Print JSON."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render(_Settings, _Around, _Data):
+    """Render a Gaussian PLY, or a finished run, to pictures or a video."""
+
+    scene: Positional[Path]
+    """A 3DGS point_cloud.ply or a run folder."""
+    cameras: str = "orbit"
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit."""
+    output: _Output = Path("out/render")
+    """Folder for the pictures."""
+    width: int | None = None
+    """Image width in pixels; default the camera's, of an orbit 640."""
+    height: int | None = None
+    """Image height in pixels; default the camera's."""
+    frames: int = 60
+    """Views of an orbit."""
+    fov: float | None = None
+    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
+    format: str = "png"
+    """Comma-separated list of png, exr, webm."""
+    fps: float = 24.0
+    """Frames a second of the video."""
+    depth: bool = False
+    """Write color-mapped depth too; exr files hold it anyway."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which views of a data set."""
+    limit: int | None = None
+    """At most this many views."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fit(_Policy, _Data):
+    """Fit Gaussians to photographs with known cameras."""
+
+    data: Positional[Path]
+    """A data set: COLMAP, transforms.json, LLFF, or a folder made by drgs sfm."""
+    output: _Output
+    """The run folder."""
+    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
+    """Render settings of a named system. Train with what will be rendered with: gsplat for viewers of PLY files."""
+    max_steps: int = 3000
+    """Optimizer steps."""
+    max_pixels: int = 130_000
+    """Images are reduced to at most this many pixels."""
+    max_gaussians: int = 30_000
+    """How many Gaussians there may be."""
+    init_points: Literal["auto", "views", "all"] = "auto"
+    """Initial points: of the training views (views) or of the data set (all); auto: all, or views if --views active."""
+    test_every: int = 8
+    """Every n-th view, by name, is held out; 0 holds out none."""
+    sh_degree: Literal[0, 1, 2, 3] = 3
+    """Highest degree of the view-dependent color."""
+    deterministic: bool = False
+    """Same seed, same bits; slower."""
+    resume: bool = False
+    """Continue from the last checkpoint in the run folder."""
+    save_every: int = 1000
+    """Steps between checkpoints."""
+    mask: Literal["auto", "object", "valid", "ignore"] = "auto"
+    """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB in [0, 1] behind everything."""
+    views: Literal["all", "active"] = "all"
+    """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
+    initial: int = 2
+    """Views at the start: the first one, then those farthest away."""
+    add: int = 10
+    """Views to be chosen on the way, one at a time; others are not read."""
+    every: int = 200
+    """Steps before the first of them, and between two."""
+    pick_points: Literal["auto", "uncovered", "none"] = "auto"
+    """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
+
+    def settings(self):
+        """As for every command, with the background that the photographs are composited on."""
+        if any(text.startswith("background=") for text in self.overrides):
+            raise ValueError("--set background: must be --background here, which photographs are composited on as well")
+        check_color("--background", self.background)
+        return super().settings().replace(background=self.background)
+
+    def active(self):
+        """The `ActiveConfig` of --views active, else None.
+
+        Raises:
+            ValueError: If an option is out of range, or belongs to --views active and that is missing.
+        """
+        from drgs.fitting.active import ActiveConfig
+
+        fields = dataclasses.fields(ActiveConfig)
+        if self.views == "active":
+            return ActiveConfig(**{field.name: getattr(self, field.name) for field in fields})
+        for field in fields:
+            if getattr(self, field.name) != field.default:
+                option = "--" + field.name.replace("_", "-")
+                raise ValueError(f"fit: {option} must have --views active, got --views all; add it or drop {option}")
+        return None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Views(_Information, _Around, _Data):
+    """Options of commands that compare views with known ones."""
+
+    scene: Positional[Path]
+    """A run folder or a 3DGS point_cloud.ply."""
+    train: str | None = None
+    """Views that are known: a data set, a run, or a cameras.json; default the run's."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which of the other views, where they are a data set's."""
+    count: int = 40
+    """Cameras of an orbit or a dome."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Select(_Policy, _Views):
+    """Rank cameras by what their views would add to a run, or to a Gaussian PLY."""
+
+    candidates: str
+    """A data set or a run (those of its views that are not known), a cameras.json, orbit, or dome."""
+    k: Annotated[int, arg(aliases=["-k"])] = 1
+    """Views to pick, each given the ones before."""
+    output: _Output = Path("out/select.json")
+    """The JSON file."""
+    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
+    """Render settings of a named system; fast ranks as exact does, in a fraction of the time (docs)."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fisher(_Views):
+    """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
+
+    cameras: str | None = None
+    """Views to draw maps for: a data set, a run, a cameras.json, orbit, or dome; default the known ones."""
+    output: _Output = Path("out/fisher")
+    """Folder for information.safetensors, fisher.json and the maps."""
+    limit: int = 4
+    """Maps of at most this many views, evenly spaced."""
+    pose: bool = False
+    """Also report what each of these views says about its own pose, a 6x6 matrix."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Seen(_Settings, _Around, _Data):
+    """Options of commands that look at a scene from a few cameras."""
+
+    scene: Positional[Path]
+    """A 3DGS point_cloud.ply or a run folder."""
+    cameras: str | None = None
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which views of a data set."""
+    limit: int = 2
+    """At most this many views, evenly spaced."""
+    max_pixels: int = 20_000
+    """Views are reduced to at most this many pixels."""
+    fov: float | None = None
+    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Crossval(_Seen):
+    """Compare a rasterizer's image and gradients with ours and name what differs, group by group."""
+
+    rasterizer: str = "drgs:ewa"
+    """drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors)."""
+    preset: Literal["auto", "exact", "fast", "inria", "gsplat", "mitsuba"] = "auto"
+    """The model that it claims to compute; auto: the one whose image is nearest."""
+    ladder: bool = True
+    """Say which approximations make that model differ from the exact one; --no-ladder saves the time."""
+    strict: bool = False
+    """Conventions that differ and known deviations fail, too, and so does a data set with images that are missing."""
+    export: Path | None = None
+    """Only write the scene, the cameras and cotangents to this .npz, for a rasterizer on another machine."""
+    output: _Output = Path("out/crossval")
+    """Folder for report.html and crossval.json."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tradeoff(_Seen):
+    """Time every accuracy/speed setting on a scene, with its image, gradient and information error."""
+
+    max_error: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
+    """Budgets: one setting is recommended for each, the fastest whose errors are all below it."""
+    repeats: int = 5
+    """Interleaved rounds of timing."""
+    seconds: float = 300.0
+    """For timing the leading settings on views as large as they are drawn; less time, smaller views."""
+    output: _Output = Path("out/tradeoff")
+    """Folder for tradeoff.json, tradeoff.md and the plot."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stress(_Common):
+    """Run the extremes of the renderer on this machine against the float64 oracle and print their errors."""
+
+    match: str = ""
+    """Only the cases with this text in their name."""
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """Folder for stress.json and stress.md; default none is written."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eval(_Common, _Data):
+    """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS when weights are given."""
+
+    run: Positional[Path]
+    """A run folder."""
+    split: Literal["all", "train", "test"] = "test"
+    """Which views."""
+    lpips_weights: Path | None = None
+    """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sfm(_Common):
+    """Recover cameras and points from plain photographs (COLMAP on the CPU)."""
+
+    images: Positional[Path]
+    """A folder of photographs."""
+    output: _Output
+    """Folder for the data set."""
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
+        "SIMPLE_RADIAL"
+    )
+    """COLMAP's name of the lens; photographs of one size share one camera."""
+    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Match all pairs, or neighbors by name (video); auto decides by their number."""
+    seed: int = 0
+    """Seed of all random sampling."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo(_Common):
+    """Make a still life, fit it, render it and compare presets: a tour in minutes."""
+
+    output: _Output = Path("out/demo")
+    """Folder for pictures and tables."""
+    quick: bool = False
+    """Half a minute with poor pictures, to see that everything runs."""
+
+
+def check_color(option: str, color: tuple[float, ...]) -> None:
+    """Raise ValueError unless a color of an option is one that a photograph can have: R, G, B in [0, 1]."""
+    if len(color) != 3 or not all(0 <= x <= 1 for x in color):
+        got = " ".join(f"{x:g}" for x in color)
+        raise ValueError(f"{option} must be R, G and B in [0, 1], got {got}; 255 is 1.0 here")
+
+
+def _parse(key: str, hint, text: str):
+    """One --set value by its field's type: str, float, `float | None`, or a tuple of floats."""
+    kinds = typing.get_args(hint) or (hint,)
+    try:
+        if typing.get_origin(hint) is tuple:
+            return tuple(float(part) for part in text.strip("()[] ").split(","))
+        if type(None) in kinds and text.lower() == "none":
+            return None
+        if bool in kinds:
+            return {"true": True, "false": False}[text.lower()]
+        number = next((kind for kind in (int, float) if kind in kinds), None)
+        return number(text) if number else text
+    except (ValueError, KeyError):
+        kind = hint.__name__ if kinds == (hint,) else hint
+        raise ValueError(f"--set {key}: must be of type {kind}, got {text!r}") from None

@@ -1,0 +1,277 @@
+"""Turntables: cameras that go around what there is to see, where the photographs say that one can stand.
+
+Three kinds of capture, told apart by their cameras alone:
+
+- The optical axes meet, or all cameras look the same way: frames go around the point looked at, on a full circle if
+  the cameras surround it, else back and forth within the span that they cover.
+- Neither (a walk through rooms, a drive): frames follow the photographs' own path.
+- No cameras (a bare PLY): frames go around the middle of the Gaussians.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.data.capture import Focus, path, upright
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["UP", "Wish", "capture_orbit", "scene_orbit", "seen_distance"]
+
+UP = {
+    "x": (1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "minus-x": (-1.0, 0.0, 0.0),
+    "minus-y": (0.0, -1.0, 0.0),
+    "minus-z": (0.0, 0.0, -1.0),
+}
+"""World directions by their names on the command line (a name must not begin with a dash)."""
+
+_ELEVATION = 20.0
+_FOV = 45.0
+_STEEPEST = 80.0  # degrees; nearer to the pole a circle turns on the spot
+_SAMPLE = 20_000  # Gaussians that decide the distance
+_FAR = 3.0  # times the median distance from the center: beyond are floaters and backgrounds
+_INSIDE = 0.998  # share of the rest that every frame shows
+_MARGIN = 1.1
+_SOLID = 0.05  # opacity below which a Gaussian is no part of the shape
+_PROBE_PIXELS = 2_500  # of a picture that says how far away what a camera sees is
+_OPAQUE = 0.5
+_NEARER = 0.25  # quantile of its distances: what is photographed stands before a background
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Wish:
+    """What a user fixes of an orbit; None leaves it to the cameras or the Gaussians.
+
+    Attributes:
+        up: (3,) world direction.
+        center: (3,) world point that all frames look at.
+        distance: Of every frame from the center, in scene units.
+        elevation: Degrees above the center.
+        span: Degrees that the frames cover; below 360 they stay in the middle of what the cameras cover.
+        fov: Horizontal field of view in degrees.
+    Raises:
+        ValueError: If one is out of range, named as the command-line option.
+    """
+
+    up: tuple[float, float, float] | None = None
+    center: tuple[float, float, float] | None = None
+    distance: float | None = None
+    elevation: float | None = None
+    span: float | None = None
+    fov: float | None = None
+
+    def __post_init__(self):
+        if self.center is not None and not np.isfinite(self.center).all():
+            raise ValueError(f"--center must be three finite numbers, got {self.center}; correct it")
+        if self.distance is not None and not 0 < self.distance < math.inf:
+            raise ValueError(f"--distance must be positive and finite, got {self.distance}; correct it")
+        for option, value, low, high in (
+            ("--elevation", self.elevation, -89, 89),
+            ("--span", self.span, 0, 360),
+            ("--fov", self.fov, 1, 170),
+        ):
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
+
+    @classmethod
+    def of(cls, args) -> Wish:
+        """Of a command's options: `up`, `center`, `distance`, `elevation`, `span` and, if it has one, `fov`."""
+        up = None if args.up == "auto" else UP[args.up]
+        fields = {name: getattr(args, name) for name in ("center", "distance", "elevation", "span")}
+        return cls(up=up, fov=getattr(args, "fov", None), **fields)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it says where frames stand or what they look at, more than through which lens."""
+        return any(value is not None for value in (self.up, self.center, self.distance, self.elevation, self.span))
+
+
+def scene_orbit(
+    gaussians: Gaussians, frames: int, *, width: int, height: int, wish: Wish | None = None, returns: bool = False
+) -> list[Camera]:
+    """An orbit around the middle of the Gaussians, outliers aside, as close as all frames show them.
+
+    Args:
+        gaussians: At least one.
+        frames: Number of cameras.
+        width, height: Pixels.
+        wish: What is fixed; else up is -y, as COLMAP's worlds stand, the elevation 20 and the field of view 45 degrees.
+        returns: On less than a full circle go back and forth, else evenly from end to end.
+    Raises:
+        ValueError: If there is no Gaussian.
+    """
+    if not len(gaussians):
+        raise ValueError("orbit: there must be at least one Gaussian, got none; use --cameras")
+    wish = wish or Wish()
+    center, offsets, reach = _shape(gaussians)
+    if wish.center is not None:
+        offsets, center = offsets + center - wish.center, np.asarray(wish.center, np.float64)
+    up = _unit(wish.up or UP["minus-y"])
+    elevation = _ELEVATION if wish.elevation is None else wish.elevation
+    lens = _Lens(intrinsics_from_fov(wish.fov or _FOV, width, height), width, height)
+    front = _level(np.eye(3)[np.argmin(np.abs(up))], up)  # any direction; this choice is stable
+    distance = wish.distance
+    if distance is None:
+        distance = 0.0
+        for camera in _around(center, up, front, _turns(min(frames, 24), 360.0, False), 1.0, elevation, lens):
+            local = offsets @ camera.w2c[:3, :3].T
+            # A point is in the frame of a camera at distance D if |x| <= (D + z) tan and |y| likewise.
+            slope = 0.5 * np.array([width / lens.K[0, 0], height / lens.K[1, 1]]) / _MARGIN
+            needed = ((np.abs(local[:, :2]) + reach[:, None]) / slope).max(axis=1) - local[:, 2]
+            distance = max(distance, float(np.quantile(needed, _INSIDE)))
+    turns = _turns(frames, 360.0 if wish.span is None else wish.span, returns)
+    return _around(center, up, front, turns, distance, elevation, lens)
+
+
+def capture_orbit(
+    cameras: list[Camera],
+    frames: int,
+    *,
+    width: int,
+    height: int,
+    wish: Wish | None = None,
+    distance_of: Callable[[Camera], float | None] | None = None,
+    returns: bool = False,
+    beyond: bool = False,
+) -> tuple[list[Camera], str]:
+    """Frames where the photographs were taken from: around what they look at, or along their path.
+
+    Args:
+        cameras: The photographs'.
+        frames, width, height, returns: As in `scene_orbit`.
+        wish: What is fixed; else center, distance, elevation, up, span and lens are the photographs'.
+        distance_of: How far away what a camera looks at is (`seen_distance`), or None if it sees nothing. Asked where
+            the axes are parallel, so that they meet nowhere.
+        beyond: Where the axes meet go all the way round, past what the cameras cover; and follow no path.
+    Returns:
+        The cameras and what they do in words; none where the photographs say nothing (there are fewer than two, or
+        they look apart and lie apart, or `beyond` they look at no common point).
+    Raises:
+        ValueError: If something is fixed that needs a center, and the photographs look at no common point.
+    """
+    wish = wish or Wish()
+    lens = _Lens.like(cameras, width, height, wish.fov) if cameras else None
+    focus = Focus.of(cameras, wish.center, distance_of)
+    if focus is None:
+        poses = [] if beyond else path(cameras, frames)
+        if poses and wish.moves:
+            raise ValueError(
+                "orbit: --up, --distance, --elevation and --span must have --center X Y Z here, the photographs look "
+                "at no common point; add it, or drop them to follow the photographs' path"
+            )
+        made = [lens.camera(w2c, index) for index, w2c in enumerate(poses)]
+        return made, f"along the path of the photographs, {frames} frames" if made else ""
+    up = _unit(wish.up) if wish.up is not None else upright(cameras)
+    middle, span, distance, elevation = focus.stand(up)
+    if beyond and focus.is_met:
+        span = 360.0
+    span = span if wish.span is None else wish.span
+    distance = distance if wish.distance is None else wish.distance
+    elevation = np.clip(elevation, -_STEEPEST, _STEEPEST) if wish.elevation is None else wish.elevation
+    made = _around(focus.center, up, middle, _turns(frames, span, returns), distance, float(elevation), lens)
+    kind = "circle" if span >= 360 else f"swing of {span:.0f} degrees"
+    place = ", ".join(f"{x:.3g}" for x in focus.center)
+    return made, f"{kind} around ({place}) at distance {distance:.3g}, {elevation:.0f} degrees up, like the photographs"
+
+
+def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
+    """A function that tells how far away what a camera looks at is: the nearer quarter of the distances in the middle
+    of its picture, in scene units, or None where it sees nothing.
+    """
+    import torch
+
+    import drgs
+    from drgs.fitting.active import at_most
+    from drgs.settings import RenderSettings
+
+    def distance(camera: Camera) -> float | None:
+        small = at_most(camera.undistorted(), _PROBE_PIXELS)
+        with torch.no_grad():
+            out = drgs.render(gaussians, small, RenderSettings.preset("fast"), ("depth",))
+        rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
+        depth, alpha = out.depth[rows, columns].cpu().numpy(), out.alpha[rows, columns].cpu().numpy()
+        solid = alpha > _OPAQUE
+        return float(np.quantile(depth[solid], _NEARER)) if solid.any() else None
+
+    return distance
+
+
+def _shape(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The middle (3,) of what there is to see, the Gaussians' offsets (P,3) from it and their reach (P,)."""
+    means = gaussians.means.detach().cpu().numpy().astype(np.float64) + gaussians.origin
+    sizes = gaussians.scales.detach().cpu().numpy().astype(np.float64).max(axis=1)
+    solid = gaussians.opacities.detach().cpu().numpy() > _SOLID
+    if solid.any():
+        means, sizes = means[solid], sizes[solid]
+    step = -(-len(means) // _SAMPLE)
+    means, sizes = means[::step], sizes[::step]
+    distance = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    near = distance <= _FAR * np.median(distance)
+    means, reach = means[near], 2 * sizes[near]
+    # The median says what belongs to the scene; the middle of that is what to turn around, since
+    # the median lies where the detail is.
+    center = np.quantile(means, (1 - _INSIDE, _INSIDE), axis=0).mean(axis=0)
+    return center, means - center, reach
+
+
+@dataclasses.dataclass(frozen=True)
+class _Lens:
+    """Intrinsics (3,3) and size of every frame."""
+
+    K: np.ndarray
+    width: int
+    height: int
+
+    @classmethod
+    def like(cls, cameras: list[Camera], width: int, height: int, fov: float | None) -> _Lens:
+        """Shows what the middle one of the photographs' lenses shows, and more where the shape differs."""
+        if fov is None:
+            wide = np.median([camera.width / camera.K[0, 0] for camera in cameras])
+            high = np.median([camera.height / camera.K[1, 1] for camera in cameras])
+            fov = 2 * math.degrees(math.atan(0.5 * max(wide, high * width / height)))
+        return cls(intrinsics_from_fov(fov, width, height), width, height)
+
+    def camera(self, w2c: np.ndarray, index: int) -> Camera:
+        return Camera(K=self.K, w2c=w2c, width=self.width, height=self.height, name=f"orbit_{index:04d}")
+
+
+def _around(center, up, front, turns, distance: float, elevation: float, lens: _Lens) -> list[Camera]:
+    """Cameras at azimuths (radians) from the direction `front`, looking at the center."""
+    side, rise = np.cross(up, front), math.radians(elevation)
+    made = []
+    for index, turn in enumerate(turns):
+        outward = math.cos(rise) * (math.cos(turn) * front + math.sin(turn) * side) + math.sin(rise) * up
+        made.append(lens.camera(look_at(center + distance * outward, center, up), index))
+    return made
+
+
+def _turns(frames: int, span: float, returns: bool) -> np.ndarray:
+    """Azimuths in radians: around the circle, or from end to end of a span (and back) about 0."""
+    index = np.arange(frames)
+    if span >= 360:
+        return 2 * np.pi * index / frames
+    if returns:
+        # Started where no two frames of the way there and back stand at the same place.
+        return math.radians(span / 2) * np.sin(2 * np.pi * (index + (0.0 if frames % 2 else 0.25)) / frames)
+    return math.radians(span) * ((index + 0.5) / frames - 0.5)
+
+
+def _unit(vector) -> np.ndarray:
+    vector = np.asarray(vector, np.float64)
+    return vector / np.linalg.norm(vector)
+
+
+def _level(direction, up) -> np.ndarray:
+    """The direction without its part along up, of length 1."""
+    return _unit(direction - (direction @ up) * up)

@@ -1,0 +1,376 @@
+"""`drgs render`: pictures and videos of a Gaussian PLY or a finished run, from any cameras.
+
+Which cameras, which settings, which files; the drawing is `drgs.render`, the files are pictures.py.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+import drgs
+from drgs import runtime
+from drgs.commands.forecast import forecast
+from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
+from drgs.data.camera_lists import load_cameras_json, save_cameras_json
+from drgs.display import pictures
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, Run, load_ply, write_json
+from drgs.fitting.records import fit_record, fitted_views
+from drgs.guards import memory
+from drgs.guards.foreign import refuse_foreign
+from drgs.guards.outputs import claim
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.options import Crossval, Render, Tradeoff
+    from drgs.data import Dataset
+    from drgs.ellipsoids import Gaussians
+    from drgs.settings import RenderSettings
+
+__all__ = [
+    "cameras_of",
+    "described",
+    "is_camera_list",
+    "load_scene",
+    "render_views",
+    "run",
+]
+
+_log = logging.getLogger(__name__)
+
+_MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as doing it
+_LONG = 10.0  # seconds that are worth a word
+_FORMATS = ("png", "exr", "webm")
+_MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
+
+
+def run(args: Render) -> None:
+    """`drgs render SCENE`."""
+    settings = args.settings()
+    formats = _formats(args.format)
+    _check_numbers(args)
+    movie = "turntable.webm" if args.cameras == "orbit" else "video.webm"
+    fixed = ["render.json", "cameras.json", *([movie] * ("webm" in formats))]
+    output = claim(args.output, "render", fixed, inputs=[args.scene, args.cameras])
+    gaussians, folder = load_scene(args.scene)
+    if folder is not None and not any(text.startswith("background=") for text in args.overrides):
+        # A run was fitted over its background; over another one its edges show a halo.
+        settings = settings.replace(background=fit_record(folder).config.settings.background)
+    size = args.width, args.height
+    cameras, source = cameras_of(args, args.cameras, gaussians, folder, args.frames, size, returns=True)
+    cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
+    if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
+        cameras = [camera.undistorted() for camera in cameras]
+        _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
+    _check_memory(cameras, settings, formats)
+    kinds = [*(kind for kind in formats if kind != "webm"), *(["depth.png"] * args.depth)]
+    output.check(f"{name}.{kind}" for name in pictures.file_names([x.name for x in cameras]) for kind in kinds)
+    if not args.quiet:
+        _say_how_long(args, gaussians, cameras, settings)
+    with Bar("render", len(cameras), not args.quiet) as bar:
+        report = render_views(
+            gaussians,
+            cameras,
+            settings,
+            args.output,
+            formats=formats,
+            depth=args.depth,
+            fps=args.fps,
+            video=movie,
+            advance=bar.advance,
+        )
+    report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
+    if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
+        save_cameras_json(args.output / "cameras.json", cameras)
+    else:
+        _say(args, "no cameras.json: its layout has no lens and no skew; render.json holds the cameras")
+    write_json(args.output / "render.json", {"schema": SCHEMA, "command": "render"} | report)
+    _say(args, _summary(report, args.output))
+
+
+def render_views(
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    settings: RenderSettings,
+    out_dir: Path,
+    *,
+    formats: tuple[str, ...] = ("png",),
+    depth: bool = False,
+    fps: float = 24.0,
+    video: str = "video.webm",
+    advance: Callable[[], None] | None = None,
+) -> dict:
+    """Render cameras to files, each of which appears once it is complete.
+
+    Args:
+        gaussians, cameras, settings: As for `drgs.render`, a list of cameras.
+        out_dir: Folder of the files; made if absent.
+        formats: Of png (8 bits, clamped, no transfer function), exr (float32; R G B, A, and Z, the
+            distance along the ray) and webm (one video).
+        depth: A color-mapped `NAME.depth.png` for each view, too.
+        fps: Of the video.
+        video: Its file name.
+        advance: Called after each view.
+    Returns:
+        JSON-serializable: settings, backend, seconds (first, median of the others, total), rays and
+        redone (rays whose exact order took more than one pass; None where the order is not exact),
+        and views (camera, files, seconds, rays, redone).
+    """
+    outputs = ("depth",) if depth or "exr" in formats else ()
+    views, seen = [], False
+    movie = pictures.Video(out_dir / video, fps) if "webm" in formats else None
+    with movie or contextlib.nullcontext():
+        for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
+            began = time.perf_counter()
+            with torch.no_grad():
+                out = drgs.render(gaussians, camera, settings, outputs)
+            rgb, alpha = out.rgb.cpu().numpy(), out.alpha.cpu().numpy()
+            seconds = time.perf_counter() - began
+            files = []
+            if "png" in formats:
+                pictures.write_png(out_dir / f"{name}.png", rgb)
+                files.append(f"{name}.png")
+            if outputs:
+                distance = out.depth.cpu().numpy()
+            if "exr" in formats:
+                pictures.write_exr(out_dir / f"{name}.exr", rgb, A=alpha, Z=distance)
+                files.append(f"{name}.exr")
+            if depth:
+                pictures.write_png(out_dir / f"{name}.depth.png", pictures.depth_picture(distance, alpha))
+                files.append(f"{name}.depth.png")
+            if movie is not None:
+                movie.write(rgb)
+            seen = seen or bool(alpha.any())
+            made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
+            views.append({"camera": described(camera), "files": files, "seconds": seconds, **made})
+            if advance:
+                advance()
+    if not seen:
+        _log.warning(
+            "none of the %d views shows anything of the scene: do the cameras belong to it? (near is %g, extent %s)",
+            len(views),
+            settings.near,
+            settings.extent,
+        )
+    times = [view["seconds"] for view in views]
+    total = {key: _total(view[key] for view in views) for key in ("rays", "redone")}
+    return {
+        "settings": dataclasses.asdict(settings),
+        "backend": runtime.backend().variant,
+        "threads": runtime.backend().threads,
+        "seconds": {"first": times[0], "median": statistics.median(times[1:] or times), "total": sum(times)},
+        **total,
+        "video": video if movie is not None else None,
+        "views": views,
+    }
+
+
+# ------------------------------------------------------------------------------------------ inputs
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(part.strip().lower() for part in text.split(",") if part.strip()))
+    unknown = [name for name in names if name not in _FORMATS]
+    if unknown or not names:
+        got = unknown[0] if unknown else text
+        raise ValueError(f"render: --format must be a list of {', '.join(_FORMATS)}, got {got!r}")
+    return names
+
+
+def _check_numbers(args: Render) -> None:
+    for option, value, high in (
+        ("--width", args.width, _MAX_SIDE),
+        ("--height", args.height, _MAX_SIDE),
+        ("--frames", args.frames, 100_000),
+        ("--limit", args.limit, 10**9),
+    ):
+        if value is not None and not 1 <= value <= high:
+            raise ValueError(f"render: {option} must be in [1, {high}], got {value}")
+    if not 0 < args.fps <= 240:
+        raise ValueError(f"render: --fps must be in (0, 240], got {args.fps}")
+    Wish.of(args)
+
+
+def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
+    """The Gaussians, and the run that they belong to if `path` is a run folder."""
+    if not path.is_dir():
+        return load_ply(path), None
+    folder = Run(path)
+    refuse_foreign(path, "a run folder or a 3DGS PLY file")
+    fit_record(folder)  # says that it is no run folder, or of another version
+    if not folder.point_cloud.is_file():
+        raise FileNotFoundError(
+            f"{path}: must hold point_cloud.ply, found none; the fit has not reached its first checkpoint"
+        )
+    return load_ply(folder.point_cloud), folder
+
+
+def cameras_of(
+    args: Render | Crossval | Tradeoff,
+    text: str,
+    gaussians: Gaussians,
+    folder: Run | None,
+    frames: int,
+    size: tuple[int | None, int | None],
+    returns: bool = False,
+) -> tuple[list[Camera], str]:
+    """The cameras of a data set, a run, a cameras.json or an orbit, and where they come from in words.
+
+    Args:
+        args: Whose `split` and options of orbits apply.
+        text: What `--cameras` says.
+        gaussians, folder: What an orbit goes around, like the photographs of the run if there is one.
+        frames, size: Number of views of an orbit and their (width, height); where one is None, 640 wide and of the
+            photographs' shape, else 4:3.
+        returns: Whether an orbit that is no full circle goes back and forth.
+    """
+    if text == "orbit":
+        if args.split != "all":
+            raise ValueError(f"--split {args.split} must have --cameras DATA, an orbit has no split")
+        wish = Wish.of(args)
+        captured = _captured(folder) if folder is not None else []
+        shape = captured[0].height / captured[0].width if captured else 0.75
+        how = dict(zip(("width", "height"), _size(*size, shape), strict=True)) | {"wish": wish, "returns": returns}
+        cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(gaussians), **how)
+        if cameras:
+            _say(args, source)
+            return cameras, source
+        up = "minus-y" if args.up == "auto" else args.up
+        if args.up == "auto":
+            _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
+        return scene_orbit(gaussians, frames, **how), f"orbit, up {up}"
+    path = Path(text)
+    if is_camera_list(path):
+        if args.split != "all":
+            raise ValueError(f"{path}: --split {args.split} must have a data set, a cameras.json has no split")
+        return load_cameras_json(path), str(path)
+    dataset, test_every = _dataset(path, args.strict)
+    train, test = dataset.split(test_every)
+    views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
+    if not views:
+        rule = dataset.split_rule(test_every)
+        raise ValueError(f"{path}: split {args.split} must hold a view, holds none ({rule}); use --split all")
+    return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{path} ({args.split})"
+
+
+def is_camera_list(path: Path) -> bool:
+    """Whether a JSON file is a list, as INRIA's cameras.json is, and not a transforms.json."""
+    if path.suffix != ".json" or not path.is_file():
+        return path.name == "cameras.json"
+    with path.open("rb") as file:
+        return file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
+
+
+def _dataset(path: Path, strict: bool) -> tuple[Dataset, int | None]:
+    """A data set, or that of a run; and the run's rule of the split."""
+    from drgs.data import load
+
+    if (path / "config.json").is_file() and (path / "log.jsonl").is_file():
+        record = fit_record(Run(path))
+        return load(record.data, strict=strict), record.config.test_every
+    return load(path, strict=strict), None
+
+
+def _captured(folder: Run) -> list[Camera]:
+    """Cameras of the photographs that a run was fitted to, in their order; none if they are no longer there."""
+    from drgs.data import load
+
+    try:
+        names = set(fitted_views(folder))
+        views = load(fit_record(folder).data, lazy=True, points=False).views
+    except (ValueError, OSError, KeyError):
+        return []
+    return [view.camera.undistorted() for view in views if view.name in names]
+
+
+def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
+    """Width and height of an orbit's frames, the missing ones by their shape (height / width)."""
+    if width is None:
+        width = 640 if height is None else max(1, min(_MAX_SIDE, round(height / shape)))
+    return width, height or max(1, min(_MAX_SIDE, round(width * shape)))
+
+
+def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
+    """The camera at the size asked for; one side alone keeps the shape."""
+    if width is None and height is None:
+        return camera
+    if width is None:
+        width = max(1, round(camera.width * height / camera.height))
+    if height is None:
+        height = max(1, round(camera.height * width / camera.width))
+    return camera.resized(width, height)
+
+
+def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tuple[str, ...]) -> None:
+    """Refuse a view that is too large to be rendered and written, before the first one is."""
+    largest = max(cameras, key=lambda camera: camera.width * camera.height)
+    pixels = largest.width * largest.height
+    pictures_need = max(memory.PICTURES[name] for name in formats)
+    where, what = f"view {largest.name!r}", f"its {largest.width}x{largest.height} pixels"
+    needed = memory.frame_bytes(pixels, settings)
+    if runtime.backend().name == "cuda":
+        memory.require(where, needed, what, "lower --width or --height", cuda=True)
+        needed = 0
+    memory.require(where, needed + pictures_need * pixels, what, "lower --width or --height")
+
+
+# ----------------------------------------------------------------------------------------- outputs
+
+
+def described(camera: Camera) -> dict:
+    """A camera as JSON."""
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "c2w": camera.c2w.tolist(),
+        "model": camera.model,
+        "distortion": list(camera.distortion),
+    }
+
+
+def _number(value) -> int | None:
+    return None if value is None else int(value)
+
+
+def _total(values) -> int | None:
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None
+
+
+def _summary(report: dict, folder: Path) -> str:
+    views, seconds = report["views"], report["seconds"]
+    text = (
+        f"{len(views)} views of {report['gaussians']} Gaussians in {seconds['total']:.1f} s "
+        f"(first {seconds['first']:.2f} s, then {seconds['median']:.3f} s a view): {folder}"
+    )
+    if report["redone"] is not None:
+        share = report["redone"] / max(report["rays"], 1)
+        text += f"\nexact order: {report['redone']} of {report['rays']} rays ({share:.2%}) took more than one pass"
+    return text
+
+
+def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> None:
+    """Exact order on every ray may take minutes where the centers' order takes seconds: said beforehand."""
+    if settings.order != "ray" or sum(camera.width * camera.height for camera in cameras) < _MANY_PIXELS:
+        return
+    seconds = forecast(gaussians, cameras, settings)
+    if seconds > _LONG:
+        took = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        what = f"{args.preset}, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}"
+        _say(args, f"{what} will take about {took} on this machine; --preset fast takes a small part of that")
+
+
+def _say(args: Render | Crossval | Tradeoff, text: str) -> None:
+    if not args.quiet:
+        print(text, flush=True)

@@ -1,0 +1,101 @@
+"""`drgs select`: which cameras would tell most about a scene, as a table and as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs.commands.render import described
+from drgs.commands.viewpoints import known_views, other_views, scene_of
+from drgs.display import tables
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, write_json
+from drgs.guards.outputs import check_file
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Select
+    from drgs.information.greedy import Selection
+
+__all__ = ["print_table", "run"]
+
+_SHORT = {"rotations": "rot.", "log_scales": "scales", "logit_opacities": "opac."}  # a table has 80 columns
+
+
+def run(args: Select) -> None:
+    """`drgs select SCENE --candidates ...`."""
+    import torch
+
+    from drgs.gain import Prior
+    from drgs.select import select
+
+    check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
+    prior = Prior(value=args.prior, relative=args.relative_prior)
+    scene = scene_of(args)
+    known = known_views(args.train, scene)
+    candidates, source = other_views("--candidates", args.candidates, args, scene, known, fresh=True)
+    with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
+        selection = select(
+            scene.gaussians,
+            candidates,
+            known.cameras,
+            args.k,
+            args.policy,
+            criterion=args.criterion,
+            settings=scene.settings,
+            method=args.method,
+            prior=prior,
+            rng=torch.Generator().manual_seed(args.seed),
+            progress=bar.update,
+        )
+    nothing = [None] * len(candidates)
+    rows = zip(candidates, selection.scores, selection.parts or nothing, selection.unseen or nothing, strict=True)
+    report = {
+        "schema": SCHEMA,
+        "command": "select",
+        "scene": str(args.scene),
+        "gaussians": len(scene.gaussians),
+        "policy": args.policy,
+        "criterion": args.criterion if args.policy == "fisher" else None,
+        "method": args.method,
+        "prior": {"value": args.prior, "relative": args.relative_prior},
+        "seed": args.seed,
+        "settings": dataclasses.asdict(scene.settings),
+        "pixels": scene.pixels,
+        "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
+        "source": source,
+        "picks": [
+            {"rank": rank, **dataclasses.asdict(pick), "camera": described(candidates[pick.index])}
+            for rank, pick in enumerate(selection.picks, 1)
+        ],
+        "candidates": [
+            {"index": i, "name": camera.name, "score": score, "parts": parts, "unseen": unseen}
+            for i, (camera, score, parts, unseen) in enumerate(rows)
+        ],
+        "left_out": selection.left_out,
+        "notes": selection.notes,
+        "evaluations": selection.evaluations,
+        "seconds": selection.seconds,
+    }
+    write_json(args.output, report)
+    if not args.quiet:
+        print_table(report, selection, args.output)
+
+
+def print_table(report: dict, selection: Selection, output: Path) -> None:
+    """The picks with each group's part of the score, and what to know about them, on stdout."""
+    title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
+    groups, rows = list(selection.picks[0].parts), []
+    for pick in selection.picks:
+        margin = "-" if pick.margin is None else f"{pick.margin:.3g}"
+        parts = (f"{100 * pick.parts[name] / pick.score:.1f}" if pick.score else "-" for name in groups)
+        rows.append((pick.name, f"{pick.score:.4g}", margin, *parts))
+    tables.show(
+        f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}",
+        ("view", "score", "margin", *(f"{_SHORT.get(name, name)} %" for name in groups)),
+        rows,
+    )
+    for note in selection.notes:
+        print(f"note: {note}")
+    known = report["known"]
+    print(f"{len(known['names'])} known views ({known['source']}); {report['seconds']:.1f} s: {output}")

@@ -1,0 +1,259 @@
+"""Pictures and videos from float arrays: PNG, OpenEXR, WebM, color-mapped depth, captions.
+
+Images are NumPy (H, W, 3), RGB. Colors of Gaussians are display-referred: they are fitted to the
+8-bit values of photographs. They are therefore written as they are, clamped to [0, 1], without a
+transfer function. Every file appears under its name only once it is complete.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from drgs.files import atomic_write
+from drgs.guards import outputs
+
+__all__ = [
+    "Video",
+    "caption",
+    "depth_picture",
+    "file_names",
+    "map_picture",
+    "png_bytes",
+    "to_bytes",
+    "write_exr",
+    "write_png",
+]
+
+_INK = (235, 235, 235)
+_UNKNOWN = 0.25  # gray of depth where nothing is
+_NOTHING = 64  # gray of pixels whose value is 0
+_DECADES = 3.0  # at most so many are told apart by color
+_WEBM_SEGMENT, _WEBM_HEAD = bytes.fromhex("18538067"), 1024  # what holds all of a WebM file, and where it begins
+_OPAQUE = 0.5  # depth is shown where at least this much of the light stops
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Float image in [0, 1] as uint8, clamped and rounded to nearest; NaN becomes 0."""
+    clamped = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0.0, 1.0)
+    return np.rint(clamped * 255).astype(np.uint8)
+
+
+def file_names(names: list[str]) -> list[str]:
+    """One file name for each view's name, which may hold folders, be empty or repeat."""
+    result: list[str] = []
+    for index, name in enumerate(names):
+        clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".")[:100]
+        clean = clean or f"view_{index:04d}"
+        while clean in result:
+            clean += f"_{index:04d}"
+        result.append(clean)
+    return result
+
+
+def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
+    """Write an (H, W, 3) RGB image, uint8 or float in [0, 1], as 8-bit PNG."""
+    with atomic_write(path) as file:
+        file.write(png_bytes(image))
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """What `write_png` writes."""
+    import cv2
+
+    pixels = image if image.dtype == np.uint8 else to_bytes(image)
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
+    return encoded.tobytes()
+
+
+def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) -> None:
+    """Write a float32 OpenEXR file, values untouched.
+
+    Args:
+        rgb: (H, W, 3).
+        channels: (H, W) each, by their names in the file: `A` for alpha, `Z` for depth.
+    """
+    from drgs import runtime
+
+    mi = runtime.mitsuba()
+    import drjit as dr
+
+    planes = [np.asarray(rgb, np.float32), *(np.asarray(x, np.float32)[..., None] for x in channels.values())]
+    data = np.ascontiguousarray(np.concatenate(planes, axis=2))
+    bitmap = mi.Bitmap(data, mi.Bitmap.PixelFormat.MultiChannel, ["R", "G", "B", *channels])
+    threads = dr.thread_count()
+    with _temporary(Path(path)) as name:
+        try:
+            # The encoder hands its work to the thread pool and waits: with a pool of one, for ever.
+            dr.set_thread_count(max(2, threads))
+            bitmap.write(name, mi.Bitmap.FileFormat.OpenEXR)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split()).rpartition(": ")[2]
+            raise OSError(f"{path}: must be written, got: {reason}; free some space or choose another folder") from None
+        finally:
+            dr.set_thread_count(threads)
+
+
+def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """(H, W + bar, 3) uint8: near is bright, gray where alpha < 0.5, a labeled color bar at the right.
+
+    The scale goes from the 1st to the 99th percentile of the depths shown, in scene units.
+    """
+    import cv2
+
+    known = (alpha >= _OPAQUE) & np.isfinite(depth)
+    low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
+    high = max(high, low + 1e-12 + 1e-6 * abs(low))
+
+    def colors(values):
+        near = to_bytes((high - values) / (high - low))
+        return cv2.applyColorMap(near, cv2.COLORMAP_INFERNO)[..., ::-1]
+
+    picture = colors(np.where(known, depth, high))
+    picture[~known] = round(255 * _UNKNOWN)
+    height = len(depth)
+    bar = np.zeros((height, 76, 3), np.uint8)
+    bar[:, 4:16] = colors(np.linspace(low, high, height)[:, None].repeat(12, 1))
+    font, inset = cv2.FONT_HERSHEY_SIMPLEX, min(12, max(height - 2, 0))
+    for row, value in ((inset, low), (height // 2 + 4, (low + high) / 2), (height - 4, high)):
+        if value in (low, high) or height >= 48:
+            cv2.putText(bar, f"{value:.4g}", (20, row), font, 0.4, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([picture, bar], axis=1)
+
+
+def map_picture(values: np.ndarray) -> np.ndarray:
+    """(H, W + bar, 3) uint8: bright is large, on a logarithmic scale, with a labeled color bar; gray where it is 0.
+
+    The scale ends at the largest value and covers what lies between it and the 1st percentile, at most three decades.
+
+    Args:
+        values: (H, W), finite, >= 0.
+    """
+    import cv2
+
+    known = values > 0
+    top = np.log10(values[known].max()) if known.any() else 0.0
+    low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
+    low = min(max(low, top - _DECADES), top - 1e-3)
+
+    def colors(exponents: np.ndarray) -> np.ndarray:
+        return cv2.applyColorMap(to_bytes((exponents - low) / (top - low)), cv2.COLORMAP_INFERNO)[..., ::-1]
+
+    picture = colors(np.log10(np.where(known, values, 10.0**low)))
+    picture[~known] = _NOTHING
+    height = len(values)
+    bar = np.zeros((height, 76, 3), np.uint8)
+    bar[:, 4:16] = colors(np.linspace(top, low, height)[:, None].repeat(12, 1))
+    inset = min(12, max(height - 2, 0))
+    for row, exponent in ((inset, top), (height // 2 + 4, (low + top) / 2), (height - 4, low)):
+        if exponent in (low, top) or height >= 48:
+            text = f"{10.0**exponent:.2g}"
+            cv2.putText(bar, text, (20, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([picture, bar], axis=1)
+
+
+def caption(image: np.ndarray, text: str) -> np.ndarray:
+    """The picture as uint8 with a line of text above it, shrunk to fit its width."""
+    import cv2
+
+    strip = np.zeros((20, image.shape[1], 3), np.uint8)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42
+    (width, _), _ = cv2.getTextSize(text, font, scale, 1)
+    scale *= min(1.0, (image.shape[1] - 8) / max(width, 1))
+    cv2.putText(strip, text, (4, 14), font, scale, _INK, 1, cv2.LINE_AA)
+    pixels = image if image.dtype == np.uint8 else to_bytes(image)
+    return np.concatenate([strip, pixels], axis=0)
+
+
+class Video:
+    """A WebM file (VP9), a frame at a time; it appears when the `with` block ends without an error.
+
+    Args:
+        path: The file.
+        fps: Frames a second.
+    """
+
+    def __init__(self, path: str | os.PathLike, fps: float = 24.0):
+        self.path, self.fps = Path(path), fps
+        self._writer = self._size = None
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Video:
+        self._name = self._stack.enter_context(_temporary(self.path))
+        return self
+
+    def __exit__(self, kind, error, trace) -> bool:
+        if self._writer is not None:
+            self._writer.release()
+            if kind is None and (problem := self._problem()):
+                self._stack.__exit__(OSError, problem, None)
+                raise problem
+        return bool(self._stack.__exit__(kind, error, trace))
+
+    def _problem(self) -> OSError | None:
+        """The encoder says nothing where the disk is full: whether the file is as long as it says itself."""
+        with open(self._name, "rb") as file:
+            head = file.read(_WEBM_HEAD)
+        start = head.find(_WEBM_SEGMENT) + len(_WEBM_SEGMENT) + 8
+        stated = int.from_bytes(head[start - 7 : start], "big")  # after the byte that says that 7 follow
+        if os.path.getsize(self._name) == start + stated:
+            return None
+        return OSError(
+            f"{self.path}: must be written, the file is not whole; is the disk full? free some space or choose another "
+            "folder"
+        )
+
+    def write(self, image: np.ndarray) -> None:
+        """Append an (H, W, 3) image, uint8 or float in [0, 1]; all frames must have one size.
+
+        Raises:
+            ValueError: If the size differs from the first frame's.
+            OSError: If this build of OpenCV cannot encode VP9.
+        """
+        pixels = image if image.dtype == np.uint8 else to_bytes(image)
+        # The encoder halves the chroma: it would silently crop an odd row or column.
+        odd = [(0, side % 2) for side in pixels.shape[:2]]
+        pixels = np.ascontiguousarray(np.pad(pixels, (*odd, (0, 0)), mode="edge")[..., ::-1])
+        if self._writer is None:
+            self._open(pixels.shape[1::-1])
+        if pixels.shape[1::-1] != self._size:
+            raise ValueError(
+                f"{self.path}: all frames of a video must have one size, got {self._size} and "
+                f"{pixels.shape[1::-1]}; give --width and --height, or leave webm out"
+            )
+        self._writer.write(pixels)
+
+    def _open(self, size: tuple[int, int]) -> None:
+        import cv2
+
+        with _no_native_stderr():  # OpenCV prints that it prefers another tag, and goes on
+            self._writer = cv2.VideoWriter(self._name, cv2.VideoWriter_fourcc(*"VP90"), self.fps, size)
+        if not self._writer.isOpened():
+            raise OSError(f"{self.path}: OpenCV must be able to encode VP9, this build cannot; use --format png")
+        self._size = size
+
+
+@contextlib.contextmanager
+def _temporary(path: Path) -> Iterator[str]:
+    """A name beside `path`, with its suffix, for a library that opens files itself; moved there at the end."""
+    with outputs.replacing(path, path.suffix) as name:
+        yield name
+        if not os.path.getsize(name):
+            raise OSError(f"{path}: must be written, but the file stayed empty; is the disk full?")
+
+
+@contextlib.contextmanager
+def _no_native_stderr() -> Iterator[None]:
+    """Close the terminal to what C libraries print."""
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)

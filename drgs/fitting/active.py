@@ -1,0 +1,352 @@
+"""Active views: fit to a few photographs, and choose one more every so often by what it would tell.
+
+The static loop of [1]: two views, then one more every 200 steps; the optimization goes on with the Gaussians there are.
+The camera file gives the poses and image sizes of all candidates. Nothing else of a view is read before it is picked:
+not its pixels, mask, depth or size on disk, no points or observations that it took part in; the extent of the scene
+and the initial points come from the initial views. (`--init-points all`, the rule of [1], breaks this and says so.)
+
+Reference:
+    [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.data.guided import Matches
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, Run, write_json
+from drgs.fitting.frames import Frame, load_frames, reduced_size
+from drgs.guards.arguments import check_fields
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.data import View
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.trainer import FitConfig
+
+__all__ = [
+    "SELECTION",
+    "ActiveConfig",
+    "ActiveViews",
+    "at_most",
+    "initial_views",
+    "resized_alike",
+]
+
+SELECTION = "selection.json"
+PICK_POINTS = ("auto", "uncovered", "none")
+_COVERED = 0.5  # opacity of a pixel that needs no new points
+_WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
+_MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
+_FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActiveConfig:
+    """How views are chosen during a fit.
+
+    Attributes:
+        policy: A name in `drgs.select.POLICIES`.
+        criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
+        method: Of the diagonal, see `drgs.fisher.diagonal`.
+        initial: Views at the start: the first of the training split, then those farthest from all before.
+        add: Views to be added, one at a time.
+        every: Steps between two of them, and before the first.
+        info_pixels: Pixels of the views that information is computed from; None: those of the fit.
+        prior: lambda, the prior precision of every parameter.
+        relative_prior: lambda is `prior` times the median of the group's positive information.
+        pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
+            Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
+            evenly among the views. `none`: no points after the start [1]. `auto`: `none` with initial points of the
+            whole data set, else `uncovered`.
+    """
+
+    policy: str = "fisher"
+    criterion: str = "eig"
+    method: str = "exact"
+    initial: int = 2
+    add: int = 10
+    every: int = 200
+    info_pixels: int | None = None
+    prior: float = 1e-6
+    relative_prior: bool = False
+    pick_points: str = "auto"
+
+    def __post_init__(self):
+        from drgs.fisher import METHODS
+        from drgs.gain import CRITERIA
+        from drgs.select import POLICIES
+
+        if self.add == 0:
+            raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
+        count = (1, 10**9)
+        ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
+        choices = {"policy": POLICIES, "criterion": CRITERIA, "method": METHODS, "pick_points": PICK_POINTS}
+        check_fields("active", self, ranges, choices)
+        self.make_prior()
+
+    def make_prior(self):
+        """As `drgs.select` takes it."""
+        from drgs.gain import Prior
+
+        return Prior(value=self.prior, relative=self.relative_prior)
+
+    def to_json(self) -> dict:
+        """As config.json, selection.json and the checkpoint hold it."""
+        return dataclasses.asdict(self)
+
+
+class ActiveViews:
+    """The training split of an active fit: what has been seen, and what to see next.
+
+    Attributes:
+        active: The `ActiveConfig`.
+        views: The training split, in its order; what has not been picked has not been opened.
+        chosen: Indices of views that may be read, in the order in which they came.
+        picks: One record a pick, as in selection.json.
+        pool_leak: Whether initial points have seen views that were not picked.
+    """
+
+    def __init__(self, active: ActiveConfig, views: list[View], config: FitConfig):
+        if not views:
+            raise ValueError("active: there must be at least one training view, got none; add photographs")
+        if active.initial + active.add > len(views):
+            raise ValueError(
+                f"active: --initial {active.initial} and --add {active.add} must be at most the {len(views)} views of "
+                "the training split; lower one, or hold out fewer (--test-every)"
+            )
+        if active.add * active.every >= config.max_steps:
+            raise ValueError(
+                f"active: --add {active.add} views, one --every {active.every} steps, must be there before step "
+                f"{config.max_steps}, the last one would come at {active.add * active.every}; raise --max-steps"
+            )
+        self.active, self.views, self._config = active, list(views), config
+        self.chosen = initial_views([view.camera for view in views], active.initial)
+        self.picks: list[dict] = []
+        self.pool_leak = config.init_points == "all"
+        grows = {"auto": not self.pool_leak, "uncovered": True, "none": False}[active.pick_points]
+        self._share = config.max_gaussians // (active.initial + active.add) if grows else 0
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._matches = Matches()
+        self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """Of the views that have been seen, in the order of `chosen`."""
+        return [self.views[i].name for i in self.chosen]
+
+    def start_views(self) -> list[View]:
+        """The views that initial points may be made from, checked against their images."""
+        views = self.views if self.pool_leak else [self.views[i] for i in self.chosen[: self.active.initial]]
+        return [view.checked() for view in views]
+
+    @property
+    def reserved(self) -> int:
+        """Gaussians to leave room for: those of views that are still to be picked."""
+        return self._share * (self.active.add - len(self.picks))
+
+    def points(self, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, torch.Tensor, bool]:
+        """Points of the view that was picked last: those triangulated with it, and where the Gaussians leave its pixels
+        more than half transparent also random ones; of a view with a depth map only there, from the map.
+
+        Args:
+            frame: Its photograph.
+            gaussians: The scene as it is now.
+        Returns:
+            (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
+        """
+        import drgs
+        from drgs.data import added_points, initial_points
+
+        nothing = torch.empty(0, 3), torch.empty(0, 3), False
+        with torch.no_grad():
+            alpha = drgs.render(gaussians, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
+        is_open = alpha < _COVERED
+        if frame.mask is not None:
+            is_open &= frame.mask.numpy() > _COVERED
+        worth = is_open.mean() >= _WORTH
+        seen = [self.views[i] for i in self.chosen]
+        dense = seen[-1].depth_path is not None
+        if not self._share or (dense and not worth):
+            return nothing
+        seed = self._config.seed + len(self.picks)
+        with Bar("points of the new view") as bar:
+            if dense:
+                wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share)
+                points, colors, _ = initial_points(seen[-1:], seed, wanted, bar.stage)
+                found = 0
+            else:
+                points, colors, found = added_points(seen, seed, self._matches, bar.stage)
+        pixels, depth = frame.camera.project(points)
+        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (frame.camera.width, frame.camera.height)).all(1)
+        # What is triangulated goes in where Gaussians are, too: it knows where things are, and they may have begun at
+        # random.
+        guessed = np.flatnonzero(inside[found:]) + found
+        columns, rows = pixels[guessed].astype(int).T
+        guessed = guessed[is_open[rows, columns]] if worth else guessed[:0]
+        sure = np.random.default_rng(seed).permutation(np.flatnonzero(inside[:found]))
+        kept = np.concatenate([sure, guessed])[: self._share]
+        if len(kept) < _FEWEST:
+            return nothing
+        return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
+
+    def frames(self) -> list[Frame]:
+        """The photographs seen so far."""
+        return [self._read(i) for i in self.chosen]
+
+    def is_due(self, step: int) -> bool:
+        """Whether a view is to be added before step `step` (from 0)."""
+        return len(self.picks) < min(self.active.add, step // self.active.every)
+
+    def pick(self, gaussians: Gaussians, frames: list[Frame], step: int) -> tuple[Frame, dict]:
+        """Choose one more view, then read it.
+
+        Args:
+            gaussians: The scene as it is now.
+            frames: The photographs seen so far; of these, too, only the cameras matter.
+            step: Steps done.
+        Returns:
+            The photograph, and the record that was appended to `picks`.
+        """
+        from drgs.select import select
+
+        active, settings = self.active, self._config.settings
+        left = [i for i in range(len(self.views)) if i not in self.chosen]
+        pixels = active.info_pixels or self._config.max_pixels
+        with Bar("choosing a view", len(left) + len(frames)) as bar:
+            selection = select(
+                gaussians,
+                [at_most(self._camera(i), pixels) for i in left],
+                [at_most(frame.camera, pixels) for frame in frames],
+                1,
+                active.policy,
+                criterion=active.criterion,
+                settings=settings,
+                method=active.method,
+                prior=active.make_prior(),
+                rng=self._generator,
+                progress=bar.update,
+            )
+        best = selection.picks[0]
+        extra = zip(selection.parts or [{}] * len(left), selection.unseen or [None] * len(left), strict=True)
+        record = {
+            "number": len(self.picks) + 1,
+            "step": step,
+            "index": left[best.index],
+            "name": best.name,
+            "score": best.score,
+            "parts": best.parts,
+            "margin": best.margin,
+            "seconds": selection.seconds,
+            "policy": active.policy,
+            "criterion": active.criterion if active.policy == "fisher" else None,
+            "prior": {"value": active.prior, "relative": active.relative_prior},
+            "gaussians": len(gaussians),
+            "left_out": selection.left_out,
+            "notes": selection.notes,
+            "candidates": [
+                {"index": i, "name": self.views[i].name, "score": score, "parts": parts, "unseen": unseen}
+                for i, score, (parts, unseen) in zip(left, selection.scores, extra, strict=True)
+            ],
+        }
+        self.chosen.append(record["index"])
+        self.picks.append(record)
+        return self._read(record["index"]), record
+
+    def to_json(self) -> dict:
+        """selection.json."""
+        initial = self.chosen[: self.active.initial]
+        return {
+            "schema": SCHEMA,
+            "command": "fit",
+            **self.active.to_json(),
+            "seed": self._config.seed,
+            "init_points": "all" if self.pool_leak else "views",
+            "pool_leak": self.pool_leak,
+            "pool": [view.name for view in self.views],
+            "start": [{"index": i, "name": self.views[i].name} for i in initial],
+            "picks": self.picks,
+        }
+
+    def write(self, run: Run) -> None:
+        """Write selection.json, atomically."""
+        write_json(run.path / SELECTION, self.to_json())
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
+        """Tensors and header that a checkpoint adds to the trainer's."""
+        header = {"config": self.active.to_json(), "pool": [view.name for view in self.views], "picks": self.picks}
+        return {"policy_rng": self._generator.get_state()}, {"active": header}
+
+    def restore(self, tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            ValueError: If the checkpoint chose by another rule, or from other views.
+        """
+        old, new = header["active"], self.active.to_json()
+        for key in new:
+            if new[key] != old["config"].get(key):
+                raise ValueError(
+                    f"{where}: --resume must continue the same fit, {key} was {old['config'].get(key)!r} and is "
+                    f"{new[key]!r}; repeat the options or choose another run folder"
+                )
+        if old["pool"] != [view.name for view in self.views]:
+            raise ValueError(
+                f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
+            )
+        self.picks = old["picks"]
+        self.chosen = self.chosen[: self.active.initial] + [pick["index"] for pick in self.picks]
+        self._generator.set_state(tensors["policy_rng"])
+
+    def _read(self, index: int) -> Frame:
+        """Open a view's files, for the first time if it has just been picked."""
+        stated = self.views[index].camera
+        self.views[index] = view = self.views[index].checked()
+        self._sizes[stated.width, stated.height] = view.camera.width, view.camera.height
+        return load_frames([view], self._config.max_pixels, self._config.mask)[0]
+
+    def _camera(self, index: int) -> Camera:
+        """Of a candidate, as its frame would have it."""
+        view = self.views[index]
+        camera = dataclasses.replace(view.camera.undistorted(), name=view.name)
+        if not view.is_checked:
+            camera = resized_alike(camera, self._sizes)
+        return at_most(camera, self._config.max_pixels)
+
+
+def at_most(camera: Camera, pixels: int) -> Camera:
+    """The camera with its image reduced to at most so many pixels."""
+    return camera.resized(*reduced_size(camera, pixels))
+
+
+def resized_alike(camera: Camera, sizes: dict[tuple[int, int], tuple[int, int]]) -> Camera:
+    """The camera at the size that its image probably has: images reduced after calibration are reduced alike.
+
+    Args:
+        camera: Of the size that the camera file states.
+        sizes: Stated (width, height) -> that of the file, of images that have been opened.
+    """
+    size = sizes.get((camera.width, camera.height))
+    return camera.resized(*size) if size else camera
+
+
+def initial_views(cameras: list[Camera], count: int) -> list[int]:
+    """The first camera, then always the one whose center is farthest from all chosen ones; ties to the lower index.
+
+    Args:
+        cameras: At least `count`.
+        count: At least 1.
+    """
+    centers = np.stack([camera.center for camera in cameras])
+    chosen, distance = [0], np.linalg.norm(centers - centers[0], axis=1)
+    while len(chosen) < count:
+        distance[chosen] = -1.0  # where all centers coincide, too, no view is chosen twice
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(centers - centers[chosen[-1]], axis=1))
+    return chosen

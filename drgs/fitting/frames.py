@@ -1,0 +1,86 @@
+"""Photographs at the resolution of a fit: decoded once, undistorted, reduced, with their masks."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.display.progress import Bar
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.data import View
+
+__all__ = ["Frame", "load_frames", "reduced_size"]
+
+_FLOAT_CACHE = 2 << 30  # bytes of images kept as float32; beyond it they are kept as 8 bits
+
+
+@dataclasses.dataclass
+class Frame:
+    """One photograph at the resolution of the fit.
+
+    Attributes:
+        name: The view's.
+        camera: Pinhole, of the image's size, named as the view.
+        pixels: (H, W, 3) float32 in [0, 1], or uint8.
+        mask: (H, W) float32 in [0, 1], or None.
+        is_object: Whether nothing but background is outside the mask.
+    """
+
+    name: str
+    camera: Camera
+    pixels: torch.Tensor
+    mask: torch.Tensor | None = None
+    is_object: bool = False
+
+    def image(self) -> torch.Tensor:
+        """(H, W, 3) float32 in [0, 1]."""
+        return self.pixels if self.pixels.dtype == torch.float32 else self.pixels.float() / 255
+
+    def target(self) -> torch.Tensor:
+        """`image`, black outside the mask."""
+        return self.image() if self.mask is None else self.image() * self.mask[..., None]
+
+
+def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[Frame]:
+    """Decode, undistort and reduce photographs (area average) to at most `max_pixels` pixels each.
+
+    Args:
+        views: Whatever their sizes; those whose image has not been looked at yet are checked now.
+        max_pixels: Of one image; smaller ones keep their size.
+        mask: As in `FitConfig`.
+    """
+    with Bar("photographs", len(views)) as bar:
+        return _frames(views, max_pixels, mask, bar)
+
+
+def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Frame]:
+    views = [view.checked() for view in views]
+    sizes = [reduced_size(view.camera, max_pixels) for view in views]
+    is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_CACHE
+    frames = []
+    for view, (width, height) in zip(views, sizes, strict=True):
+        pixels = torch.from_numpy(view.image(width, height))
+        weights = None if mask == "ignore" else view.mask(width, height)
+        frames.append(
+            Frame(
+                name=view.name,
+                camera=dataclasses.replace(view.camera.undistorted().resized(width, height), name=view.name),
+                pixels=pixels if is_float else (pixels * 255).round().to(torch.uint8),
+                mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
+                is_object=mask == "object" or (mask == "auto" and view.mask_path is not None),
+            )
+        )
+        bar.advance()
+    return frames
+
+
+def reduced_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
+    """(width, height) of a camera's image at no more than `max_pixels` pixels, and never larger than it is."""
+    scale = min(1.0, math.sqrt(max_pixels / (camera.width * camera.height)))
+    return max(1, int(camera.width * scale)), max(1, int(camera.height * scale))

@@ -1,0 +1,140 @@
+"""What a run folder says about itself, validated once, here: config.json, selection.json and the checkpoint's header.
+
+People copy, move and edit run folders. Whatever is read from one has the types, ranges and shapes that its readers
+count on, or is refused in one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from drgs.fitting.trainer import FitConfig
+from drgs.guards.json_files import check_json, read_json
+
+if TYPE_CHECKING:
+    from drgs.files import Run
+
+__all__ = ["FitRecord", "check_checkpoint", "fit_record", "fitted_views"]
+
+_CONFIG = {"data": str, "train": [str], "test": [str], "fit": {"settings": dict}}
+_VIEW = {"index": int, "name": str}
+_HEADER = {
+    "step": int,
+    "bad_steps": int,
+    "start_count": int,
+    "extent": float,
+    "views": [str],
+    "config": dict,
+    "seconds": float,
+    "point_source": str,
+}
+_ACTIVE = {"config": dict, "pool": [str], "picks": [{"number": int, "step": int, **_VIEW}]}
+
+
+@dataclasses.dataclass(frozen=True)
+class FitRecord:
+    """What config.json of a run says about its fit.
+
+    Attributes:
+        data: The data set.
+        train, test: Names of the views of the two splits; of an active run, `train` are those it began with.
+        config: How it was fitted.
+        is_active: Whether views were chosen during the fit.
+    """
+
+    data: Path
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    config: FitConfig
+    is_active: bool
+
+
+def fit_record(run: Run) -> FitRecord:
+    """The record of a run.
+
+    Raises:
+        FileNotFoundError: If it is no run folder.
+        ValueError: If config.json is damaged, of another version, or says something that no fit has written.
+    """
+    config, where = run.config(), f"{run.path / 'config.json'}"
+    advice = "restore the file, or fit again in another folder"
+    check_json(where, config, _CONFIG, advice)
+    try:
+        fit = FitConfig.from_json(config["fit"])
+    except (ValueError, NotImplementedError) as error:
+        raise ValueError(f"{where}: {error}; {advice}") from None
+    return FitRecord(
+        Path(config["data"]), tuple(config["train"]), tuple(config["test"]), fit, bool(config.get("active"))
+    )
+
+
+def fitted_views(run: Run) -> list[str]:
+    """Names of the views that a run was fitted to: all of its training split, or those chosen so far.
+
+    Raises:
+        FileNotFoundError: If it is no run folder, or an active run without selection.json.
+        ValueError: If a file is damaged.
+    """
+    record = fit_record(run)
+    if not record.is_active:
+        return list(record.train)
+    path, advice = run.path / "selection.json", "move it away and resume the fit"
+    selection = read_json(path, "the record of the chosen views", advice)
+    check_json(str(path), selection, {"start": [_VIEW], "picks": [_VIEW]}, advice)
+    return [view["name"] for view in (*selection["start"], *selection["picks"])]
+
+
+def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict) -> None:
+    """Refuse a checkpoint that no fit has written.
+
+    Args:
+        path: For the message.
+        tensors, header: As `drgs.files.load_state` returns them.
+    Raises:
+        ValueError: If the header lacks a field, or a value is of another type or out of range, or a tensor is missing
+            or has another shape than the number of Gaussians asks for.
+    """
+    advice = "restore the file, or fit again in another folder"
+    kind = _HEADER | ({"active": _ACTIVE} if header.get("active") is not None else {})
+    check_json(str(path), header, kind, advice)
+    least = {"step": 0, "bad_steps": 0, "start_count": 1, "seconds": 0}
+    for name, low in least.items():
+        if header[name] < low:
+            raise ValueError(f"{path}: {name} must be >= {low}, got {header[name]}; {advice}")
+    if not header["extent"] > 0:
+        raise ValueError(f"{path}: extent must be > 0, got {header['extent']}; {advice}")
+    if header.get("active") is not None:
+        pool = header["active"]["pool"]
+        for pick in header["active"]["picks"]:
+            if not (0 <= pick["index"] < len(pool) and pool[pick["index"]] == pick["name"]):
+                raise ValueError(f"{path}: pick {pick['name']!r} must be of the pool, is not; {advice}")
+    for name, (dtype, shape) in _expected(tensors, header).items():
+        x = tensors.get(name)
+        if x is None or x.dtype != dtype or tuple(x.shape) != shape:
+            got = "none" if x is None else f"{x.dtype} of shape {tuple(x.shape)}"
+            raise ValueError(f"{path}: {name} must be {dtype} of shape {shape}, got {got}; {advice}")
+    queue = tensors["queue"]
+    if queue.numel() and not (int(queue.min()) >= 0 and int(queue.max()) < len(header["views"])):
+        raise ValueError(f"{path}: queue must hold numbers of the {len(header['views'])} views; {advice}")
+
+
+def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
+    """Type and shape of the tensors of a checkpoint, of as many Gaussians as there are means."""
+    length = lambda name, axis: x.shape[axis] if (x := tensors.get(name)) is not None and x.ndim > axis else 0  # noqa: E731
+    count, rest = length("parameter.means", 0), length("parameter.sh_rest", 1)
+    rest = next((k for k in (0, 3, 8, 15) if k >= rest), 0)
+    columns = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh_dc": (1, 3)}
+    expected = {}
+    for name, tail in (columns | {"sh_rest": (rest, 3)}).items():
+        expected[f"parameter.{name}"] = torch.float32, (count, *tail)
+        if any(key.startswith(f"adam.{name}.") for key in tensors):
+            expected[f"adam.{name}.exp_avg"] = expected[f"adam.{name}.exp_avg_sq"] = torch.float32, (count, *tail)
+            expected[f"adam.{name}.step"] = torch.float32, ()
+    state = torch.Generator().get_state()
+    generators = ("rng",) if header.get("active") is None else ("rng", "policy_rng")
+    expected |= {name: (state.dtype, tuple(state.shape)) for name in generators}
+    return expected | {"queue": (torch.int64, (length("queue", 0),))}

@@ -1,0 +1,137 @@
+"""What a camera must be: its intrinsics, proportions, pose and lens, each refused in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drgs.guards.arguments import ArgumentError, kind_of
+
+__all__ = [
+    "IMAGE_MAX",
+    "as_numpy",
+    "check_distance",
+    "check_proportions",
+    "checked_distortion",
+    "checked_intrinsics",
+    "checked_pose",
+    "is_tensor",
+    "read_only",
+]
+
+_OPENCV_LENGTHS = (4, 5, 8)
+_ROTATION_TOLERANCE = 1e-4
+# Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.
+IMAGE_MAX = 2**31  # pixels
+_FOCAL_MIN, _FOCAL_MAX, _DISTANCE_MAX, _DISTORTION_MAX = 1e-4, 1e6, 1e15, 1e6
+
+
+def is_tensor(value: Any) -> bool:
+    """Whether a value is a torch tensor, told without importing torch."""
+    return hasattr(value, "detach")
+
+
+def as_numpy(value: Any) -> np.ndarray:
+    """An array of what is an array, a list or a torch tensor (detached)."""
+    if not is_tensor(value):
+        return np.asarray(value)
+    from drgs.runtime import unwrapped
+
+    return unwrapped(value, lambda values: values.cpu().numpy())
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    """A float64 copy that cannot be changed."""
+    array = np.array(array, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _numbers(where: str, name: str, value: Any) -> np.ndarray:
+    try:
+        return read_only(as_numpy(value))
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{where}: {name} must be an array of numbers, got {kind_of(value)}; correct it") from None
+
+
+def checked_intrinsics(where: str, K: Any) -> np.ndarray:
+    """(3,3) float64 K, read-only, finite, with positive focal lengths and ones and zeros where they belong."""
+    K = _numbers(where, "K", K)
+    if K.shape != (3, 3):
+        raise ValueError(f"{where}: K must have shape (3, 3), got {K.shape}; see drgs.cameras.intrinsics")
+    if not np.isfinite(K).all():
+        raise ValueError(f"{where}: K must be finite, got {K[tuple(np.argwhere(~np.isfinite(K))[0])]}; correct it")
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError(f"{where}: focal lengths must be positive, got {K[0, 0]:g} and {K[1, 1]:g}; correct K")
+    if K[1, 0] != 0 or tuple(K[2]) != (0.0, 0.0, 1.0):
+        raise ValueError(f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; correct it")
+    return K
+
+
+def check_proportions(where: str, K: np.ndarray, size: tuple[int, int]) -> None:
+    """Focal lengths and principal point have something to do with (width, height)."""
+    for axis, side in enumerate(size):
+        focal, middle = K[axis, axis], K[axis, 2]
+        if not _FOCAL_MIN * side <= focal <= _FOCAL_MAX * side:
+            raise ValueError(
+                f"{where}: focal lengths must be {_FOCAL_MIN:g} to {_FOCAL_MAX:g} times the sides of the image, got "
+                f"f{'xy'[axis]} = {focal:g} for {side} pixels; correct K or the size"
+            )
+        if abs(middle) > _FOCAL_MAX * side or abs(K[0, 1]) > _FOCAL_MAX * side:
+            raise ValueError(
+                f"{where}: the principal point must be within {_FOCAL_MAX:g} sides of the image, skew too, got "
+                f"c{'xy'[axis]} = {middle:g}, skew = {K[0, 1]:g} for {side} pixels; correct K or the size"
+            )
+
+
+def checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
+    """(4,4) float64 w2c, read-only, finite, a rotation and a translation."""
+    w2c = _numbers(where, "w2c", w2c)
+    if w2c.shape != (4, 4):
+        raise ValueError(f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1")
+    if not np.isfinite(w2c).all():
+        row, column = np.argwhere(~np.isfinite(w2c))[0]
+        raise ValueError(
+            f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop this view"
+        )
+    check_distance(where, w2c)
+    if np.abs(w2c[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError(f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
+    rotation = w2c[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        got = f"an error of {error:.2g}" if error > _ROTATION_TOLERANCE else "a reflection"
+        raise ValueError(
+            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove scale and flips"
+        )
+    return w2c
+
+
+def check_distance(where: str, pose: np.ndarray) -> None:
+    """No number of a pose is beyond reason."""
+    far = np.abs(pose).max()
+    if far > _DISTANCE_MAX:
+        raise ValueError(f"{where}: the pose must be within {_DISTANCE_MAX:g} of the origin, got {far:g}; correct it")
+
+
+def checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, ...]:
+    """Finite coefficients, as many as the lens model takes."""
+    try:
+        values = tuple(float(v) for v in distortion)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{where}: distortion must hold numbers, got {kind_of(distortion)}; correct it") from None
+    if not all(abs(v) <= _DISTORTION_MAX for v in values):
+        raise ValueError(
+            f"{where}: distortion must be finite, no coefficient above {_DISTORTION_MAX:g}, got {values}; correct it"
+        )
+    lengths = {"pinhole": (0,), "opencv": _OPENCV_LENGTHS, "opencv_fisheye": (4,)}.get(model)
+    if lengths is None:
+        raise ValueError(f"{where}: model must be pinhole, opencv or opencv_fisheye, got {model!r}; choose one")
+    if len(values) not in lengths:
+        raise ValueError(
+            f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion "
+            f"coefficients, got {len(values)}; "
+            "pad with zeros"
+        )
+    return values

@@ -1,0 +1,67 @@
+"""What the public functions take: a scene, cameras and settings of the right kind, or one sentence about it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.settings import RenderSettings
+
+__all__ = ["camera_list", "check_oracle", "check_path", "check_scene", "check_view"]
+
+_SCENE = "drgs.load_ply(path) or drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh) makes one"
+_CAMERA = "drgs.Camera(K=K, w2c=w2c, width=width, height=height) makes one"
+_SETTINGS = 'drgs.RenderSettings.preset("exact") makes them'
+
+
+def check_scene(where: str, gaussians: Any, settings: Any) -> None:
+    """Raise `ArgumentError` unless these are Gaussians and RenderSettings (or None)."""
+    must_be(where, "gaussians", gaussians, Gaussians, _SCENE)
+    if settings is not None:
+        must_be(where, "settings", settings, RenderSettings, _SETTINGS)
+
+
+def check_view(where: str, gaussians: Any, camera: Any, settings: Any) -> None:
+    """The same, and one Camera."""
+    if isinstance(camera, Gaussians) and isinstance(gaussians, Camera):
+        raise ArgumentError(f"{where}: gaussians must come first and the camera second, got them swapped; swap them")
+    check_scene(where, gaussians, None)
+    several = isinstance(camera, list | tuple) and all(isinstance(x, Camera) for x in camera)
+    hint = f"it takes one view at a time: [drgs.{where}(..., camera, ...) for camera in cameras]"
+    must_be(where, "camera", camera, Camera, hint if several else _CAMERA)
+    check_scene(where, gaussians, settings)
+
+
+def camera_list(where: str, name: str, cameras: Any) -> list[Camera]:
+    """One Camera or several as a list; `ArgumentError` for anything else."""
+    if isinstance(cameras, Camera):
+        return [cameras]
+    if isinstance(cameras, str | bytes | dict) or not isinstance(cameras, Iterable):
+        raise ArgumentError(f"{where}: {name} must be a Camera or a list of them, got {kind_of(cameras)}; {_CAMERA}")
+    cameras = list(cameras)
+    for index, camera in enumerate(cameras):
+        must_be(where, f"{name}[{index}]", camera, Camera, _CAMERA)
+    return cameras
+
+
+def check_oracle(where: str, gaussians: Any, camera: Any, settings: Any) -> None:
+    """What the oracles need, which take anything that has the fields of Gaussians and of a Camera."""
+    if hasattr(camera, "log_scales"):
+        raise ArgumentError(f"{where}: gaussians must come first and the camera second, got them swapped; swap them")
+    if not hasattr(gaussians, "log_scales"):
+        must_be(where, "gaussians", gaussians, Gaussians, _SCENE)
+    if camera is not None and not hasattr(camera, "w2c"):
+        must_be(where, "camera", camera, Camera, _CAMERA)
+    if settings is not None:
+        must_be(where, "settings", settings, RenderSettings, _SETTINGS)
+
+
+def check_path(where: str, path: Any) -> Path:
+    """A file name as a Path."""
+    must_be(where, "path", path, (str, os.PathLike), 'a file name, e.g. "point_cloud.ply"')
+    return Path(path)

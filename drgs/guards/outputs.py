@@ -1,0 +1,413 @@
+"""What a command may write: never over an input, never over a file that drgs did not make, alone in its folder.
+
+A folder that a command writes into is claimed first, before anything is loaded: `claim` finds out that it can be
+written, locks it, and compares what is there with what will be written. `.drgs.jsonl` in it records every file that we
+put there with its SHA-256 hash, before the file appears: what is there under its name with another hash is somebody
+else's, or was edited, and stays. The same is asked again when a file is put in its place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from drgs.guards import locks, unfinished
+
+__all__ = [
+    "Claim",
+    "check_file",
+    "claim",
+    "clean",
+    "release_all",
+    "replacing",
+]
+
+JOURNAL = ".drgs.jsonl"
+_MAX_JSON = 64 << 20
+_LARGE = 1 << 20
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+
+_log = logging.getLogger(__name__)
+_claims: dict[Path, Claim] = {}
+_hashes: dict[tuple, str] = {}  # of checkpoints, which are moved and linked
+
+
+class Claim:
+    """A folder that this process alone writes into, until `release`; also a `with` block.
+
+    Attributes:
+        path: The folder, without links.
+        command: Name of the command that writes.
+    """
+
+    def __init__(self, path: Path, command: str):
+        self.path, self.command = path, command
+        self._thread, self._depth, self._inputs = threading.get_ident(), 1, []
+        self._new = []  # folders that were made for it, from the outside in
+        self._made: dict[str, dict[str, str]] = {}  # name -> hash -> command
+
+    def __enter__(self) -> Claim:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.release()
+
+    def check(self, names: Iterable[str]) -> None:
+        """See to it that files may be written.
+
+        Args:
+            names: Relative to the folder.
+        Raises:
+            ValueError: If one is an input, or is there and was not made by this command.
+        """
+        for name in names:
+            target = self.path / name
+            if not os.path.lexists(target):
+                continue
+            _refuse_inputs(target, self._inputs)
+            if not self.is_made(target):
+                raise ValueError(
+                    f"{target}: must not be replaced, it is not as `drgs {self.command}` left it or is somebody "
+                    "else's; move it away or choose another output (-o)"
+                )
+
+    def is_made(self, path: Path, by: tuple[str, ...] | None = None) -> bool:
+        """Whether a file, a link or everything in a folder is as drgs wrote it.
+
+        Args:
+            path: In the folder.
+            by: By these commands; default by any.
+        """
+        if path.is_dir() and not path.is_symlink():
+            return all(self.is_made(child, by) for child in path.iterdir())
+        if not path.is_symlink() and not path.is_file():
+            return False
+        made = self._made.get(path.relative_to(self.path).as_posix())
+        command = made.get(_hash(path)) if made else None
+        if command is None and path.suffix == ".json":
+            command = _author(path)
+            command = command if command == self.command else None
+        if command is None and path.suffix == ".jsonl" and _is_log(path):
+            command = self.command
+        return command is not None and (by is None or command in by)
+
+    def record(self, name: str, content: str | os.PathLike, command: str | None = None) -> None:
+        """Write down that a command is about to put a file into the folder.
+
+        Args:
+            name: Relative to the folder.
+            content: A file or link with the same content.
+            command: Default the one that holds the folder.
+        """
+        row = {"file": name, "sha256": _hash(Path(content)), "command": command or self.command}
+        known = self._made.setdefault(name, {})
+        if known.get(row["sha256"]) == row["command"]:
+            return
+        known[row["sha256"]] = row["command"]
+        with (self.path / JOURNAL).open("ab") as file:
+            file.write(json.dumps(row).encode() + b"\n")
+
+    def adopt(self, names: Iterable[str], command: str) -> None:
+        """Take what is there for a command's own, where there is no record: a copy without hidden files."""
+        if not (self.path / JOURNAL).exists():
+            for name in names:
+                if (self.path / name).is_file():
+                    self.record(name, self.path / name, command)
+
+    def put(self, path: Path, name: str) -> None:
+        """Move a finished file, link or folder into the folder, where nothing must be of that name."""
+        for part in (path, *(path.rglob("*") if path.is_dir() and not path.is_symlink() else ())):
+            if part.is_symlink() or part.is_file():
+                self.record((Path(name) / part.relative_to(path)).as_posix(), part)
+        if os.path.lexists(self.path / name):
+            raise ValueError(f"{self.path / name}: must not be replaced, it has appeared meanwhile; move it away")
+        os.rename(path, self.path / name)
+
+    def remove(self, path: Path) -> None:
+        """Delete a file, a link or a folder of files, each of which drgs has made.
+
+        Raises:
+            ValueError: If one is not, or if an input is among them; then nothing is deleted.
+        """
+        if not os.path.lexists(path):
+            return
+        self.check([path.relative_to(self.path).as_posix()])
+        if path.is_dir() and not path.is_symlink():
+            for input_path in self._inputs:
+                if path in (input_path, *input_path.parents):
+                    raise ValueError(f"{input_path}: must not be an input and be replaced; choose another output (-o)")
+            for child in path.iterdir():
+                self.remove(child)
+            path.rmdir()
+        else:
+            path.unlink()
+
+    def check_all(self, by: tuple[str, ...]) -> list[Path]:
+        """What is in the folder, all of which the given commands must have made.
+
+        Raises:
+            ValueError: If they have not.
+        """
+        ours = JOURNAL, locks.NAME
+        content = [x for x in self.path.iterdir() if x.name not in ours and not unfinished.NAME.fullmatch(x.name)]
+        for path in content:
+            if not self.is_made(path, by):
+                raise ValueError(
+                    f"{path}: must not be deleted, `drgs {self.command}` did not make it or it was changed; "
+                    "move it away or choose another output (-o)"
+                )
+        return content
+
+    def clear(self, by: tuple[str, ...]) -> None:
+        """Delete everything in the folder, if all of it is by these commands (`check_all`)."""
+        for path in self.check_all(by):
+            self.remove(path)
+
+    def sweep(self, *folders: str) -> None:
+        """Delete unfinished files of processes that were killed here, in the folder and in the given ones in it."""
+        for folder in (self.path, *(self.path / name for name in folders)):
+            for path in folder.iterdir() if folder.is_dir() else ():
+                if unfinished.is_left_over(path):
+                    _log.info("%s: removed, an interrupted command left it unfinished", path)
+                    unfinished.delete(path)
+
+    def release(self) -> None:
+        """Unlock the folder; it is removed if it was made for the claim and nothing came into it."""
+        self._depth -= 1
+        if self._depth:
+            return
+        _claims.pop(self.path, None)
+        locks.release(self.path)
+        with contextlib.suppress(OSError):
+            if self._new and {path.name for path in self.path.iterdir()} <= {JOURNAL}:
+                (self.path / JOURNAL).unlink(missing_ok=True)
+        for path in reversed(self._new):
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+    def _read(self) -> None:
+        """Read the journal, and shorten it to what is still so."""
+        path = self.path / JOURNAL
+        if not path.exists():
+            return
+        rows = []
+        for line in path.read_bytes().splitlines():
+            with contextlib.suppress(ValueError, TypeError, KeyError):  # a killed process leaves half a line
+                row = json.loads(line)
+                rows.append(row)
+                self._made.setdefault(row["file"], {})[row["sha256"]] = row["command"]
+        if len(rows) > 2 * len(self._made) + 100:
+            kept = [row for row in rows if _is_there(self.path / row["file"], row["sha256"])]
+            with replacing(path, claimed=False) as name:
+                Path(name).write_text("".join(json.dumps(row) + "\n" for row in kept))
+
+
+def claim(
+    folder: str | os.PathLike, command: str, names: Iterable[str] = (), inputs: Iterable[str | os.PathLike] = ()
+) -> Claim:
+    """Make a folder if it is missing, lock it, and see to it that it can be written; before anything is loaded.
+
+    Within one thread a claimed folder can be claimed again; the first command's name stays.
+
+    Args:
+        folder: What -o says.
+        command: For people, and for the record of what it made.
+        names: Files that will be written; more may be checked later (`Claim.check`).
+        inputs: Files and folders that are read; those that do not exist are left out.
+    Raises:
+        ValueError: If it is no folder that can be written, another process writes there, or a name is taken by an
+            input or a file that drgs did not make.
+    """
+    path = Path(os.path.realpath(folder))
+    held = _claims.get(path)
+    if held is not None and held._thread == threading.get_ident():
+        held._depth += 1
+    else:
+        held = _locked(Path(folder), path, command, held)
+    held._inputs += [Path(os.path.realpath(x)) for x in inputs if os.path.exists(x)]
+    try:
+        held.check(names)
+    except BaseException:
+        held.release()
+        raise
+    return held
+
+
+def check_file(
+    path: str | os.PathLike,
+    command: str,
+    inputs: Iterable[str | os.PathLike] = (),
+    is_made: Callable[[Path], bool] | None = None,
+) -> None:
+    """The same for a command that writes one file.
+
+    Args:
+        path: The file.
+        command: Name of the command.
+        inputs: As for `claim`.
+        is_made: Whether a file is one that the command wrote; default: a JSON file that says so.
+    Raises:
+        ValueError: If it cannot be written, is an input, or is there and was not made by this command.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path}: must be a file, is a folder; name a file in it")
+    if os.path.lexists(path):
+        _refuse_inputs(path, [Path(os.path.realpath(x)) for x in inputs if os.path.exists(x)])
+        if path.is_symlink() or not (is_made(path) if is_made else _author(path) == command):
+            raise ValueError(
+                f"{path}: must not be replaced, `drgs {command}` did not make it; move it away or choose another output"
+            )
+    new = _make(path.parent, path.parent)
+    try:
+        with tempfile.NamedTemporaryFile(prefix=".drgs.", suffix=".tmp", dir=path.parent):
+            pass
+    except OSError as error:
+        raise _unwritable(path.parent, error) from None
+    finally:
+        for made in reversed(new):  # as long as nothing has been computed, nothing is left
+            made.rmdir()
+
+
+def release_all() -> None:
+    """Release what a command has claimed, at its end."""
+    for held in reversed(list(_claims.values())):
+        held._depth = 1
+        held.release()
+
+
+def clean() -> None:
+    """Remove what is unfinished, and the locks; for a process that is about to end in the middle of its work."""
+    unfinished.delete_all()
+    release_all()
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -> Iterator[str]:
+    """The name of a hidden file beside `path`, which it becomes once the block ends; missing folders are made.
+
+    A process that dies leaves the old file, or none, and at most the hidden one.
+
+    Args:
+        path: The file.
+        suffix: That the hidden name must end with, for a library that goes by it.
+        claimed: In a claimed folder, refuse to replace what drgs did not make, and record what it made.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parent = os.path.realpath(path.parent)
+    try:
+        with unfinished.hidden_file(parent, path.name, suffix) as name:
+            yield name
+            umask = os.umask(0)  # hidden files are private; what we write is to be shared as any other
+            os.umask(umask)
+            os.chmod(name, 0o666 & ~umask)
+            held = _claim_of(Path(parent)) if claimed else None
+            if held is not None:
+                inside = (Path(parent) / path.name).relative_to(held.path).as_posix()
+                held.check([inside])
+                held.record(inside, name)
+            os.replace(name, path)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        reason = f"must be written, got: {error.strerror}; free some space or choose another folder"
+        raise OSError(f"{path}: {reason}") from None
+
+
+def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim:
+    if held is not None:
+        raise ValueError(f"{folder}: must not be written by two threads at once; choose another folder")
+    made, new = Claim(path, command), _make(folder, path)
+    made._new = new
+    try:
+        stale = locks.acquire(path, command)
+        if stale is not None:
+            _log.warning("%s: %s ended without unlocking it, goes on here", folder, stale)
+        _claims[path] = made
+        made._read()
+        made.sweep()
+    except BaseException as error:
+        if path in _claims:
+            made.release()
+        for x in reversed(new):
+            with contextlib.suppress(OSError):
+                x.rmdir()
+        if isinstance(error, OSError):
+            raise _unwritable(folder, error) from None
+        raise
+    return made
+
+
+def _make(folder: Path, path: Path) -> list[Path]:
+    """Make a folder; those that were missing, from the outside in."""
+    missing = [x for x in (path, *path.parents) if not os.path.lexists(x)][::-1]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    return missing
+
+
+def _unwritable(folder: Path, error: OSError) -> ValueError:
+    reason = error.strerror or error
+    return ValueError(f"{folder}: -o must be a folder that can be written, got: {reason}; choose another")
+
+
+def _refuse_inputs(target: Path, inputs: list[Path]) -> None:
+    for path in inputs:
+        with contextlib.suppress(OSError):
+            if os.path.samefile(path, target):  # through links of either kind
+                raise ValueError(f"{target}: must not be read and replaced, it is an input; choose another output (-o)")
+
+
+def _claim_of(folder: Path) -> Claim | None:
+    """The innermost claim that a folder is in."""
+    return next((_claims[x] for x in (folder, *folder.parents) if x in _claims), None)
+
+
+def _hash(path: Path) -> str:
+    if path.is_symlink():
+        return f"link to {os.readlink(path)}"
+    status = path.stat()
+    key = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+    if key in _hashes:
+        return _hashes[key]
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if status.st_size > _LARGE:  # small ones are quick, and might be replaced within a tick of the clock
+        _hashes[key] = digest
+    return digest
+
+
+def _is_there(path: Path, digest: str) -> bool:
+    return os.path.lexists(path) and not (path.is_dir() and not path.is_symlink()) and _hash(path) == digest
+
+
+def _author(path: Path) -> str | None:
+    """The command that a JSON file of ours says it is of."""
+    try:
+        if path.stat().st_size > _MAX_JSON:
+            return None
+        value = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return value.get("command") if isinstance(value, dict) and isinstance(value.get("schema"), int) else None
+
+
+def _is_log(path: Path) -> bool:
+    """Whether the first line is an event of `drgs.files.Run.log`."""
+    try:
+        with path.open("rb") as file:
+            value = json.loads(file.readline(_MAX_JSON))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(value, dict) and isinstance(value.get("schema"), int) and "event" in value

@@ -1,0 +1,116 @@
+"""Parameter groups of Fisher information. A group is one entry of `GROUPS`; nothing else asks for its name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+
+from drgs.gain import Information
+from drgs.information.jacobian import GEOMETRY
+from drgs.tracing.call import quaternion_product
+
+__all__ = ["GROUPS", "Group", "Information", "groups_of"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Group:
+    """What a group is shaped like, and where its numbers come from.
+
+    Attributes:
+        shape: Gaussians -> shape of its information.
+        entries: What it is made from, of the sums of a replay (`jacobian.Diagonal`).
+        collect: (N, entries) sums, `Replay`, channel weights -> its information.
+        spread: Weights shaped like its information, `Replay` -> (N, entries or 3) weights of squares in a pixel
+            (`jacobian.Variance`); None where a pixel's RGB do not depend on it.
+        input: The tensor that reverse mode differentiates by.
+        pull: (derivative by `input`, `input`) -> derivative by the group.
+        fisherrf: Inputs by name -> what FisherRF divides the squares by; None where it leaves the group out.
+        columns: Gaussians -> shape of a tangent, where it is not `shape`.
+        outputs: First and last (exclusive) channel of a column that tells about it: RGB, then features.
+        merge: Squares of all columns, shaped `columns` -> information.
+        there: Gaussians -> whether they have it.
+    """
+
+    shape: Callable
+    entries: tuple[int, ...]
+    collect: Callable
+    input: str
+    spread: Callable | None = None
+    pull: Callable = lambda slope, _: slope
+    fisherrf: Callable | None = lambda _: 1.0
+    columns: Callable | None = None
+    outputs: tuple = (0, 3)
+    merge: Callable = lambda squares: squares
+    there: Callable = lambda _: True
+
+    def tangent(self, gaussians) -> tuple[int, ...]:
+        """Shape of a tangent in `render_jvp`."""
+        return (self.columns or self.shape)(gaussians)
+
+
+def _geometry(first: int, count: int, name: str, **options) -> Group:
+    """`count` numbers a Gaussian from entry `first` of the rows on."""
+    shape = (lambda g: (len(g), count)) if count > 1 else (lambda g: (len(g),))
+    return Group(
+        shape=shape,
+        entries=tuple(range(first, first + count)),
+        collect=lambda sums, replay, weights: sums if count > 1 else sums[:, 0],
+        spread=lambda values, replay: values.reshape(len(values), count),
+        input=name,
+        **options,
+    )
+
+
+def _turned(slope: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
+    """(N, 3) derivative by a world-frame rotation, from the one by the quaternion."""
+    axes = torch.eye(3, dtype=torch.float64)
+    return torch.stack([(slope * 0.5 * quaternion_product(x.expand(len(quats), 3), quats)).sum(1) for x in axes], 1)
+
+
+def _opacity_slope(inputs: dict) -> torch.Tensor:
+    opacity = inputs["logit_opacities"].cpu().double().sigmoid()
+    return (opacity * (1 - opacity)).clamp_min(1e-300)
+
+
+# Colors are linear: dC_c / d sh_kc = w Y_k, 0 where the color is clamped.
+GROUPS = {
+    "means": _geometry(0, 3, "means"),
+    "rotations": _geometry(3, 3, "quats", pull=_turned, fisherrf=None),
+    # FisherRF squares derivatives by s and alpha, then multiplies by ds/dlog s and dalpha/dlogit once.
+    "log_scales": _geometry(6, 3, "log_scales", fisherrf=lambda inputs: inputs["log_scales"].cpu().double().exp()),
+    "logit_opacities": _geometry(9, 1, "logit_opacities", fisherrf=_opacity_slope),
+    "sh": Group(
+        shape=lambda g: tuple(g.sh.shape),
+        entries=(GEOMETRY,),
+        collect=lambda sums, replay, weights: replay.sh_information(sums) * weights,
+        spread=lambda values, replay: replay.sh_spread(values),
+        input="sh",
+    ),
+    "features": Group(
+        shape=lambda g: (len(g),),
+        entries=(GEOMETRY,),
+        collect=lambda sums, replay, weights: sums[:, 0],
+        input="features",
+        columns=lambda g: tuple(g.features.shape),
+        outputs=(3, None),
+        merge=lambda squares: squares.mean(1),
+        there=lambda g: g.features is not None,
+    ),
+}
+
+
+def groups_of(gaussians, wanted=None) -> dict[str, Group]:
+    """The groups that Gaussians have, or those of them that are wanted, in the order of `GROUPS`.
+
+    Raises:
+        ValueError: If one is wanted that they do not have.
+    """
+    if isinstance(wanted, str):
+        wanted = (wanted,)
+    there = {name: group for name, group in GROUPS.items() if group.there(gaussians)}
+    for name in wanted or ():
+        if name not in there:
+            raise ValueError(f"fisher: groups must be among {', '.join(there)}, got {name!r}")
+    return {name: group for name, group in there.items() if wanted is None or name in wanted}

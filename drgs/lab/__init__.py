@@ -1,0 +1,1 @@
+"""Measuring: rasterizers against models, settings against their cost, extremes against float64."""

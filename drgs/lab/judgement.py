@@ -1,0 +1,294 @@
+"""What a rasterizer's image and gradients are beside a model's, and what explains the difference: verdicts of groups.
+
+Pixels that hang on near ties, where two correct renderers differ, are left out before a difference counts; then known
+deviations explain what they can, and the rasterizer's own central differences decide the rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+
+import torch
+
+from drgs.cameras import Camera
+from drgs.lab.conventions import LEAST, Model
+from drgs.lab.differences import Differences, central
+from drgs.lab.rasterizers import GROUPS, Dump, Rasterizer
+
+__all__ = ["Case", "Compared", "compared", "judge"]
+
+_PIXEL = 1e-3  # a pixel that differs by more hangs on a cut-off or on the order; if few do, they are left out
+_FEW = 0.01
+_IMAGE = 1e-3  # RMS of images that agree
+_ENOUGH = 3  # converged differences that a verdict needs
+_OWN = 0.02  # relative difference from its own central differences that is a bug
+
+
+@dataclasses.dataclass(frozen=True)
+class Deviation:
+    """A difference of gradients that is made on purpose.
+
+    Attributes:
+        name: In words.
+        where: Where it is known from.
+        change: Fields of the model that have it.
+    """
+
+    name: str
+    where: str
+    change: dict
+
+
+_DETACHED = Deviation(
+    "view direction of SH detached",
+    "training code that evaluates SH on detached directions",
+    {"direction_gradient": False},
+)
+_PASSED = Deviation("clamped alpha passes its gradient", "INRIA, backward.cu:977", {"alpha_max_gradient": "pass"})
+_ZEROED = Deviation(
+    "clamped alpha has no gradient", "gsplat, RasterizeToPixels3DGSDevice.cuh:155", {"alpha_max_gradient": "zero"}
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """What is compared, and how: arguments of `crossval`; `first` is the view that is asked for differences."""
+
+    rasterizer: Rasterizer | Dump
+    raw: dict
+    cameras: list[Camera]
+    background: tuple
+    oracle: bool
+    tolerance: float
+    entries: int
+    first: int
+    say: Callable[[str], None]
+
+    def theirs(self, u) -> dict:
+        """The rasterizer's gradient, summed over views; None where there is none."""
+        if isinstance(self.rasterizer, Dump):
+            return dict(self.rasterizer.gradients)
+        pairs = zip(self.cameras, u, strict=True)
+        parts = [self.rasterizer.gradient(self.raw, camera, self.background, w) for camera, w in pairs]
+        return {name: None if parts[0][name] is None else sum(part[name] for part in parts) for name in GROUPS}
+
+    def ours(self, model: Model, u) -> dict:
+        """The model's gradient, summed over views."""
+        parts = [model.gradient(self.raw, c, w, self.oracle) for c, w in zip(self.cameras, u, strict=True)]
+        return {name: sum(part[name] for part in parts) for name in GROUPS}
+
+
+@dataclasses.dataclass
+class Compared:
+    """Images and gradients beside the model's, before anything is explained.
+
+    Attributes:
+        views: A row a view.
+        agrees: Whether the images are the model's.
+        u: (C, H, W, 3) cotangents, 0 at pixels that do not count.
+        theirs: The rasterizer's gradients.
+        groups: A row a group.
+        ties: (C, H, W) bool, pixels that hang on near ties, looked for where something is to be explained.
+        counted: Whether these count all the same, because next to nothing would be left.
+    """
+
+    views: list[dict]
+    agrees: bool
+    u: torch.Tensor
+    theirs: dict
+    groups: dict
+    ties: torch.Tensor
+    counted: bool
+
+
+def compared(case: Case, model: Model, signs, pictures, alphas, drawn, near_ties: Callable) -> Compared:
+    """Two correct renderers differ where pixels hang on near ties: these are left out before a difference counts."""
+    ties, counted = torch.zeros(signs.shape[:3], dtype=torch.bool), False
+    while True:
+        left = ties & (not counted)
+        views = [_image_row(*row) for row in zip(case.cameras, pictures, alphas, drawn, ~left, strict=True)]
+        agrees = all(row["rms"] <= _IMAGE and row["share"] <= _FEW for row in views)
+        u = signs
+        if not isinstance(case.rasterizer, Dump):  # whose gradients are of its own cotangents
+            off = torch.stack([(a - s).abs().amax(-1) > _PIXEL for a, (s, _) in zip(pictures, drawn, strict=True)])
+            u = signs * ~(left | (off & agrees))[..., None]
+        case.say("gradients")
+        theirs, ours = case.theirs(u), case.ours(model, u)
+        groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in GROUPS}
+        found = Compared(views, agrees, u, theirs, groups, ties, counted)
+        if ties.any() or (agrees and all(row["verdict"] for row in groups.values())):
+            return found
+        ties = torch.stack([near_ties(view) for view in range(len(case.cameras))])
+        counted = float((~ties).double().mean()) < LEAST
+        if counted or not ties.any():
+            return dataclasses.replace(found, ties=ties, counted=counted)
+
+
+def judge(case: Case, model: Model, compared: Compared) -> None:
+    """Give every group that differs its verdict."""
+    rasterizer, agrees, groups = case.rasterizer, compared.agrees, compared.groups
+    if agrees:
+        _known(case, model, compared)
+    names = [name for name, row in groups.items() if row["verdict"] is None]
+    if names and isinstance(rasterizer, Rasterizer):
+        case.say("central differences")
+        _decide(case, model if agrees else None, compared, names)
+    elif names:
+        verdict, why = "undecided", "the image is of another model, a dump cannot be asked for central differences"
+        open_to = dict.fromkeys(names, 0.0)
+        if agrees:
+            verdict, why = "gradient bug", "the image is the model's, the gradient is not"
+            # Its cotangents cannot be masked: what pixels with near ties add may be another in its order.
+            tied = case.ours(model, compared.u * compared.ties[..., None])
+            open_to = {name: float(tied[name].norm()) for name in names}
+        for name in names:
+            groups[name] |= {"verdict": verdict, "why": why}
+            if groups[name]["relative"] * groups[name]["norm"] <= open_to[name]:
+                why_not = (
+                    f"{int(compared.ties.sum())} pixels that hang on near ties could explain it; choose other views"
+                )
+                groups[name] |= {"verdict": "undecided", "why": why_not}
+    if compared.counted:
+        share = float(compared.ties.double().mean())
+        for row in groups.values():
+            if row["verdict"] == "model difference":
+                why = f"{share:.0%} of the pixels hang on near ties; choose other views"
+                row |= {"verdict": "undecided", "why": why}
+
+
+def _image_row(camera: Camera, image, alpha, drawn: tuple, counts) -> dict:
+    """How far two images are apart, at the pixels that count."""
+    same, same_alpha = drawn
+    error = (image - same).abs().amax(-1) * counts
+    worst = torch.topk(error.reshape(-1), min(5, error.numel())).indices
+    at = [
+        {"x": int(i) % camera.width, "y": int(i) // camera.width, "difference": float(error.view(-1)[i])} for i in worst
+    ]
+    return {
+        "view": camera.name,
+        "rms": _mean((image - same).square().mean(-1), counts) ** 0.5,
+        "max": float(error.max()),
+        "share": _mean((error > _PIXEL).double(), counts),
+        "alpha": {
+            "rms": _mean((alpha - same_alpha).square(), counts) ** 0.5,
+            "bias": _mean(alpha - same_alpha, counts),
+        },
+        "near_ties": int((~counts).sum()),
+        "worst": at,
+    }
+
+
+def _mean(values: torch.Tensor, counts: torch.Tensor) -> float:
+    return float((values * counts).sum()) / max(int(counts.sum()), 1)
+
+
+def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float) -> dict:
+    """How far two gradients are apart; `verdict` is None where that is still to be explained."""
+    row = {"verdict": None, "why": "", "worst": []}
+    if theirs is None:
+        theirs, row["why"] = torch.zeros_like(ours), "the image does not depend on it"
+    finite = torch.isfinite(theirs)
+    if not finite.all():
+        index = [int(i) for i in torch.nonzero(~finite)[0]]
+        row |= {"verdict": "gradient bug", "why": f"not finite, first at {index}"}
+        theirs = torch.where(finite, theirs, 0.0)
+    a, b = theirs.reshape(-1), ours.reshape(-1)
+    norm = float(b.norm())
+    row["relative"] = float((a - b).norm()) / max(norm, 1e-12)
+    row["cosine"] = float(a @ b / (a.norm() * b.norm()).clamp_min(1e-300)) if norm > 0 else float(not a.any())
+    row["bias"] = float(a @ b) / max(norm, 1e-12) ** 2 - 1 if norm > 0 else 0.0
+    row["max"] = float((a - b).abs().max())
+    row["norm"] = norm
+    each = (theirs - ours).reshape(len(ours), -1).norm(dim=1)
+    for i in torch.topk(each, min(5, len(each))).indices:
+        row["worst"].append({"gaussian": int(i), "difference": float(each[i])})
+    if row["verdict"] is None and (row["relative"] <= tolerance or (norm < 1e-9 and row["max"] < 1e-9)):
+        row["verdict"], row["why"] = "agreement", ""
+    return row
+
+
+def _known(case: Case, model: Model, compared: Compared) -> None:
+    """Explain what documented choices explain: the fewest of them that settle most groups."""
+    groups, theirs = compared.groups, compared.theirs
+    open_ones = [name for name, row in groups.items() if row["verdict"] is None and theirs[name] is not None]
+    if not open_ones:
+        return
+    clamp = _PASSED if model.settings.alpha_max_gradient == "zero" else _ZEROED
+    choices = [_DETACHED] if case.raw["sh"].shape[1] > 1 else []
+    choices += [clamp] if model.settings.alpha_max < 1 else []
+    best: tuple[list, tuple] = ([], ())
+    for size in range(1, len(choices) + 1):
+        for chosen in itertools.combinations(choices, size):
+            changed = model.replace(**{k: v for c in chosen for k, v in c.change.items()})
+            ours = case.ours(changed, compared.u)
+            settled = [n for n in open_ones if _group_row(theirs[n], ours[n], case.tolerance)["verdict"] == "agreement"]
+            if len(settled) > len(best[0]):
+                best = settled, chosen
+    for name in best[0]:
+        groups[name] |= {"verdict": "known deviation", "why": "; ".join(f"{c.name} ({c.where})" for c in best[1])}
+
+
+def _decide(case: Case, model: Model | None, compared: Compared, names: list[str]) -> None:
+    """Ask the rasterizer's own central differences; `model` is given if the image is its."""
+    groups, rasterizer, raw, background = compared.groups, case.rasterizer, case.raw, case.background
+    camera, u = case.cameras[case.first], compared.u[case.first]
+    found = rasterizer.gradient(raw, camera, background, u)
+    found = {name: torch.zeros_like(raw[name]) if x is None else x for name, x in found.items()}
+    wanted = found if model is None else model.gradient(raw, camera, u)
+    chosen = {name: _entries(found[name], wanted[name], case.entries) for name in names}
+    own = central(rasterizer, raw, camera, background, u, chosen)
+    kept = rasterizer.gradient(raw, camera, background, u * own.kept[..., None])
+    wanted = None if model is None else model.gradient(raw, camera, u * own.kept[..., None])
+    for name in names:
+        there = torch.zeros_like(raw[name]) if kept[name] is None else kept[name]
+        row = _own_row(there, None if wanted is None else wanted[name], own, name)
+        groups[name]["differences"] = row
+        row["pixels_left_out"] = int((~own.kept).sum())
+        if len(own.entries[name]) < _ENOUGH:
+            groups[name] |= {"verdict": "undecided", "why": f"{row['left_out']} of its differences did not converge"}
+        elif row["bug"]:
+            groups[name] |= {"verdict": "gradient bug", "why": row["what"]}
+        else:
+            why = "agrees with its own central differences"
+            why += "; its image is of another model" if model is None else ", which differ from the model's gradient"
+            groups[name] |= {"verdict": "model difference", "why": why}
+
+
+def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
+    """Where the two differ most, and where the gradient is largest: half of each."""
+    a, b = torch.nan_to_num(theirs).reshape(-1), ours.reshape(-1)
+    order = [torch.argsort(x.abs(), descending=True).tolist() for x in (a - b, b)]
+    return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]
+
+
+def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differences, name: str) -> dict:
+    """A gradient, and the model's if it has the same image, against central differences at their entries."""
+    values, bars = own.values[name], own.uncertainty[name]
+    there = gradient.reshape(-1)[own.entries[name]]
+    error, size = float((there - values).norm()), float(values.norm())
+    noise = float(bars.norm())
+    ratios = there[values.abs() > 3 * bars] / values[values.abs() > 3 * bars]
+    ratio = float(ratios.median()) if len(ratios) else float("nan")
+    spread = float((ratios - ratio).abs().median()) if len(ratios) else float("nan")
+    bug = error > _OWN * size + 3 * noise
+    if wanted is not None:  # a small error, too, if the differences clearly side with the model
+        other = float((wanted.reshape(-1)[own.entries[name]] - values).norm())
+        bug |= error > 3 * max(noise, other)
+    if not there.any() and bug:
+        what = "it is 0, its own central differences are not"
+    elif spread < 0.02 and abs(ratio - 1) > 0.02:
+        what = f"it is {ratio:.3g} times its own central differences"
+    else:
+        what = f"it is off its own central differences by {error / max(size, 1e-300):.2g} of their size"
+    return {
+        "entries": own.entries[name],
+        "central": values.tolist(),
+        "uncertainty": bars.tolist(),
+        "gradient": there.tolist(),
+        "relative": error / max(size, 1e-300),
+        "left_out": own.left_out[name],
+        "bug": bool(bug),
+        "what": what,
+    }

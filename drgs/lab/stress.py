@@ -1,0 +1,399 @@
+"""`drgs stress`: the extremes of the renderer, on this machine and backend, against the float64 oracle.
+
+A row a case and traversal: the largest error of the image; the relative error of the worst block of gradients, of the
+forward mode, and of the two against each other (`drgs.lab.accuracy.Errors`); the error of the exact Fisher diagonal
+against the oracle's dense Jacobian, of the group's largest entry. It holds if all are within `BOUNDS` and everything is finite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import textwrap
+import time
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.guards.outputs import claim
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.options import Stress
+    from drgs.ellipsoids import Gaussians
+    from drgs.lab.accuracy import Oracle
+    from drgs.lab.extremes import Case
+    from drgs.lab.refusals import Refusal
+
+__all__ = ["BOUNDS", "COLUMNS", "Row", "Truth", "markdown", "measure", "refused", "rows", "run", "truth_of"]
+
+BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fisher": 1e-4}
+"""What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
+
+_DENSE = 3_000_000  # pixels^2 x Gaussians: the dense Jacobian of that takes the oracle a few seconds
+_ROUNDING = 8 * 6e-8  # of `bvh`, times distance / smallest sigma: docs/numerics.md
+
+COLUMNS = {
+    "image": "image",
+    "gradient": "gradient",
+    "forward": "forward mode",
+    "duality": "adjoint against forward",
+    "fisher": "Fisher diagonal",
+}
+_CRITERIA = ("logdet", "eig", "trace_cov")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One case on one traversal.
+
+    Attributes:
+        case, traversal: Their names; refusals have the traversal `all`.
+        image, gradient, forward, duality, fisher: Errors, see `BOUNDS`; None where there is none.
+        group: That of the worst gradient.
+        finite: Every output, derivative and entry of the information is; None where nothing was computed.
+        verdict: `holds`, `warns` (refused or warned about, as documented) or `FAILS`.
+        remark: What a reader should know, messages included.
+        seconds: Of the renderer, compilation of its kernels included.
+    """
+
+    case: str
+    traversal: str
+    image: float | None = None
+    gradient: float | None = None
+    group: str = ""
+    forward: float | None = None
+    duality: float | None = None
+    fisher: float | None = None
+    finite: bool | None = None
+    verdict: str = "FAILS"
+    remark: str = ""
+    seconds: float = 0.0
+
+
+def run(args: Stress) -> int:
+    """`drgs stress`: exit code 1 if a bound is broken."""
+    from drgs.lab import extremes, refusals
+
+    known = (*extremes.CASES, *refusals.REFUSALS)
+    chosen = [case for case in known if args.match.lower() in case.name.lower()]
+    if not chosen:
+        raise ValueError(f"stress: --match must be part of a case's name, got {args.match!r}; drgs stress lists all")
+    if args.output is not None:
+        claim(args.output, "stress", ["stress.json", "stress.md"])
+    start, found = time.perf_counter(), []
+    if not args.quiet:
+        print(f"{len(chosen)} cases; the first run compiles their kernels: minutes. Later ones take one or two.")
+        print(_line("on", "", "image", "gradient", "forward", "adj/fwd", "Fisher"))
+    with Bar("stress", len(chosen), not args.quiet) as bar:
+        for number, case in enumerate(chosen):
+            bar.update(number, text=case.name)
+            measured = list(rows(case))
+            found += measured
+            shown = [_printed(row) for row in measured if not args.quiet or row.verdict == "FAILS"]
+            if shown:
+                print("\n".join([case.name, *shown]), flush=True)
+    seconds = time.perf_counter() - start
+    failed = [row for row in found if row.verdict == "FAILS"]
+    if args.output is not None:
+        _write(args, found, seconds)
+    if not args.quiet:
+        held, told = (sum(row.verdict == verdict for row in found) for verdict in ("holds", "warns"))
+        print(
+            f"\n{len(found)} rows in {seconds:.0f} s: {held} hold, {told} refused or warned about, {len(failed)} fail"
+        )
+        for row in failed:
+            print(f"FAILS: {row.case} on {row.traversal}: {row.remark}")
+        if args.output is not None:
+            print(f"stress.json and stress.md: {args.output}")
+    return 1 if failed else 0
+
+
+def rows(case: Case | Refusal) -> Iterator[Row]:
+    """Measure a case on each of its traversals; what raises becomes a row."""
+    from drgs.lab.refusals import Refusal
+
+    if isinstance(case, Refusal):
+        yield _caught(case.name, "all", lambda: refused(case))
+        return
+    truth = functools.cache(lambda: truth_of(case))  # takes longer than the renderer
+    for traversal in case.traversals:
+        yield _caught(case.name, traversal, lambda traversal=traversal: measure(case, traversal, truth()))
+
+
+def _caught(name: str, traversal: str, make) -> Row:
+    try:
+        return make()
+    except Exception as error:  # whatever a backend does wrong must not end the run
+        text = " ".join(str(error).split()) or "no message"
+        return Row(name, traversal, remark=f"raised {type(error).__name__}: {text}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """A case, and what the oracle says about it.
+
+    Attributes:
+        g, cam: The scene, leaves.
+        oracle: Images and derivatives.
+        view: The camera whose image is compared in Fisher information; None where none is.
+        information: Group -> diagonal of the dense Jacobian's J^T J, of `view`.
+        remark: What `view` leaves out, and why.
+    """
+
+    g: Gaussians
+    cam: Camera
+    oracle: Oracle
+    view: Camera | None
+    information: dict
+    remark: str
+
+
+def truth_of(case: Case) -> Truth:
+    """Build a case and ask the oracle."""
+    from drgs import reference
+    from drgs.lab.accuracy import FIELDS, Oracle, jacobian, squares
+
+    rng, settings = np.random.default_rng(3), case.settings
+    g, cam = case.build(rng)
+    names = [name for name in FIELDS if case.depth or name != "depth"]
+    oracle = Oracle(g, cam, settings, rng, 1e-6, names)
+    good, out, view, remark = oracle.good, oracle.out, cam, ""
+    whole = settings.culling == "extent" and settings.fov_clamp == "none"
+    most = math.isqrt(_DENSE // max(len(g), 1)) if whole else good.numel()
+    if not good.all() and not whole:
+        remark = "no Fisher error: some pixels are near a tie, and clamp and culling make a part another image"
+        return Truth(g, cam, oracle, None, {}, remark)
+    if not good.all() or good.numel() > most:
+        view = _window(cam, good, most)
+        why = "more would take the oracle long" if good.all() else "others are near a tie, or too many"
+        remark = f"Fisher error of {view.width}x{view.height} pixels: {why}"
+        out = reference.render(g, view, settings)
+    return Truth(g, cam, oracle, view, squares(jacobian(g, out, features=True)), remark)
+
+
+def measure(case: Case, traversal: str, truth: Truth) -> Row:
+    """One row: every error of a case on `tiles` or `bvh`, and what they amount to."""
+    from drgs.lab.accuracy import compare
+
+    g, cam, oracle, settings = truth.g, truth.cam, truth.oracle, case.settings.replace(traversal=traversal)
+    start = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        errors = compare(g, cam, settings, oracle)
+        information, sound, remark = _information(case, settings, truth)
+    seconds = time.perf_counter() - start
+    told = sorted({str(w.message) for w in caught if "traversal='tiles'" in str(w.message)})
+    group = max(errors.gradient, key=errors.gradient.get)
+    values = {
+        "image": max(errors.image.values(), default=0.0),
+        "gradient": errors.gradient[group],
+        "forward": errors.joint,
+        "duality": errors.duality,
+        "fisher": information,
+    }
+    finite, bounds, limits = errors.finite and sound, BOUNDS, ""
+    if traversal == "bvh" and case.bvh == "rounds":
+        bounds = _rounded(g, cam)
+        limits = f"rounding of `bvh`: image within {bounds['image']:.0e}"
+    # A comparison with NaN is False: what is not a number is not within a bound.
+    broken = [f"{n} {x:.1e} > {bounds[n]:.0e}" for n, x in values.items() if x is not None and not x <= bounds[n]]
+    expected = traversal == "bvh" and case.bvh == "warns"
+    if expected and told and finite:
+        verdict, broken = "warns", []
+    elif expected != bool(told):
+        verdict, broken = "FAILS", [*broken, "no warning" if expected else "a warning without need"]
+    else:
+        verdict = "FAILS" if broken or not finite else "holds"
+    ties = 100 * float((~oracle.good).double().mean())
+    parts = (
+        *broken,
+        case.remark,
+        limits,
+        *told,
+        f"{ties:.2g} % of pixels near a tie, left out" if ties else "",
+        remark,
+    )
+    return Row(
+        case.name,
+        traversal,
+        **values,
+        group=group,
+        finite=finite,
+        verdict=verdict,
+        remark="; ".join(part for part in parts if part),
+        seconds=seconds,
+    )
+
+
+def _rounded(g, cam) -> dict:
+    """`BOUNDS` of hits in float32 world space; derivatives have four times the error, their squares twice that."""
+    far = (g.means.detach().double() - torch.tensor(cam.center - g.origin)).norm(dim=1)
+    unit = _ROUNDING * float((far / g.scales.detach().double().amin(1)).max())
+    more = {"image": unit, "gradient": 4 * unit, "forward": 4 * unit, "fisher": 8 * unit}
+    return {name: max(bound, more.get(name, 0.0)) for name, bound in BOUNDS.items()}
+
+
+def _information(case: Case, settings, truth: Truth) -> tuple[float | None, bool, str]:
+    """Error of the Fisher diagonal (and gains), whether all of it and of the blocks is finite, and a remark."""
+    from drgs import fisher
+    from drgs.lab.accuracy import entry_error
+
+    g, cam, view = truth.g, truth.cam, truth.view
+    found, blocks = fisher.diagonal(g, cam, settings), fisher.blocks(g, cam, settings)
+    finite = all(bool(torch.isfinite(x).all()) for x in (*found.values(), blocks))
+    if view is None:
+        return None, finite, truth.remark
+    if view is not cam:
+        found = fisher.diagonal(g, view, settings)
+    error = max(entry_error(found[name], x) for name, x in truth.information.items())
+    if not case.gain:
+        return error, finite, truth.remark
+    gain, remark = _gain(g, view, settings, found, truth.information)
+    return max(error, gain), finite, remark
+
+
+def _gain(g, cam, settings, H, truth) -> tuple[float, str]:
+    """Relative error of the gains of a second view for lambda = 0, and a remark; NaN if one is not defined."""
+    from drgs import fisher, reference
+    from drgs.gain import Prior, information_gain
+    from drgs.lab.accuracy import jacobian, squares
+
+    K = cam.K.copy()
+    K[0, 2] -= 0.6 * cam.width
+    other, prior = dataclasses.replace(cam, K=K), Prior(value=0.0)
+    Hc = fisher.diagonal(g, other, settings)
+    true = squares(jacobian(g, reference.render(g, other, settings), features=True))
+    worst, seen = 0.0, {name: x > 0 for name, x in truth.items()}
+    for criterion in _CRITERIA:
+        gain = information_gain(Hc, H, criterion, prior)
+        want = 0.0
+        for name, keep in seen.items():
+            a, c = truth[name][keep], true[name][keep]
+            terms = {"logdet": (c / a).log1p(), "eig": c / a, "trace_cov": 1 / a - 1 / (a + c)}
+            want += float(terms[criterion].sum())
+        worst = max(worst, abs(gain.total - want) / max(abs(want), 1e-12))
+    left = {name: int((~keep).sum()) for name, keep in seen.items()}
+    blocks = information_gain(
+        {"blocks": fisher.blocks(g, other, settings)},
+        {"blocks": fisher.blocks(g, cam, settings)},
+        "block_logdet",
+        prior,
+    )
+    if gain.left_out != left or not np.isfinite(blocks.total):
+        return float("nan"), f"left out {gain.left_out}, the oracle {left}; block_logdet {blocks.total}"
+    count, total = sum(left.values()), sum(x.numel() for x in truth.values())
+    return worst, f"gain of a second view (logdet, eig, trace_cov) {worst:.0e}, {count} of {total} entries left out"
+
+
+def _window(cam, good, most: int):
+    """The camera of the largest rectangle of good pixels, shortened to `most` pixels."""
+    height, width = good.shape
+    best, heights = (0, 0, 0, 0, 0), np.zeros(width, int)
+    for bottom in range(height):
+        heights = np.where(good[bottom].numpy(), heights + 1, 0)
+        for left in range(width):
+            low = height
+            for right in range(left, width):
+                low = min(low, heights[right])
+                if low == 0 or low * (width - left) <= best[0]:
+                    break
+                best = max(best, (low * (right - left + 1), left, bottom + 1 - low, right - left + 1, low))
+    _, x, y, w, h = (int(v) for v in best)
+    w, h = (w, max(1, min(h, most // w))) if w <= most else (most, 1)
+    K = cam.K.copy()
+    K[0, 2], K[1, 2] = K[0, 2] - x, K[1, 2] - y
+    return dataclasses.replace(cam, K=K, width=w, height=h)
+
+
+def refused(case: Refusal) -> Row:
+    """The row of input that must raise ValueError, or be warned about, with one line that says why."""
+    start, count, message = time.perf_counter(), 0, ""
+    for call, text in case.attempts():
+        count += 1
+        told, result = [], None
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                result = call()
+            except ValueError as error:
+                told = [] if case.warns else [str(error)]
+        if case.warns:
+            told = [str(w.message) for w in caught]
+        message = next((x for x in told if text in x and "\n" not in x), "")
+        if not message:
+            got = told or f"{type(result).__name__} without a word"
+            return Row(case.name, "all", remark=f"attempt {count}: must be told {text!r}, got {got}")
+    seconds = time.perf_counter() - start
+    return Row(case.name, "all", verdict="warns", remark=f"{count} attempts, e.g. {message}", seconds=seconds)
+
+
+# -------------------------------------------------- tables
+
+
+def _line(traversal: str, verdict: str, image: str, gradient: str, *others: str) -> str:
+    return f"  {traversal:<5}  {verdict:<5}  {image:>7}  {gradient:<22}" + "".join(f"{x:>9}" for x in others)
+
+
+def _number(x: float | None) -> str:
+    return "-" if x is None else f"{x:.0e}"
+
+
+def _finite(row: Row) -> str:
+    return "-" if row.finite is None else "yes" if row.finite else "NO"
+
+
+def _printed(row: Row) -> str:
+    """Lines of at most 80 characters; the case has a line of its own."""
+    gradient = " ".join((_number(row.gradient), row.group)).strip()
+    others = (_number(row.forward), _number(row.duality), _number(row.fisher))
+    told = "; ".join(["not finite"] * (row.finite is False) + [row.remark] * bool(row.remark))
+    remark = textwrap.wrap(told, 80, initial_indent=" " * 4, subsequent_indent=" " * 4)
+    return "\n".join([_line(row.traversal, row.verdict, _number(row.image), gradient, *others), *remark])
+
+
+def markdown(found: list[Row]) -> list[str]:
+    """The lines of a table."""
+    lines = [
+        "| case | traversal | " + " | ".join(COLUMNS.values()) + " | finite | verdict | remark |",
+        "|---" * (len(COLUMNS) + 5) + "|",
+    ]
+    for row in found:
+        numbers = [_number(getattr(row, name)) for name in COLUMNS]
+        numbers[1] += f" ({row.group.replace('_', ' ')})" if row.group and row.gradient else ""
+        remark = row.remark.replace("|", "\\|")
+        lines.append(
+            f"| {row.case} | {row.traversal} | {' | '.join(numbers)} | {_finite(row)} | {row.verdict} | {remark} |"
+        )
+    return lines
+
+
+def _write(args: Stress, found: list[Row], seconds: float) -> None:
+    from drgs import runtime
+
+    env = runtime.info()
+    report = {
+        "schema": SCHEMA,
+        "command": "stress",
+        "match": args.match,
+        "bounds": BOUNDS,
+        "seconds": seconds,
+        "verdicts": {name: sum(row.verdict == name for row in found) for name in ("holds", "warns", "FAILS")},
+        "rows": [_finite_numbers(dataclasses.asdict(row)) for row in found],
+        "env": env,
+    }
+    write_json(args.output / "stress.json", report)
+    text = "\n".join([f"drgs {env['drgs']}, {env['cpu']}, {env['backend']['variant']}.", "", *markdown(found), ""])
+    with atomic_write(args.output / "stress.md") as file:
+        file.write(text.encode())
+
+
+def _finite_numbers(row: dict) -> dict:
+    """JSON has no NaN: such a number is its name."""
+    return {k: str(x) if isinstance(x, float) and not np.isfinite(x) else x for k, x in row.items()}

@@ -1,0 +1,437 @@
+"""Times and errors of render settings against preset `exact`, for `drgs tradeoff` (tradeoff.py says what they mean)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import random
+import statistics
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+import drgs
+from drgs import runtime
+from drgs.lab.tradeoff_advice import interval
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.tradeoff import Variant
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["clocked", "measure", "placed"]
+
+_SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
+_AT_LEAST = 3  # but not before so many
+_RAYS = 200  # of a sample on Mitsuba's traversal
+_PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
+_NOTHING = 1e-6  # alpha of a view that shows nothing
+_UNSEEN = 1e-6  # of the largest: entries of the diagonal, and groups, that are left out of relative errors
+
+
+def measure(
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    variants: tuple[Variant, ...],
+    fields: dict | None = None,
+    repeats: int = 5,
+    seed: int = 0,
+    advance: Callable[[], None] = lambda: None,
+) -> dict:
+    """Times and errors of settings.
+
+    Args:
+        gaussians: At least one.
+        cameras: Pinhole, at least one.
+        variants: Rows; the first one is the truth.
+        fields: Settings that hold in every row that does not say otherwise.
+        repeats: Rounds of timing at most; they end after 100 seconds if three are done.
+        seed: Of the cotangents, of the samples of pixels and of the order within a round.
+        advance: Called after each turn.
+    Returns:
+        `rows`, in the order of `variants` (name, kind, settings, share, by, skipped; image, gradient, information,
+        errors, seconds, ratio, times (intervals of the ratios, see tradeoff_advice.py), first_call), `scatter` (of the
+        truth's times against itself), `own` (errors of the truth against the oracle), `pixels` (of one view on
+        average), `rounds`, `clock` (wall or processor). Where there is no number there is None, and the reason in
+        `skipped` or `notes`.
+    Raises:
+        ValueError: If no view shows a Gaussian, or the truth cannot be computed.
+    """
+    gaussians = placed(gaussians)
+    stage = _Stage(gaussians, cameras, seed)
+    rows = _rows_of(variants, fields or {})
+    turns = [_Turn(row, stage) for row in rows if row["skipped"] is None and row["by"] == "view"]
+    truth, others = turns[0], turns[1:]
+    again = _Turn(dict(truth.row), stage)  # the truth once more in every round: how much equal work scatters
+    others.append(again)
+    order, done = random.Random(seed), 0
+    began = time.perf_counter(), time.process_time()
+    # The first pass compiles. Every view has a turn, so that errors are of all of them.
+    for number in range(max(repeats, len(cameras) - 1) + 1):
+        timed = 1 <= number <= repeats
+        spent = min(time.perf_counter() - began[0], time.process_time() - began[1])
+        if number >= len(cameras) and done >= _AT_LEAST and spent > _SECONDS:
+            break
+        truth.take(number, timed)
+        if number == 0:
+            stage.check(truth.settings)
+        for turn in order.sample(others, len(others)):
+            turn.take(number, timed)
+            advance()
+        advance()
+        done += timed
+    for turn in (*turns, again):
+        turn.finish(truth)
+    own = _sampled(rows, stage, truth, seed)
+    for row in rows:
+        row["errors"] = _bound(row, own)
+    pixels = statistics.mean(camera.width * camera.height for camera in cameras)
+    return {
+        "rows": rows,
+        "own": own,
+        "scatter": again.row["times"],
+        "pixels": pixels,
+        "rounds": done,
+        "clock": _clock_name(),
+    }
+
+
+def placed(gaussians: Gaussians) -> Gaussians:
+    """Where they are rendered, without a graph."""
+    device = "cuda" if runtime.backend().name == "cuda" else "cpu"
+    return gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
+
+
+class _Stage:
+    """What all settings are measured on: Gaussians, views, cotangents, and the truth about each view once it is known.
+
+    Attributes:
+        shown: Whether a view has shown anything.
+        sampled: The view of which rays are sampled.
+    """
+
+    def __init__(self, gaussians, cameras, seed):
+        self.gaussians, self.cameras = gaussians, cameras
+        self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
+        self.moving = gaussians.replace(**self.leaves)
+        generator = torch.Generator().manual_seed(seed)
+        sizes = [(camera.height, camera.width, 3) for camera in cameras]
+        device = gaussians.means.device
+        self.cotangents = [
+            (torch.randint(0, 2, size, generator=generator) * 2 - 1).float().to(device) for size in sizes
+        ]
+        self.truth, self.shown, self.sampled = {}, False, 0
+
+    def image(self, g, camera, settings, share):
+        """(H, W, 3), whatever the share of its resolution that is rendered."""
+        out = drgs.render(g, _reduced(camera, share), settings, outputs=())
+        self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)
+        if share == 1:
+            return out.rgb
+        size = (camera.height, camera.width)
+        image = out.rgb.permute(2, 0, 1)[None]
+        return torch.nn.functional.interpolate(image, size=size, mode="bilinear")[0].permute(1, 2, 0)
+
+    def check(self, settings) -> None:
+        """Find a view that shows something.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        for index, camera in enumerate(self.cameras):
+            if not self.shown:
+                self.image(self.gaussians, camera, settings, 1)
+            if self.shown:
+                self.sampled = index
+                return
+        count = len(self.cameras)
+        raise ValueError(f"tradeoff: one of {count} cameras must show a Gaussian, all are empty; choose others")
+
+    def pull(self, image, cotangent) -> dict:
+        """J^T u by group."""
+        found = torch.autograd.grad((image * cotangent).sum(), list(self.leaves.values()), allow_unused=True)
+        pairs = zip(self.leaves.items(), found, strict=True)
+        return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
+
+    def information(self, camera, settings, share) -> dict:
+        small = _reduced(camera, share)
+        found = drgs.fisher.diagonal(self.gaussians, small, settings)
+        scale = camera.width * camera.height / (small.width * small.height)
+        return {name: x * scale for name, x in found.items()} if share != 1 else found
+
+
+class _Turn:
+    """One row's measurements, view by view and round by round."""
+
+    def __init__(self, row, stage):
+        self.row, self.stage = row, stage
+        self.settings = RenderSettings(**row["settings"])
+        self.seconds = {"forward": {}, "forward_backward": {}, "fisher": {}}
+        self.pixels, self.slopes, self.parts, self.medians = [], {}, {}, {}
+        self.first = 0.0
+
+    def take(self, number: int, timed: bool) -> None:
+        """Render, differentiate and inform one view; errors if it is new."""
+        if self.row["skipped"] is not None:
+            return
+        try:
+            self._take(number, timed)
+        except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
+            if number % len(self.stage.cameras) not in self.stage.truth:
+                raise  # this is the truth
+            self.row["skipped"] = _line(error)
+
+    def _take(self, number, timed):
+        stage, view, share = self.stage, number % len(self.stage.cameras), self.row["share"]
+        camera, took = stage.cameras[view], {}
+        with torch.no_grad():
+            _, took["forward"] = clocked(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
+
+        def both():
+            image = stage.image(stage.moving, camera, self.settings, share)
+            return image.detach().cpu(), stage.pull(image, stage.cotangents[view])
+
+        (image, slopes), took["forward_backward"] = clocked(both)
+        parts = None
+        if "information" not in self.row["notes"]:
+            try:
+                parts, took["fisher"] = clocked(lambda: stage.information(camera, self.settings, share))
+            except NotImplementedError as error:
+                self.row["notes"]["information"] = _line(error)
+        if number == 0:
+            self.first = sum(took.values())
+        if timed:
+            for name, seconds in took.items():
+                self.seconds[name][number] = seconds
+        if number < len(stage.cameras):
+            if not all(bool(torch.isfinite(x).all()) for x in (image, *slopes.values(), *(parts or {}).values())):
+                raise ValueError(f"{self.row['name']}: must be finite, view {camera.name or view} has NaN or Inf")
+            self._compare(stage.truth.setdefault(view, (image, slopes, parts)), image, slopes, parts)
+
+    def _compare(self, truth, image, slopes, parts):
+        self.pixels.append((image - truth[0]).abs().double().reshape(-1).numpy())
+        for name, x in slopes.items():
+            a, b = self.slopes.get(name, (0.0, 0.0))
+            y = truth[1][name]
+            self.slopes[name] = a + _squares(x - y), b + _squares(y)
+        for name, x in (parts or {}).items() if truth[2] else ():
+            y, (a, b) = truth[2][name], self.parts.get(name, (0.0, 0.0))
+            self.parts[name] = a + float((x - y).abs().sum()), b + float(y.sum())
+            seen = y > _UNSEEN * y.max()
+            if bool(seen.any()):
+                self.medians.setdefault(name, []).append(float(((x - y).abs()[seen] / y[seen]).median()))
+
+    def finish(self, truth: _Turn) -> None:
+        """Fill the row."""
+        if self.row["skipped"] is not None:
+            return
+        self.row["image"] = _image_errors(np.concatenate(self.pixels))
+        self.row["gradient"] = _gradient_errors(self.slopes)
+        if self.parts:
+            names = _compared({name: b for name, (_, b) in self.parts.items()}, _UNSEEN**2)
+            groups = {}
+            for name, (a, b) in self.parts.items():
+                known = name in names
+                groups[name] = {
+                    "l1": a / b if known else None,
+                    "median": statistics.mean(self.medians[name]) if known else None,
+                }
+            worst = max(names, key=lambda name: max(groups[name].values()), default=None)
+            self.row["information"] = {"groups": groups, "group": worst, **(groups[worst] if worst else {})}
+        warm, times = {}, {}
+        for name, x in self.seconds.items():
+            both = x.keys() & truth.seconds[name].keys()
+            warm[name] = statistics.median(x.values()) if x else None
+            times[name] = interval([x[k] / truth.seconds[name][k] for k in both])
+        self.row["seconds"], self.row["times"] = warm, times
+        self.row["ratio"] = {name: x and x["ratio"] for name, x in times.items()}
+        self.row["first_call"] = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
+
+
+def _rows_of(variants, fields: dict) -> list[dict]:
+    """Rows without numbers; those that cannot or need not be measured say why."""
+    rows, seen = [], {}
+    for variant in variants:
+        row = {"name": variant.name, "kind": variant.kind, "share": variant.share, "by": variant.by, "skipped": None}
+        row |= {"settings": None, "image": None, "gradient": None, "information": None, "notes": {}}
+        row |= {"seconds": None, "ratio": None, "times": None, "first_call": None, "full": {}}
+        try:
+            settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
+        except (ValueError, NotImplementedError) as error:
+            if not rows:
+                raise  # the truth itself
+            row["skipped"] = _line(error)
+        else:
+            row["settings"] = dataclasses.asdict(settings)
+            same = seen.setdefault((settings, variant.share, variant.by == "oracle"), variant.name)
+            if same != variant.name:
+                row["skipped"] = f"the same as {same}, with these --set"
+        rows.append(row)
+    return rows
+
+
+def _sampled(rows, stage: _Stage, truth: _Turn, seed: int) -> dict:
+    """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
+    camera, count = stage.cameras[stage.sampled], len(stage.gaussians)
+    pixels = camera.width * camera.height
+    places = torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
+    own = {"image": None, "gradient": None, "information": None}
+    for row in rows:
+        if row["skipped"] is not None or row["by"] == "view":
+            continue
+        wanted = _RAYS if row["by"] == "rays" else max(32, min(_RAYS, _PAIRS // count))
+        chosen = places[:wanted].sort().values
+        try:
+            found = _by_rays(row, stage, truth, chosen)
+        except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
+            row["skipped"] = _line(error)
+            continue
+        if row["by"] == "oracle":
+            own = found
+    return own
+
+
+def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
+    """One row on some pixels of a view: errors against the truth's image, time scaled to all of them."""
+    camera, oracle = stage.cameras[stage.sampled], row["by"] == "oracle"
+    whole = stage.cotangents[stage.sampled]
+    pixels = camera.width * camera.height
+    forward, both = _tracer(stage, RenderSettings(**row["settings"]), chosen, oracle)
+    fixed, start = [0.0, 0.0], 0.0
+    if not oracle:
+        # The acceleration structure does not grow with the number of rays. The first call compiles.
+        few = _tracer(stage, RenderSettings(**row["settings"]), chosen[:1], oracle)
+        start = sum(clocked(work)[1] for work in few)
+        fixed = [clocked(work)[1] for work in few]
+    out, first = clocked(forward)
+    good = ~out.ambiguous if oracle else torch.ones(len(chosen), dtype=torch.bool)
+    slopes, second = clocked(lambda: both(good))
+    off = (out.rgb.cpu().double() - stage.truth[stage.sampled][0].reshape(-1, 3)[chosen].double()).abs()
+    row["image"] = _image_errors(off[good].numpy().reshape(-1))
+    u = torch.zeros_like(whole)
+    u.reshape(-1, 3)[chosen[good]] = whole.reshape(-1, 3)[chosen[good]]
+    right = stage.pull(stage.image(stage.moving, camera, truth.settings, 1), u)
+    # Relative to whichever is the better of the two.
+    row["gradient"] = _gradient_errors(
+        {name: (_squares(slopes[name] - x), _squares(slopes[name] if oracle else x)) for name, x in right.items()}
+    )
+    times = [a + max(b - a, 0.0) * pixels / len(chosen) for a, b in zip(fixed, (first, second), strict=True)]
+    names = ("forward", "forward_backward")
+    row["seconds"] = dict(zip(names, times, strict=True)) | {"fisher": None}
+    exact = truth.row["seconds"]
+    row["ratio"] = {k: x / exact[k] if x and exact[k] else None for k, x in row["seconds"].items()}
+    row["first_call"] = max(start - sum(fixed), 0.0)
+    row["notes"] |= {
+        "sample": f"{len(chosen)} of {pixels} rays of one view; times scaled to all of them",
+        "information": "not measured on single rays",
+    }
+    if oracle:
+        row["notes"] |= {"ties": int((~good).sum()), "max with ties": float(off.max())}
+    own = row["gradient"]["worst"]
+    # |x^2 - y^2| = |x - y| |x + y|, summed: at most 2 e + e^2 of sum y^2 where x - y is e of y in the L2 norm.
+    return {"image": row["image"]["max"], "gradient": own, "information": own and 2 * own + own**2}
+
+
+def _tracer(stage: _Stage, settings, chosen, oracle: bool):
+    """Functions that trace these pixels' rays: the image, and the gradients of some of them."""
+    from drgs.integrator import render_rays
+
+    camera = stage.cameras[stage.sampled]
+    directions = torch.from_numpy(camera.pixel_directions().reshape(-1, 3))[chosen]
+    origins = torch.from_numpy(camera.center.copy()).expand(directions.shape)
+
+    def trace(g):
+        if oracle:
+            return drgs.reference.render(g, camera, settings, rays=(origins, directions))
+        return render_rays(g, origins, directions, settings, outputs=())
+
+    def forward():
+        with torch.no_grad():
+            return trace(stage.gaussians)
+
+    def both(good=None):
+        image = trace(stage.moving).rgb
+        u = stage.cotangents[stage.sampled].reshape(-1, 3)[chosen].to(image)
+        return stage.pull(image, u if good is None else u * good.to(u)[:, None])
+
+    return forward, both
+
+
+def _bound(row: dict, own: dict) -> dict:
+    """What budgets are compared with: the worst measure of each kind, plus the truth's own error."""
+    found = {"image": None, "gradient": None, "information": None}
+    if row["skipped"] is not None or row["by"] == "oracle":
+        return found
+    if row["image"]:
+        found["image"] = max(row["image"]["rms"], row["image"]["p999"])
+    if row["gradient"]:
+        found["gradient"] = row["gradient"]["worst"]
+    if row["information"] and row["information"]["group"]:
+        found["information"] = max(row["information"]["l1"], row["information"]["median"])
+    return {kind: None if x is None else x + (own[kind] or 0.0) for kind, x in found.items()}
+
+
+def _image_errors(off: np.ndarray) -> dict:
+    if not off.size:
+        raise ValueError("every sampled pixel is a tie; choose another --seed")
+    rms = float(np.sqrt(np.mean(off**2)))
+    psnr = -20 * math.log10(rms) if rms > 0 else None
+    return {"rms": rms, "p999": float(np.quantile(off, 0.999)), "max": float(off.max()), "psnr": psnr}
+
+
+def _gradient_errors(squares: dict) -> dict:
+    """From sums of squares of the difference and of the truth, by group."""
+    names = _compared({name: b for name, (_, b) in squares.items()}, _UNSEEN**2)
+    groups = {name: math.sqrt(a / b) if name in names else None for name, (a, b) in squares.items()}
+    worst = max(names, key=groups.get, default=None)
+    total = sum(b for _, b in squares.values())
+    return {
+        "all": math.sqrt(sum(a for a, _ in squares.values()) / total) if total else None,
+        "worst": groups[worst] if worst else None,
+        "group": worst,
+        "groups": groups,
+    }
+
+
+def _compared(sizes: dict, share: float) -> list[str]:
+    """Groups that have a relative error: rotating spheres changes nothing, and rounding would look like an error."""
+    # Means have a unit, the others do not.
+    least = share * max((x for name, x in sizes.items() if name != "means"), default=0.0)
+    return [name for name, x in sizes.items() if x > (0.0 if name == "means" else least)]
+
+
+def _squares(x: torch.Tensor) -> float:
+    return float(x.double().square().sum())
+
+
+def _reduced(camera: Camera, share: float) -> Camera:
+    if share == 1:
+        return camera
+    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+
+
+def clocked(work: Callable):
+    """What it returns, and the seconds until it was computed."""
+    import drjit as dr
+
+    now = time.process_time if _clock_name() == "processor" else time.perf_counter
+    began = now()
+    result = work()
+    dr.sync_thread()
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return result, now() - began
+
+
+def _clock_name() -> str:
+    """With one thread, time of the processor: what else runs on the machine does not stretch it."""
+    backend = runtime.backend()
+    return "processor" if backend.name == "llvm" and backend.threads == 1 else "wall"
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()).removeprefix("RenderSettings: ") or type(error).__name__

@@ -1,0 +1,140 @@
+"""Times of a few settings on views as large as `drgs render` draws them, for `drgs tradeoff`.
+
+Ratios change with the size of an image: what a setting does once a Gaussian weighs less in a large one. So the settings
+that lead at the reduced size are timed again on the cameras themselves, within a number of seconds that the user gives.
+Where one round would take longer, views are reduced just so far that it does not, and the report says so. Where there
+is no time for three rounds, intervals are as wide as the scatter of equal work at the reduced size.
+"""
+
+from __future__ import annotations
+
+import random
+import statistics
+from collections.abc import Callable
+
+import torch
+
+import drgs
+from drgs.fitting.active import at_most
+from drgs.lab.tradeoff import clocked, placed
+from drgs.lab.tradeoff_advice import interval, leaders
+from drgs.settings import RenderSettings
+
+__all__ = ["measure_full"]
+
+_ROUNDS = 3  # that say how much times scatter
+_FORWARD = 0.6  # of the seconds are for images, which is what is drawn at full size
+_GROW = 4  # times as many pixels are tried next, on the way to full size
+
+
+def measure_full(
+    measured: dict, gaussians, cameras: list, budgets, repeats: int, seconds: float, seed: int, say: Callable
+) -> dict:
+    """Times at full size, into the rows' `full`: clock -> ratio, low, high, rounds, seconds.
+
+    Args:
+        measured: Of `tradeoff_measure.measure`.
+        gaussians: On the device that they are rendered on.
+        cameras: Pinhole, as large as they are drawn.
+        budgets: Of errors.
+        repeats: Rounds at most.
+        seconds: For all three clocks together.
+        seed: Of the order within a round.
+        say: Called with what is being timed, before each.
+    Returns:
+        Clock -> `size` of the first view as it was timed, None where there was no time; `drawn`, its own size;
+        `rounds` and `names` of the rows.
+    """
+    rows = {row["name"]: row for row in measured["rows"]}
+    exact, order, report = measured["rows"][0], random.Random(seed), {}
+    gaussians = placed(gaussians)
+    chosen = {clock: leaders(measured, clock, budgets) for clock in ("forward", "forward_backward", "fisher")}
+    chosen = {clock: names for clock, names in chosen.items() if names}
+    for k, (clock, names) in enumerate(chosen.items()):
+        work = _Work(clock, gaussians, seed)
+        share = seconds * (_FORWARD if clock == "forward" and len(chosen) > 1 else 1 / (len(chosen) - k))
+        # What a round takes, in units of exact's time: at full size the others take a smaller share of it, if any.
+        units = 1 + sum(rows[name]["times"][clock]["ratio"] for name in names)
+        views, spent = _sized(work, cameras, exact, measured["pixels"], share, units, say)
+        if not views:
+            seconds = max(seconds - spent, 0.0)
+            drawn = [cameras[0].width, cameras[0].height]
+            report[clock] = {"size": None, "drawn": drawn, "rounds": 0, "names": []}
+            continue
+        took: dict[str, list[float]] = {name: [] for name in (exact["name"], *names)}
+        for number in range(max(repeats, _ROUNDS)):
+            a_round = sum(x[-1] for x in took.values()) if number else 0.0
+            if number and spent + a_round > share:
+                break
+            camera = views[number % len(views)]
+            for name in (exact["name"], *order.sample(names, len(names))):
+                say(_said(clock, camera, name))
+                took[name].append(work(camera, rows[name]))
+                spent += took[name][-1]
+        seconds = max(seconds - spent, 0.0)
+        for name, times in took.items():
+            found = interval([a / b for a, b in zip(times, took[exact["name"]], strict=True)])
+            if found["rounds"] < _ROUNDS and name != exact["name"]:
+                scatter = measured["scatter"][clock]
+                found["low"] = min(found["low"], found["ratio"] * scatter["low"])
+                found["high"] = max(found["high"], found["ratio"] * scatter["high"])
+            rows[name]["full"][clock] = {**found, "seconds": statistics.median(times)}
+        report[clock] = {
+            "size": [views[0].width, views[0].height],
+            "drawn": [cameras[0].width, cameras[0].height],
+            "rounds": len(took[exact["name"]]),
+            "names": list(took),
+        }
+    return report
+
+
+class _Work:
+    """One clock: what is done to a view between its two readings."""
+
+    def __init__(self, clock: str, gaussians, seed: int):
+        self.clock, self.gaussians, self.seed = clock, gaussians, seed
+        self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
+        self.moving = gaussians.replace(**self.leaves)
+
+    def __call__(self, camera, row: dict) -> float:
+        """Seconds that a row's settings take."""
+        return clocked(lambda: getattr(self, "_" + self.clock)(camera, RenderSettings(**row["settings"])))[1]
+
+    def _forward(self, camera, settings):
+        with torch.no_grad():
+            out = drgs.render(self.gaussians, camera, settings, outputs=())
+        return out.rgb.cpu(), out.alpha.cpu()  # as `drgs render` takes them
+
+    def _forward_backward(self, camera, settings):
+        image = drgs.render(self.moving, camera, settings, outputs=()).rgb
+        signs = torch.randint(0, 2, image.shape, generator=torch.Generator().manual_seed(self.seed)) * 2 - 1
+        return torch.autograd.grad((image * signs.to(image)).sum(), list(self.leaves.values()), allow_unused=True)
+
+    def _fisher(self, camera, settings):
+        return drgs.fisher.diagonal(self.gaussians, camera, settings)
+
+
+def _sized(work: _Work, cameras: list, exact: dict, pixels: float, seconds: float, units: float, say) -> tuple:
+    """The cameras, reduced until a round fits into the seconds, and how many of these finding out took.
+
+    No cameras if a round fits at no more than the pixels that all rows were measured with already. Four times as many
+    pixels are tried each time, so that nothing far too large is ever begun.
+    """
+    whole, spent = max(camera.width * camera.height for camera in cameras), 0.0
+    least = pixels = min(pixels, whole)
+    while True:
+        camera = at_most(cameras[0], int(pixels))
+        say(_said(work.clock, camera, "exact"))
+        took = work(camera, exact)
+        spent += took
+        # Time grows with the pixels at most. What is tried on the way is spent, too.
+        fits = pixels * (seconds - spent) / (units * took)
+        following = min(whole, _GROW * pixels)
+        if following * _GROW >= fits or following >= whole:
+            break
+        pixels = following
+    return [at_most(camera, int(min(whole, fits))) for camera in cameras if fits >= least], spent
+
+
+def _said(clock: str, camera, name: str) -> str:
+    return f"{clock.replace('_', ' + ')} at {camera.width}x{camera.height}: {name}"

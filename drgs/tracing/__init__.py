@@ -1,0 +1,1 @@
+"""The engine: Gaussians and rays in, composited images and their derivatives out."""

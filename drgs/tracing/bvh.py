@@ -1,0 +1,319 @@
+"""Arbitrary rays through Mitsuba's acceleration structure.
+
+Mitsuba's `ellipsoids` shape is used as a proxy only: it says which Gaussian a ray may meet next, the response is always
+evaluated from our own records. What is done about its known faults (Mitsuba 3.9.1):
+
+- the intersection divides by |d| instead of |d|^2: rays are traced with directions as long as the thinnest proxy;
+- its discriminant is rounded to about 6e-8 (distance / radius)^2: rays start where they enter the box of all proxies,
+  proxies are not smaller than 1e-3 of their distance, and larger than their Gaussians by what rounding may take;
+- rays that start inside a proxy see nothing of it: the few that an origin can be inside of are not traced but listed,
+  and every ray is offered them first. Where entry order needs them in their place, or they are many because origins
+  lie apart, origins are moved back behind them, which costs precision: everything is that much farther away;
+- the restart behind a hit loses what enters within the step: the step is about one unit in
+  the last place, doubled on a repeated hit;
+- of coincident proxies only one is found, of nested ones not all: Gaussians with the same center, rotation and shape
+  share one primitive, the largest, whose members the stream delivers one by one.
+
+Neighboring lanes get neighboring rays (`_coherent`): a packet of them walks through the same part of the structure.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import drjit as dr
+import numpy as np
+
+from drgs import runtime
+from drgs.tracing.tiles import depth_order
+from drgs.tracing.walk import EMPTY, Part
+
+__all__ = ["Proxies", "proxy_scene"]
+
+_STEP = 1.2e-7  # of the coordinates of where a ray starts: one unit in the last place
+_GRAZE = 1e-7  # of (distance / radius)^2: what rounding takes from the discriminant, with a margin
+_FAR = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
+_THIN = 1e-3  # smallest proxy radius, relative to the distance it is traced over
+_LISTED = 1000  # primitives that every ray is offered before it is traced, where origins differ
+_AROUND = 1.05  # half axes of a proxy within which an origin counts as inside
+
+
+class Proxies:
+    """A Mitsuba scene of proxy ellipsoids.
+
+    Attributes:
+        scene: mi.Scene, or None when all Gaussians are listed.
+        members, first: Gaussian indices grouped by primitive, and the first of each. Behind the primitives follows one
+            more group: the Gaussians that every ray is offered first.
+        listed: First and last of `members` in that group.
+        low, high, size: Corners (3,) of the box of all primitives, and its diagonal.
+        back: How far an origin must be moved back along its ray.
+        scale: Length of traced directions.
+    """
+
+    def __init__(self, t, scene, members, first, box, back, scale):
+        self.scene = scene
+        self.listed = [dr.opaque(t.UInt32, int(x)) for x in first[-2:]]
+        self.members, self.first = t.UInt32(members.astype(np.uint32)), t.UInt32(first.astype(np.uint32))
+        self.low, self.high = ([dr.opaque(t.Float, float(x)) for x in corner] for corner in box)
+        size = np.linalg.norm(box[1] - box[0])
+        self.size, self.back, self.scale = (dr.opaque(t.Float, float(x)) for x in (size, back, scale))
+
+
+def proxy_scene(t, means, quats, radii, alive, origins, nested=True, tails=False) -> Proxies | None:
+    """Build the proxies, or None when nothing can be hit.
+
+    Args:
+        means, quats, radii: (3, N), (4, N) wxyz, (3, N) half axes in world units, NumPy.
+        alive: (N,) bool.
+        origins: (3, P) ray origins: decide how far everything can be.
+        nested: Any order of delivery will do: ellipsoids that only differ in size share a proxy, and those that origins
+            are inside of are listed. Otherwise only equal ones share, and origins are moved back.
+        tails: What a ray meets behind its origin counts: all that it can meet close by is listed.
+    """
+    mi = runtime.mitsuba()
+    index = np.flatnonzero(alive & np.isfinite(means).all(0) & np.isfinite(radii).all(0))
+    if len(index) == 0 or origins.shape[1] == 0:
+        return None
+    means, radii, quats = (x[:, index].astype(np.float64) for x in (means, radii, quats))
+    quats /= np.sqrt((quats * quats).sum(0))
+    longest = radii.max(0)
+    # Rounded: the radii differ by the extents, which are multiplied in.
+    shape = np.round(radii / longest, 9) if nested else radii
+    grouped, first = _groups(np.concatenate([means, quats, shape]))
+    members, primitive = index[grouped], grouped[first[:-1]]
+    growth = np.maximum.reduceat(longest[grouped], first[:-1]) / longest[primitive]
+    means, quats, radii = means[:, primitive], quats[:, primitive], radii[:, primitive] * growth
+    low, high = origins.min(1), origins.max(1)
+    spread = 0.5 * float(np.linalg.norm(high - low))
+    to = means - 0.5 * (low + high)[:, None]
+    distance = np.sqrt((to * to).sum(0)) + spread
+    back, proxies = 0.0, _grown(radii, means, distance)
+    around = _around(to, quats, proxies, spread, distance, tails)
+    # Of a single origin all are candidates of every ray, and listed they are cheaper than traced.
+    most = (_LISTED if spread > 0 else len(around)) if nested else 0
+    if len(around) > most:
+        # The largest are listed all the same: a move back behind them would cost the others their precision.
+        around = around[np.argsort(radii[:, around].max(0), kind="stable")]
+        moved = around[: len(around) - most]
+        around = around[len(moved) :]
+        back = 2.5 * float(proxies[:, moved].max())
+    if len(around):
+        kept, counts = np.delete(np.arange(len(primitive)), around), np.diff(first)
+        listed = np.isin(np.repeat(np.arange(len(primitive)), counts), around)
+        members = np.concatenate([members[~listed], members[listed]])
+        first = np.concatenate([[0], np.cumsum(counts[kept])])
+        means, quats, radii, distance = means[:, kept], quats[:, kept], radii[:, kept], distance[kept]
+    first = np.append(first, len(members))
+    if means.shape[1] == 0:
+        return Proxies(t, None, members, first, np.zeros((2, 3)), 0, 1)
+    proxies = _grown(radii, means, distance + back)
+    shape = {
+        "type": "ellipsoids",
+        "centers": mi.TensorXf(means.T.astype(np.float32, order="C")),
+        "scales": mi.TensorXf(proxies.T.astype(np.float32, order="C")),
+        "quaternions": mi.TensorXf(quats[[1, 2, 3, 0]].T.astype(np.float32, order="C")),
+        "extent": 1.0,
+    }
+    scene = mi.load_dict({"type": "scene", "gaussians": shape})
+    # A sphere around each, and a margin for rounding.
+    widest = 1.001 * proxies.max(0)
+    box = (means - widest).min(1), (means + widest).max(1)
+    # Where the scaled direction is longer than a proxy is thick, thick hits are lost as well as grazing ones.
+    return Proxies(t, scene, members, first, box, back, proxies.min())
+
+
+def _groups(columns):
+    """Indices of equal columns (k, N) side by side, and where each group starts, one more at the end."""
+    order = np.argsort(columns[0], kind="stable")
+    x = columns[0, order]
+    equal = np.flatnonzero(x[1:] == x[:-1])
+    tied = np.zeros(len(order), bool)
+    tied[equal], tied[equal + 1] = True, True
+    # Comparing whole columns is slow: only those whose first numbers are equal.
+    some, alone = order[tied], order[~tied]
+    if len(some) == 0:
+        return alone, np.arange(len(alone) + 1)
+    rows = np.ascontiguousarray(columns[:, some].T + 0.0)
+    _, group = np.unique(rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel(), return_inverse=True)
+    sizes = np.concatenate([np.bincount(group), np.ones(len(alone), int)])
+    return np.concatenate([some[np.lexsort((some, group))], alone]), np.concatenate([[0], np.cumsum(sizes)])
+
+
+def _grown(radii, means, distance):
+    """Half axes of proxies that are traced over `distance`, or through the box of all of them where that is shorter."""
+    widest = radii.max(0)
+    size = np.linalg.norm((means + widest).max(1) - (means - widest).min(1))
+    reach = np.minimum(distance, size)
+    # Grazing rays are lost to rounding unless the proxy is larger than the Gaussian by as much.
+    graze = _GRAZE * (reach / np.maximum(radii.min(0), _THIN * reach)) ** 2
+    return np.maximum(radii * (1 + 1e-4 + graze), _THIN * reach)
+
+
+def _around(to, quats, radii, spread, distance, spheres):
+    """Indices of ellipsoids that a point within `spread` of 0 may be inside of; boxes, or spheres, stand for them."""
+    widest = radii.max(0)
+    if spheres:
+        return np.flatnonzero(distance <= 2 * spread + _AROUND * widest)
+    near = np.flatnonzero(distance <= 2 * spread + 2 * widest)
+    w, x, y, z = quats[:, near]
+    axes = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    local = abs((axes * to[:, near]).sum(1))
+    return near[(local <= _AROUND * radii[:, near] + spread).all(0)]
+
+
+class _Stream:
+    """Listed Gaussians, then the proxies along rays in the order of their entry points."""
+
+    def __init__(self, t, proxies: Proxies, ray, bounded: bool, active):
+        self.t, self.proxies, self.bounded, self.active = t, proxies, bounded, active
+        self.mi = runtime.mitsuba()
+        self.d = ray.lane[-3:]
+        if proxies is not None:
+            # Parameters along a ray count from where it starts, so that they are small and their rounding is.
+            self.start = self._enter(ray.lane[-6:-3])
+            self.o = [dr.fma(d, self.start, x) for x, d in zip(ray.lane[-6:-3], self.d, strict=True)]
+            size = dr.maximum(dr.maximum(abs(self.o[0]), abs(self.o[1])), abs(self.o[2]))
+            self.step = _STEP * dr.maximum(size, proxies.scale)
+
+    def begin(self):
+        """(hits so far, parameter, step, primitive, next member, end of members, something left)."""
+        t, p = self.t, self.proxies
+        width = dr.width(self.d)
+        if p is None:
+            return t.UInt32(0), *([t.Float(0)] * 2), *([t.UInt32(0)] * 3), t.UInt32(0)
+        some = dr.select(self.active, t.UInt32(1), dr.zeros(t.UInt32, width))
+        none = t.UInt32(0xFFFFFFFF)
+        at = dr.zeros(t.Float, width)
+        return t.UInt32(0), at, t.Float(self.step), none, *(t.UInt32(x) for x in p.listed), some
+
+    def _enter(self, origin):
+        """Where a ray starts: at the box of all primitives, but not before it was moved back."""
+        t, p = self.t, self.proxies
+        near = t.Float(-p.back)
+        for o, d, low, high in zip(origin, self.d, p.low, p.high, strict=True):
+            along = dr.minimum((low - o) / d, (high - o) / d)
+            along -= 1e-6 * (abs(along) + p.size)
+            # A ray within the plane of a side divides 0 by 0.
+            near = dr.maximum(near, dr.select(abs(along) < 1e30, along, near))
+        return near
+
+    def more(self, s):
+        """Whether the ray goes on."""
+        return s[6] != 0
+
+    def next(self, s, active):
+        """One member of the current primitive, or the next primitive (whose members follow)."""
+        t, p, mi = self.t, self.proxies, self.mi
+        if p is None:
+            return t.UInt32(0), t.Bool(False), t.Float(EMPTY), s
+        count, at, step, last, member, end, some = s
+        inside = member < end
+        trace = active & ~inside & (some != 0)
+        found, primitive, entry = t.Bool(False), t.UInt32(0), at
+        if p.scene is not None:
+            o = [dr.fma(d, at, x) for x, d in zip(self.o, self.d, strict=True)]
+            ray = mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*[d * p.scale for d in self.d]))
+            pi = p.scene.ray_intersect_preliminary(ray, coherent=False, active=trace)
+            found = trace & pi.is_valid()
+            primitive = dr.select(found, pi.prim_index, 0)
+            entry = at + dr.select(found, pi.t, 0) * p.scale
+        again = found & (primitive == last)
+        fresh = found & ~again
+        first, behind = (
+            dr.gather(t.UInt32, p.first, primitive, fresh),
+            dr.gather(t.UInt32, p.first, primitive + 1, fresh),
+        )
+        member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
+        step = dr.select(again, 2 * step, dr.select(fresh, self.step, step))
+        # Far along the ray the step is less than one unit in the last place.
+        forward = dr.maximum(step, 1.2e-7 * abs(entry))
+        at = dr.select(found, entry + forward, at)
+        last = dr.select(fresh, primitive, last)
+        some = dr.select(trace & ~found, 0, some)
+        valid = active & (member < end)
+        index = dr.gather(t.UInt32, p.members, member, valid)
+        bound = t.Float(EMPTY)
+        if self.bounded:
+            # Listed ones come first, whatever their keys. The factor is the rounding of entries.
+            bound = dr.select(last == 0xFFFFFFFF, EMPTY, dr.maximum(self.start + entry, 0) * (1 - 1e-4))
+        member = dr.select(valid, member + 1, member)
+        return index, valid, bound, (count + 1, at, step, last, member, end, some)
+
+
+def parts_of(view, model, buffer, ray_of, share):
+    """All rays of a view as one part."""
+    t, s = view.t, view.settings
+    if view.lanes is None:
+        i = dr.arange(t.UInt32, view.pixels)
+        ray = ray_of(None, None, i, t.Bool(True))
+        view.proxies, view.lanes = _build(view, ray), _coherent(t, ray.lane[-6:])
+    i, inside = view.lanes, t.Bool(bool(view.pixels))
+    ray = ray_of(None, None, i, t.Bool(True))
+
+    def stream_of(lanes):
+        r = ray if lanes is None else type(ray)(lane=[dr.gather(t.Float, v, lanes) for v in ray.lane], basis=ray.basis)
+        return _Stream(t, view.proxies, r, s.order == "ray", t.Bool(True))
+
+    center = view.projected.key if s.order == "center" else None
+    if center is not None and s.depth_key == "z":
+        # Behind the camera plane z is negative, which no order key may be: the rank orders as well.
+        center = dr.zeros(t.Float, dr.width(view.projected.key))
+        rank = dr.arange(t.UInt32, dr.width(center))
+        dr.scatter(center, t.Float(rank), depth_order(t, view.projected.key, rank))
+    return [Part(t, model, buffer, [ray], [i], [inside], stream_of, s.order != "entry", center)]
+
+
+def _coherent(t, lane):
+    """Order of rays (o, d) in which neighbors are alike: along a Morton curve of directions and origins."""
+    count = dr.width(lane)
+    if count <= 16:
+        return dr.arange(t.UInt32, count)
+    key = t.UInt64(0)
+    for group, triple in ((3, lane[:3]), (0, lane[3:])):
+        low = [dr.min(x) for x in triple]
+        sizes = [dr.max(x) - y for x, y in zip(triple, low, strict=True)]
+        size = dr.maximum(dr.maximum(sizes[0], sizes[1]), sizes[2])
+        scale = dr.select(size > 0, 1023 / size, 0)
+        for k, (x, y) in enumerate(zip(triple, low, strict=True)):
+            bits = t.UInt64((x - y) * scale)
+            for b in range(10):
+                key |= ((bits >> b) & 1) << (6 * b + group + k)
+    order = t.UInt32(dr.argsort(key))
+    dr.eval(order)
+    return order
+
+
+def _build(view, ray):
+    """Proxies of the view's ellipsoids, for rays with these origins."""
+    if view.pixels == 0:
+        return None
+    projected, origins = view.projected, ray.lane[-6:-3]
+    corners = [f(x) for f in (dr.min, dr.max) for x in origins]
+    dr.eval(projected.ellipsoids, projected.alive, corners)
+    ellipsoids = np.array([x.numpy() for x in projected.ellipsoids])
+    alive = projected.alive.numpy() & np.ones(ellipsoids.shape[1], bool)
+    origins = np.array([float(x[0]) for x in corners]).reshape(2, 3).T
+    _warn_of_rounding(ellipsoids, alive, origins)
+    nested, tails = view.settings.order != "entry", view.settings.response == "integral"
+    return proxy_scene(view.t, ellipsoids[:3], ellipsoids[3:7], ellipsoids[7:], alive, origins, nested, tails)
+
+
+def _warn_of_rounding(ellipsoids, alive, origins):
+    """Tell of Gaussians too thin, in two of their axes, for hits in float32 world space."""
+    to = ellipsoids[:3] - origins.mean(1, keepdims=True)
+    a, b, c = ellipsoids[7:]
+    middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    ratio = (np.sqrt((to * to).sum(0)) / np.maximum(middle, 1e-300))[alive]
+    if (share := float((ratio > _FAR).sum()) / max(len(ratio), 1)) > 0.01:
+        warnings.warn(
+            f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR:g} of their distance in two axes, got "
+            f"{share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use traversal='tiles'",
+            stacklevel=2,
+        )
