@@ -2,7 +2,8 @@
 
 A row a case and traversal: the largest error of the image; the relative error of the worst block of gradients, of the
 forward mode, and of the two against each other (`drgs.lab.accuracy.Errors`); the error of the exact Fisher diagonal
-against the oracle's dense Jacobian, of the group's largest entry. It holds if all are within `BOUNDS` and everything is finite.
+against the oracle's dense Jacobian, of the group's largest entry. It holds if all are within `BOUNDS` and everything is
+finite.
 """
 
 from __future__ import annotations
