@@ -116,7 +116,8 @@ def test_probes_are_unbiased():
     spread = {}
     for probes in (32, 512):
         found = fisher.diagonal(g, cam, settings, "probes", probes=probes)
-        assert torch.equal(found["features"], exact["features"])  # no probe is needed for what has a sum
+        # No probe is needed for what has a sum; on two threads sums differ in the last bits.
+        torch.testing.assert_close(found["features"], exact["features"], rtol=1e-6, atol=1e-9)
         ratios = torch.cat([(found[n] / exact[n])[exact[n] > 1e-6 * exact[n].max()].reshape(-1) for n in GROUPS])
         spread[probes] = float((ratios - 1).square().mean().sqrt())
         assert abs(float(ratios.mean()) - 1) < 0.5 * math.sqrt(2 / probes)
