@@ -36,6 +36,7 @@ from drgs.guards.camera_checks import (
     checked_distortion,
     checked_intrinsics,
     checked_pose,
+    checked_time,
     is_tensor,
     read_only,
 )
@@ -79,9 +80,11 @@ class Camera:
         model: ``pinhole``, ``opencv`` or ``opencv_fisheye``.
         distortion: coefficients in OpenCV's order; empty for ``pinhole``.
         name: for messages and file names.
+        time: when the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets), or None
+            where that does not matter.
 
     Raises:
-        ValueError: K, w2c, size, model or distortion is not what it must be.
+        ValueError: K, w2c, size, model, distortion or time is not what it must be.
     """
 
     K: np.ndarray
@@ -91,6 +94,7 @@ class Camera:
     model: str = "pinhole"
     distortion: tuple[float, ...] = ()
     name: str = ""
+    time: float | None = None
 
     def __post_init__(self) -> None:
         must_be("Camera", "name", self.name, str, "it becomes a file name")
@@ -114,6 +118,7 @@ class Camera:
             raise ValueError(f"{where}: an image must have at most 2^31 pixels, got {shown}; correct its size")
         check_proportions(where, self.K, (self.width, self.height))
         put("distortion", checked_distortion(where, self.model, self.distortion))
+        put("time", checked_time(where, self.time))
 
     @property
     def c2w(self) -> np.ndarray:

@@ -11,13 +11,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 
-__all__ = ["Gaussians", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
+__all__ = ["Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
 
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
 # float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
@@ -41,6 +42,20 @@ def semi_axes(quats: torch.Tensor, scales: torch.Tensor) -> torch.Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, dim=1).reshape(-1, 3, 3) * scales[:, None, :]
+
+
+@runtime_checkable
+class Scene(Protocol):
+    """What is rendered: Gaussians, or anything that has Gaussians at any time."""
+
+    def at(self, time: float | None) -> Gaussians:
+        """The Gaussians at the time of a view (`Camera.time`).
+
+        None of a view that states no time: a scene that moves raises ValueError then.
+        """
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The tensors, by name, that `at` computes from and that an optimizer may change."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -160,6 +175,10 @@ class Gaussians:
         """(N,) in (0, 1)."""
         return torch.sigmoid(self.logit_opacities)
 
+    def at(self, time: float | None = None) -> Gaussians:
+        """The Gaussians themselves, for they do not move: the `Scene` that is the same at all times."""
+        return self
+
     def parameters(self) -> dict[str, torch.Tensor]:
         """The raw parameter tensors by group name; `features` only when there are any."""
         return {name: x for name in _FIELDS if (x := getattr(self, name)) is not None}
@@ -167,6 +186,11 @@ class Gaussians:
     def replace(self, **fields) -> Gaussians:
         """A copy with the given fields replaced."""
         return dataclasses.replace(self, **fields)
+
+    def to(self, device: str | torch.device) -> Gaussians:
+        """The same values on another device; gradients pass, and tensors that are there already are not copied."""
+        device = torch.device(device)
+        return self.replace(**{name: x.to(device) for name, x in self.parameters().items()})
 
     def detach(self) -> Gaussians:
         """The same values without an autograd graph."""

@@ -18,7 +18,7 @@ from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import check_scene, check_view
+from drgs.guards.doors import check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
 from drgs.tracing.call import EPS_ALPHA, Output, Scene, to_drjit
 
@@ -40,7 +40,7 @@ def render(
     """Render a view.
 
     Args:
-        gaussians: N Gaussians, world frame.
+        gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians at `camera.time` are seen.
         camera: Its pose is differentiated when `camera.w2c` is a torch tensor that requires a gradient.
         settings: Default `RenderSettings.preset("exact")`.
         outputs: What to compute besides rgb, alpha and features: any of `OUTPUTS`, or "all". What is not asked for
@@ -57,6 +57,7 @@ def render(
     Reference:
         Kerbl et al. 2023 (compositing, SH); Moenne-Loccoz et al. 2024 (response at the peak of the ray).
     """
+    gaussians = gaussians_at("render", gaussians, camera)
     check_view("render", gaussians, camera, settings)
     settings = settings or RenderSettings.preset("exact")
     scene = Scene(gaussians, camera, settings, _wanted(outputs))
@@ -80,6 +81,7 @@ def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth
     Raises:
         ValueError: If a name or shape is wrong.
     """
+    gaussians = gaussians_at("render_jvp", gaussians, camera)
     check_view("render_jvp", gaussians, camera, settings)
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")

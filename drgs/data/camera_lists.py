@@ -18,7 +18,7 @@ _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position":
 
 
 def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
-    """Write cameras in INRIA's ``cameras.json`` layout, with cx and cy added; atomically.
+    """Write cameras in INRIA's ``cameras.json`` layout, with cx, cy and a camera's time, if any, added; atomically.
 
     Raises:
         ValueError: a camera is distorted or skewed (the layout has no room for that).
@@ -44,6 +44,7 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
                 "fy": float(camera.K[1, 1]),
                 "cx": float(camera.K[0, 2]),
                 "cy": float(camera.K[1, 2]),
+                **({} if camera.time is None else {"time": camera.time}),
             }
         )
     with atomic_write(path) as file:
@@ -52,7 +53,7 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
 
 def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
     """Read cameras in INRIA's layout: a list of id, img_name, width, height, position, rotation
-    (c2w), fx, fy[, cx, cy].
+    (c2w), fx, fy[, cx, cy, time].
 
     Raises:
         FileNotFoundError: no such file.
@@ -78,7 +79,7 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
         name = str(entry.get("img_name", entry.get("id", index)))
         try:
             K = intrinsics(entry["fx"], entry["fy"], center["cx"], center["cy"])
-            cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name))
+            cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name, time=entry.get("time")))
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
     return cameras

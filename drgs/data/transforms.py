@@ -52,10 +52,9 @@ def load_transforms(
 ) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 
-    Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x;
-        lens from
-    camera_model and k1, k2, k3, k4, p1, p2. Frames may name ``mask_path`` and ``depth_file_path``
-    (z-depth; unit from ``depth_unit_scale_factor``, else millimeters for images and scene units for
+    Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
+    camera_model and k1, k2, k3, k4, p1, p2. Frames may state their ``time``, and name ``mask_path`` and
+    ``depth_file_path`` (z-depth; unit from ``depth_unit_scale_factor``, else millimeters for images and scene units for
     ``.npy``).
 
     Args:
@@ -174,7 +173,8 @@ def _fill(
     `first` where no other image may be opened.
     """
     own = any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
-    merged = {**{key: value for key, value in data.items() if key != "frames"}, **frame}
+    shared = {key: value for key, value in data.items() if key not in ("frames", "time")}
+    merged = {**shared, **frame}
     camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), view.image_path, first)
     depth = _optional_file(folder, where, frame, "depth_file_path")
     unit = 1.0 if depth is not None and depth.suffix == ".npy" else _MILLIMETER
@@ -236,7 +236,9 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
         if not any(distortion):
             model, distortion = "pinhole", ()
     try:
-        return Camera(K=K, w2c=w2c, width=width, height=height, model=model, distortion=distortion)
+        return Camera(
+            K=K, w2c=w2c, width=width, height=height, model=model, distortion=distortion, time=values.get("time")
+        )
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

@@ -273,7 +273,9 @@ def check_parallax(views: list[View]) -> None:
             "all %d training views stand in one place: the photographs tell no depths, other places will look wrong",
             len(views),
         )
-    elif same := len(poses) - len(np.unique(np.round(poses / tiny).reshape(len(poses), -1), axis=0)):
+        return
+    times = [[view.camera.time or 0.0] for view in views]  # from one place at two times, things may have moved
+    if same := len(poses) - len(np.unique(np.c_[np.round(poses / tiny).reshape(len(poses), -1), times], axis=0)):
         _log.warning(
             "%d of the %d training views have the pose of another one; check the camera file", same, len(poses)
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import numbers
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ __all__ = [
     "checked_distortion",
     "checked_intrinsics",
     "checked_pose",
+    "checked_time",
     "is_tensor",
     "read_only",
 ]
@@ -135,3 +138,16 @@ def checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, 
             "pad with zeros"
         )
     return values
+
+
+def checked_time(where: str, time: Any) -> float | None:
+    """A finite number as a float, or None; no tensor, whose gradient would be lost."""
+    if time is None:
+        return None
+    try:
+        value = float(time) if isinstance(time, numbers.Real) and not isinstance(time, bool) else math.nan
+    except OverflowError:  # an integer that no float holds
+        value = math.inf
+    if not math.isfinite(value):
+        raise ArgumentError(f"{where}: time must be a finite number, or None, got {kind_of(time)}; correct it")
+    return value

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.settings import RenderSettings
 
-__all__ = ["camera_list", "check_oracle", "check_path", "check_scene", "check_view"]
+__all__ = ["camera_list", "check_oracle", "check_path", "check_scene", "check_view", "gaussians_at"]
 
 _SCENE = "drgs.load_ply(path) or drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh) makes one"
 _CAMERA = "drgs.Camera(K=K, w2c=w2c, width=width, height=height) makes one"
@@ -24,6 +24,15 @@ def check_scene(where: str, gaussians: Any, settings: Any) -> None:
     must_be(where, "gaussians", gaussians, Gaussians, _SCENE)
     if settings is not None:
         must_be(where, "settings", settings, RenderSettings, _SETTINGS)
+
+
+def gaussians_at(where: str, scene: Any, camera: Any) -> Any:
+    """The Gaussians of a scene at the time of a camera; anything else as it is, for `check_view` to refuse."""
+    if isinstance(scene, Gaussians) or not (isinstance(scene, Scene) and isinstance(camera, Camera)):
+        return scene
+    gaussians = scene.at(camera.time)
+    must_be(where, "scene.at(time)", gaussians, Gaussians, "a scene has Gaussians at any time")
+    return gaussians
 
 
 def check_view(where: str, gaussians: Any, camera: Any, settings: Any) -> None:
