@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 
+import drjit as dr
 import torch
 
 from drgs import runtime
@@ -21,8 +22,6 @@ from drgs.guards.arguments import must_be
 from drgs.guards.doors import check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
 from drgs.tracing.call import EPS_ALPHA, Output, Scene, to_drjit
-
-import drjit as dr  # isort: skip  (after the scene, which chooses libLLVM)
 
 __all__ = ["EPS_ALPHA", "OUTPUTS", "Output", "render", "render_jvp", "render_rays"]
 

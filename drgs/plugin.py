@@ -23,12 +23,11 @@ from drgs.tracing.composite import Composite, View
 from drgs.tracing.projection import project_world, sh_basis
 
 mi = runtime.mitsuba()
-from mitsuba.python.ad.integrators.common import RBIntegrator  # noqa: E402 - needs a variant
 
 __all__ = ["DrgsIntegrator"]
 
 
-class DrgsIntegrator(RBIntegrator):
+class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
     """Radiance field of one `ellipsoids` shape.
 
     Plugin parameters: `preset` (default `exact`; its traversal is replaced by `bvh`) and any field of `RenderSettings`

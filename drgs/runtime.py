@@ -1,7 +1,8 @@
 """The backend: which Dr.Jit variant computes, on which libLLVM, with how many threads.
 
-Three entry points, from cheap to complete. Nothing else in the package imports `drjit` or
-`mitsuba` before having called one of them, because the import itself loads libLLVM (libllvm.py).
+Three entry points, from cheap to complete. Importing `drjit` or `mitsuba` loads libLLVM (libllvm.py), so the first one
+has to come before: `import drgs` calls it. `import drgs.tracing` calls the second one, so the engine's modules have a
+backend.
 
     prepare()    sets DRJIT_LIBLLVM_PATH; imports nothing; called by `import drgs`
     backend()    Dr.Jit, its array types and thread counts; no Mitsuba

@@ -15,6 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from drgs.libllvm import prepare
+
+prepare()  # tests may import drjit before drgs
 # Before torch or Dr.Jit is imported, and inherited by the processes that tests start.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"):
     os.environ.setdefault(_name, "2")

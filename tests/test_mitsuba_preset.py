@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import drjit as dr
 import numpy as np
 import torch
 
@@ -12,7 +13,6 @@ from drgs import runtime
 from drgs.testing import random_scene
 
 mi = runtime.mitsuba()
-import drjit as dr  # noqa: E402
 
 
 def load(g: drgs.Gaussians, cam: drgs.Camera):

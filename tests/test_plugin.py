@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
 from scenes_random import camera, gaussians
 
 import drgs
-from drgs import runtime
+from drgs import plugin, runtime  # noqa: F401 - the plugin registers the integrator
 from drgs.ellipsoids import ellipsoids_shape
 from drgs.settings import RenderSettings
 
 mi = runtime.mitsuba()
-import drjit as dr  # noqa: E402
-
-from drgs import plugin  # noqa: E402, F401 - registers the integrator
 
 
 def _scene(seed=0, K=4, size=(20, 16)):

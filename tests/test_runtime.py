@@ -266,6 +266,17 @@ def test_tiles_need_no_mitsuba():
     assert done.stdout.split() == ["1", "1", "False"], done.stderr
 
 
+def test_the_engine_chooses_the_backend():
+    """Any module that computes may be imported first, on the libLLVM that was found, without Mitsuba."""
+    done = _python(
+        "import drgs.tracing.walk, sys, os; from drgs import runtime\n"
+        "found = os.path.realpath(os.environ['DRJIT_LIBLLVM_PATH'])\n"
+        "print(runtime._active.llvm_path == found, 'mitsuba' in sys.modules)",
+        DRGS_VARIANT="llvm_ad_rgb",
+    )
+    assert done.stdout.split() == ["True", "False"], done.stderr
+
+
 def test_mitsuba_variant_is_set_only_if_none_is():
     """A fresh Mitsuba gets our variant; one that the user has set stays; scalar is refused."""
     done = _python(

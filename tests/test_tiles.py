@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -15,12 +16,8 @@ from drgs.integrator import render
 from drgs.settings import RenderSettings
 from drgs.tracing import tiles
 from drgs.tracing.call import Scene, to_drjit
-
-runtime.backend()
-import drjit as dr  # noqa: E402
-
-from drgs.tracing.composite import _pack  # noqa: E402
-from drgs.tracing.tiles import TILE, build  # noqa: E402
+from drgs.tracing.composite import _pack
+from drgs.tracing.tiles import TILE, build
 
 
 def _scene(g, cam, settings):

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import torch
 
+from drgs.information.groups import GROUPS, Information
+from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
+from drgs.tracing import projection
 from drgs.tracing.call import Scene, quaternion_product, to_drjit
-
-import drjit as dr  # isort: skip  (after the scene, which chooses libLLVM)
-
-from drgs.information.groups import GROUPS, Information  # noqa: E402
-from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras  # noqa: E402
-from drgs.tracing import projection  # noqa: E402
-from drgs.tracing.composite import Composite  # noqa: E402
+from drgs.tracing.composite import Composite
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import drjit as dr
 import numpy as np
 import torch
 
@@ -11,14 +12,10 @@ from drgs import runtime
 from drgs.cameras import Camera, rigid
 from drgs.guards import memory
 from drgs.guards.arguments import ArgumentError, kind_of
-
-runtime.backend()  # chooses libLLVM, which has to happen before drjit is imported
-import drjit as dr  # noqa: E402
-
-from drgs.tracing import projection  # noqa: E402
-from drgs.tracing.composite import Composite, View  # noqa: E402
-from drgs.tracing.tiles import build  # noqa: E402
-from drgs.tracing.walk import tile_part  # noqa: E402
+from drgs.tracing import projection
+from drgs.tracing.composite import Composite, View
+from drgs.tracing.tiles import build
+from drgs.tracing.walk import tile_part
 
 __all__ = ["EPS_ALPHA", "Output", "Scene", "quaternion_product", "to_drjit"]
 
