@@ -176,7 +176,13 @@ def test_copy_without_hidden_files(dataset, run):  # noqa: F811
 def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
     """A file, or a folder that cannot be made, as -o: found out before anything is loaded, by every command."""
     (tmp_path / "file").write_text("mine")
-    readers = ("render_command.load_scene", "viewpoints.load_scene", "data.load", "stress.rows", "files.load_ply")
+    readers = (
+        "commands.render.load_scene",
+        "commands.viewpoints.load_scene",
+        "data.load",
+        "lab.stress.rows",
+        "files.load_ply",
+    )
     for name in (f"drgs.{reader}" for reader in readers):
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail("loaded"))
     out = tmp_path / "file" / "x.json"
