@@ -17,7 +17,7 @@ import drgs
 from drgs.display import tables
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, Run, load_ply, write_json
+from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.resume import claim_run
 
 if TYPE_CHECKING:
@@ -263,14 +263,14 @@ def run_eval(args: Eval) -> None:
     """`drgs eval RUN`."""
     from drgs.data import load
     from drgs.fitting.frames import load_frames
-    from drgs.fitting.records import fit_record, fitted_views
+    from drgs.fitting.records import fit_record, fitted_views, load_run
 
     run = Run(args.run)
     recorded = fit_record(run)
     output = claim_run(run, "eval")
+    g = load_run(run).gaussians
     config = recorded.config
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
-    g = load_ply(run.point_cloud)
     # Of an active run, images may be missing that were never picked.
     dataset = load(
         recorded.data,

@@ -147,7 +147,7 @@ def test_picture_is_logarithmic():
         ("run --cameras cameras.json --split test", "--split test must have --cameras DATA"),
         ("run --prior nan", "lambda (value) must be in [0, inf), got nan"),
         ("nowhere.ply", "nowhere.ply: must be a PLY file, found none"),
-        ("early", "must hold point_cloud.ply, found none"),
+        ("early", "must hold state.safetensors or point_cloud.ply, found none"),
     ],
 )
 def test_bad_input_is_one_line(place, tmp_path, monkeypatch, capsys, line, message):

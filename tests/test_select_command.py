@@ -163,7 +163,10 @@ def test_dome_is_even(count):
         ("run --candidates nowhere", "nowhere: must be a data set, found no such file or folder"),
         ("data --candidates orbit", "must be a run folder, found no config.json"),
         ("run --candidates empty.json", "must be a list of at least one camera"),
-        ("early --candidates orbit", "must hold point_cloud.ply, found none; the fit has not reached"),
+        (
+            "early --candidates orbit",
+            "must hold state.safetensors or point_cloud.ply, found none; the fit has not reached",
+        ),
         ("run --candidates data -o data", "data: must be a file, is a folder; name a file in it"),
         ("run --candidates data --method best", "--method"),
     ],

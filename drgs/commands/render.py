@@ -24,7 +24,7 @@ from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display import pictures
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, Run, load_ply, write_json
-from drgs.fitting.records import fit_record, fitted_views
+from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.guards import memory
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
@@ -206,12 +206,7 @@ def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
         return load_ply(path), None
     folder = Run(path)
     refuse_foreign(path, "a run folder or a 3DGS PLY file")
-    fit_record(folder)  # says that it is no run folder, or of another version
-    if not folder.point_cloud.is_file():
-        raise FileNotFoundError(
-            f"{path}: must hold point_cloud.ply, found none; the fit has not reached its first checkpoint"
-        )
-    return load_ply(folder.point_cloud), folder
+    return load_run(folder).gaussians, folder
 
 
 def cameras_of(

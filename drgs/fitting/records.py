@@ -7,18 +7,24 @@ count on, or is refused in one line.
 from __future__ import annotations
 
 import dataclasses
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
+from drgs.files import load_ply, load_state
+from drgs.fitting.density import Model
 from drgs.fitting.trainer import FitConfig
 from drgs.guards.json_files import check_json, read_json
 
 if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
     from drgs.files import Run
 
-__all__ = ["FitRecord", "check_checkpoint", "fit_record", "fitted_views"]
+__all__ = ["FitRecord", "LoadedRun", "check_checkpoint", "fit_record", "fitted_views", "load_run"]
+
+_log = logging.getLogger(__name__)
 
 _CONFIG = {"data": str, "train": [str], "test": [str], "fit": {"settings": dict}}
 _VIEW = {"index": int, "name": str}
@@ -51,6 +57,68 @@ class FitRecord:
     test: tuple[str, ...]
     config: FitConfig
     is_active: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedRun:
+    """What a run holds.
+
+    Attributes:
+        gaussians: As the last checkpoint has them, or the PLY where there is none that can be read.
+        record: How they were fitted.
+        step: Of the checkpoint; None where only the PLY could be read.
+    """
+
+    gaussians: Gaussians
+    record: FitRecord
+    step: int | None
+
+
+def load_run(run: Run) -> LoadedRun:
+    """A run, from its last checkpoint: point_cloud.ply holds less, it is what other programs read.
+
+    Where the checkpoint is missing or damaged the PLY is taken, and where both are there but differ, for somebody has
+    edited the PLY, the checkpoint; the log has a warning in one line. (`drgs.load_ply` reads a PLY that is named.)
+
+    Raises:
+        FileNotFoundError: If it is no run folder, or has neither a checkpoint nor a PLY.
+        ValueError: If config.json is damaged, or everything else.
+    """
+    record = fit_record(run)
+    try:
+        tensors, header = load_state(run.state)
+        check_checkpoint(run.state, tensors, header)
+        gaussians = Model.from_state(tensors).gaussians().detach()
+        gaussians.validate(str(run.state))
+    except (FileNotFoundError, ValueError) as error:
+        if not run.point_cloud.is_file():
+            if run.state.exists():
+                raise
+            raise FileNotFoundError(
+                f"{run.path}: must hold {run.state.name} or {run.point_cloud.name}, found none; the fit has not "
+                "reached its first checkpoint"
+            ) from None
+        gaussians = load_ply(run.point_cloud)
+        _log.warning("%s; %s is taken instead", str(error).partition(";")[0], run.point_cloud.name)
+        return LoadedRun(gaussians, record, None)
+    if run.point_cloud.is_file() and not _shows(run.point_cloud, gaussians):
+        _log.warning(
+            "%s: does not hold what %s holds, was edited or written later; the checkpoint is taken, name the PLY to "
+            "take that",
+            run.point_cloud,
+            run.state.name,
+        )
+    return LoadedRun(gaussians, record, header["step"])
+
+
+def _shows(path: Path, gaussians: Gaussians) -> bool:
+    """Whether a PLY has the same bits, as far as its layout has room for them; one that is damaged has not."""
+    try:
+        shown = load_ply(path).parameters()
+    except ValueError:
+        return False
+    held = gaussians.parameters()
+    return all(torch.equal(x, held[name]) for name, x in shown.items())
 
 
 def fit_record(run: Run) -> FitRecord:

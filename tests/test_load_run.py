@@ -1,0 +1,102 @@
+"""What a run holds is read by one function, from its checkpoint; its PLY stands in where that cannot be read."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+import torch
+from test_resume import dataset, made, run  # noqa: F401 (fixtures)
+
+from drgs import cli
+from drgs.commands.render import load_scene
+from drgs.files import load_ply, load_state, save_ply, save_state
+from drgs.fitting.records import load_run
+
+
+def equal(a, b) -> bool:
+    """Whether Gaussians have the same bits."""
+    a, b = a.parameters(), b.parameters()
+    return a.keys() == b.keys() and all(torch.equal(x, b[name]) for name, x in a.items())
+
+
+def test_checkpoint_and_ply_hold_the_same_bits(run, caplog):  # noqa: F811
+    """Of every parameter, at the degree of SH that the fit has reached, here none of the two that are its aim."""
+    loaded = load_run(run)
+    assert equal(loaded.gaussians, load_ply(run.point_cloud))
+    assert loaded.gaussians.sh_degree == load_ply(run.point_cloud).sh_degree
+    assert not any(x.requires_grad for x in loaded.gaussians.parameters().values())
+    assert (loaded.step, loaded.record.config.max_steps) == (6, 6)
+    assert equal(load_scene(run.path)[0], loaded.gaussians)
+    assert not caplog.text
+
+
+def test_run_without_its_ply(run, dataset, monkeypatch, caplog):  # noqa: F811
+    """Nothing is missing: commands read the checkpoint, and `eval` finds what the fit found."""
+    found = json.loads((run.path / "metrics.json").read_text())["mean"]
+    run.point_cloud.unlink()
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    assert cli.main(["eval", str(run.path), "--quiet"]) == 0
+    assert json.loads((run.path / "metrics.json").read_text())["mean"]["psnr"] == pytest.approx(found["psnr"])
+    assert not caplog.text
+
+
+def damaged(path) -> None:
+    path.write_bytes(path.read_bytes()[:999])
+
+
+def of_a_newer_version(path) -> None:
+    tensors, header = load_state(path)
+    save_state(path, tensors, header)
+    path.write_bytes(path.read_bytes().replace(rb"schema\": 1", rb"schema\": 9", 1))
+
+
+def not_finite(path) -> None:
+    tensors, header = load_state(path)
+    tensors["parameter.quats"][3, 0] = torch.nan
+    save_state(path, tensors, header)
+
+
+def short(path) -> None:
+    tensors, header = load_state(path)
+    save_state(path, {**tensors, "parameter.quats": tensors["parameter.quats"][1:]}, header)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda path: path.unlink(), "must be a checkpoint, found none"),
+        (damaged, "must be a checkpoint, got "),
+        (of_a_newer_version, "checkpoint schema must be 1, got 9"),
+        (not_finite, "quats must be finite, got .* at index 3"),
+        (short, r"parameter\.quats must be torch\.float32 of shape"),
+    ],
+    ids=lambda x: getattr(x, "__name__", ""),
+)
+def test_run_without_a_checkpoint_is_its_ply(run, change, told, caplog):  # noqa: F811
+    """One line names the checkpoint and what is wrong with it; without the PLY, too, it is the error."""
+
+    change(run.state)
+    loaded = load_run(run)
+    assert equal(loaded.gaussians, load_ply(run.point_cloud))
+    assert loaded.step is None
+    assert len(caplog.messages) == 1
+    assert re.search(rf"state\.safetensors: {told}.*; point_cloud\.ply is taken instead$", caplog.messages[0])
+    assert "\n" not in caplog.messages[0]
+    run.point_cloud.unlink()
+    with pytest.raises(
+        (ValueError, FileNotFoundError), match=told if run.state.exists() else "found none; the fit has"
+    ):
+        load_run(run)
+
+
+def test_edited_ply_is_told_of(run, caplog):  # noqa: F811
+    """The checkpoint is taken, whether the PLY was cleaned by hand or damaged."""
+    g = load_run(run).gaussians
+    save_ply(g.take(slice(0, 5)), run.point_cloud)
+    assert equal(load_run(run).gaussians, g)
+    damaged(run.point_cloud)
+    assert equal(load_run(run).gaussians, g)
+    assert len(caplog.messages) == 2
+    assert all("point_cloud.ply: does not hold what state.safetensors holds" in x for x in caplog.messages)
