@@ -18,6 +18,7 @@ Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than re
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.gain import Prior, information_gain
-from drgs.guards.arguments import must_be
+from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_scene, check_view
 from drgs.information.groups import GROUPS, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
@@ -33,6 +34,7 @@ from drgs.information.replay import Replay, by_probes
 from drgs.integrator import render_jvp
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
+from drgs.splats import SplatTensors, scene_of
 
 __all__ = [
     "BLOCK",
@@ -55,8 +57,8 @@ _BATCH = 16  # tangents of one traversal
 
 @alone
 def diagonal(
-    gaussians: Gaussians,
-    cameras: Camera | Sequence[Camera],
+    gaussians: Gaussians | None = None,
+    cameras: Camera | Sequence[Camera] | None = None,
     settings: RenderSettings | None = None,
     method: str = "exact",
     *,
@@ -64,13 +66,14 @@ def diagonal(
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     probes: int = 16,
     seed: int = 0,
+    **splats: Unpack[SplatTensors],
 ) -> Information:
     """The diagonal of J^T J, summed over views.
 
     Args:
         gaussians: N Gaussians, world frame.
         cameras: One or several; nothing of a view is kept but its sum.
-        settings: Default `RenderSettings.preset("exact")`.
+        settings: Default `RenderSettings.preset("exact")`; of tensors `preset("gsplat")`, as in `drgs.rasterization`.
         method: `exact`: squares of every pixel's and channel's derivative, in one traversal after the primal one.
             `columns`: the same from forward-mode columns, one for every parameter: for checks on small scenes.
             `probes`: mean of (J^T v)^2 over Rademacher v, unbiased, relative error about sqrt(2 / probes).
@@ -79,23 +82,47 @@ def diagonal(
         groups: Those wanted; default all that the Gaussians have.
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
         probes, seed: Of method `probes`.
+        splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
+            without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
+            `height`, and maybe `sh_degree` and `backgrounds`.
     Returns:
-        Group -> float64 tensor on the CPU.
+        Group -> float64 tensor on the CPU. Of tensors, too, about the raw parameters: H of `log_scales` divided by
+        scales^2 is about the scales, H of `logit_opacities` divided by (opacities (1 - opacities))^2 about the
+        opacities. Of plain colors (N, D) the first three channels are `sh` (N, 1, min(D, 3)), divided by
+        1 / (4 pi) about the colors themselves; the others are `features`, which say nothing about the geometry.
     Raises:
-        ValueError: If a method, group or weight is unknown or wrong, or a parameter is not finite.
+        ValueError: If a method, group, weight or tensor is unknown or wrong, or a parameter is not finite.
     """
+    if isinstance(gaussians, torch.Tensor):
+        raise ArgumentError(
+            "fisher.diagonal: tensors must be passed by name, got one by place; use means=..., quats=..."
+        )
+    if splats and (gaussians is not None or cameras is not None):
+        raise ArgumentError(
+            f"fisher.diagonal: it must get Gaussians and cameras or the tensors of both, got {next(iter(splats))} "
+            "besides; pass either"
+        )
+    backgrounds = []
+    weights, channels = _weights(channel_weights), 3
+    if splats:
+        settings = settings or RenderSettings.preset("gsplat")
+        scene = scene_of("fisher.diagonal", splats)
+        gaussians, cameras = scene.gaussians, scene.cameras
+        backgrounds, channels = scene.backgrounds, scene.channels
+        weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
     check_scene("fisher.diagonal", gaussians, settings)
     settings = settings or RenderSettings.preset("exact")
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
     cameras, wanted = _cameras("fisher.diagonal", cameras), groups_of(gaussians, groups)
-    weights = _weights(channel_weights)
     if method == "fisherrf":
         wanted = {name: group for name, group in wanted.items() if group.fisherrf}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in wanted.items()}
     for number, camera in enumerate(cameras):
         if not len(gaussians):
             break
+        if backgrounds:  # every view has its own
+            settings = settings.replace(background=backgrounds[number])
         if method == "columns":
             part = _by_columns(gaussians, camera, settings, wanted, weights)
         elif method == "probes":
@@ -104,6 +131,8 @@ def diagonal(
             part = Replay(gaussians, camera, settings).diagonal(wanted, weights, method == "fisherrf")
         for name in wanted:
             total[name] += part[name]
+    if "sh" in total:
+        total["sh"] = total["sh"][..., :channels]
     return total
 
 

@@ -4,9 +4,8 @@ Argument names, shapes, defaults and meanings are those of `gsplat.rasterization
 import and runs without CUDA. What gsplat can do and this cannot is refused by name; what only steers gsplat's memory
 and speed (`packed`, `tile_size`, `channel_chunk`, `segmented`) is accepted and changes nothing.
 
-Channels: rendering is linear in the colors, so up to three of them travel as the color of SH degree 0, shifted above
-the clamp at 0 (the shift times alpha is taken off the image again), and the others as features. Depth of the
-rasterizers' model is a Gaussian's own z, as in gsplat.
+What the tensors are in raw parameters is said in splats.py. Depth of the rasterizers' model is a Gaussian's own z, as
+in gsplat.
 """
 
 from __future__ import annotations
@@ -17,19 +16,15 @@ from collections.abc import Sequence
 
 import torch
 
-from drgs import runtime
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians, semi_axes
+from drgs.ellipsoids import semi_axes
 from drgs.integrator import EPS_ALPHA, render
 from drgs.settings import RenderSettings
+from drgs.splats import Splats, cameras_of, check_shapes, inside, inside_opacities
 
 __all__ = ["rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-_SH0 = 0.28209479177387814  # Y_00
-# Raw parameters are logarithms and logits: values at the ends of their range are moved inside by less than float32
-# can tell from them, and keep their derivative.
-_LEAST_SCALE, _LEAST_OPACITY, _MOST_OPACITY = 1e-20, 1e-12, 1 - 2.0**-26
 # Defaults of gsplat's signature: another preset's own constants hold unless an argument differs from these.
 _NEAR, _FAR, _DILATION = 0.01, 1e10, 0.3
 # What to do instead of an option that does not exist here.
@@ -142,9 +137,10 @@ def rasterization(
     _one_of("render_mode", render_mode, RENDER_MODES)
     _one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     settings = _settings(preset, near_plane, eps2d, rasterize_mode)
-    lead, cameras = _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
-    _check_values(scales, opacities)
-    scales, opacities = _inside(scales, _LEAST_SCALE, math.inf), _inside(opacities, _LEAST_OPACITY, _MOST_OPACITY)
+    lead, count = check_shapes(
+        "rasterization", means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds
+    )
+    scales, opacities = inside("rasterization", scales, opacities)
     by_camera = colors.ndim == len(lead) + (3 if sh_degree is None else 4)
     of = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
     means_b, quats_b, scales_b, opacities_b, colors_b, viewmats_b, Ks_b = map(
@@ -153,17 +149,12 @@ def rasterization(
     behind_b = None if backgrounds is None else of(backgrounds)
     made = []
     for b in range(len(means_b)):
-        for c in range(cameras):
+        for c, camera in enumerate(cameras_of(viewmats_b[b], Ks_b[b], width, height)):
             shown = colors_b[b, c] if by_camera else colors_b[b]
             made.append(
                 _view(
-                    _Splats(means_b[b], quats_b[b], scales_b[b], opacities_b[b], shown, sh_degree),
-                    Camera(
-                        K=runtime.unwrapped(Ks_b[b, c], lambda K: K.cpu().double().numpy()),
-                        w2c=viewmats_b[b, c],
-                        width=width,
-                        height=height,
-                    ),
+                    Splats(means_b[b], quats_b[b], scales_b[b], opacities_b[b], shown, sh_degree),
+                    camera,
                     settings,
                     render_mode,
                     rasterize_mode == "antialiased",
@@ -171,59 +162,21 @@ def rasterization(
                     None if behind_b is None else behind_b[b, c],
                 )
             )
-    stacked = [torch.stack(x).reshape(*lead, cameras, *x[0].shape) for x in zip(*(v[:2] for v in made), strict=True)]
+    stacked = [torch.stack(x).reshape(*lead, count, *x[0].shape) for x in zip(*(v[:2] for v in made), strict=True)]
     meta = {
-        name: torch.stack([v[2][name] for v in made]).reshape(*lead, cameras, *made[0][2][name].shape)
+        name: torch.stack([v[2][name] for v in made]).reshape(*lead, count, *made[0][2][name].shape)
         for name in made[0][2]
     }
-    meta |= {"width": width, "height": height, "n_batches": math.prod(lead), "n_cameras": cameras}
+    meta |= {"width": width, "height": height, "n_batches": math.prod(lead), "n_cameras": count}
     return *stacked, meta
 
 
-@dataclasses.dataclass
-class _Splats:
-    """One scene as gsplat stores it: means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), and colors (N, D), or
-    with a degree (N, K, 3).
-    """
-
-    means: torch.Tensor
-    quats: torch.Tensor
-    scales: torch.Tensor
-    opacities: torch.Tensor
-    colors: torch.Tensor
-    degree: int | None
-
-    def take(self, index) -> _Splats:
-        parts = (getattr(self, f.name)[index] for f in dataclasses.fields(self) if f.name != "degree")
-        return _Splats(*parts, self.degree)
-
-    def gaussians(self, with_color: bool) -> tuple[Gaussians, float]:
-        """Raw parameters, and what was added to the first three channels to keep them above the clamp."""
-        n, shift, features = len(self.means), 0.0, None
-        if not with_color:
-            sh = self.means.new_zeros(n, 1, 3)
-        elif self.degree is not None:
-            sh = self.colors[:, : (self.degree + 1) ** 2]
-        else:
-            first, rest = self.colors[:, :3], self.colors[:, 3:]
-            # At exactly 0 the clamp would end the gradient; one half is exact and keeps black clear of it.
-            shift = 0.5 - min(0.0, float(first.detach().min()) if first.numel() else 0.0)
-            first = torch.nn.functional.pad(first, (0, 3 - first.shape[1]))
-            sh = ((first + (shift - 0.5)) / _SH0)[:, None, :]
-            features = rest if rest.shape[1] else None
-        opacities = self.opacities.double()  # near 1 float32 cannot hold 1 - opacity
-        logits = torch.log(opacities) - torch.log1p(-opacities)
-        return Gaussians(self.means, self.quats, torch.log(self.scales), logits, sh, features), shift
-
-
-def _view(splats: _Splats, camera: Camera, settings, mode: str, antialiased: bool, limits, background):
+def _view(splats: Splats, camera: Camera, settings, mode: str, antialiased: bool, limits, background):
     """One image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
     far, clip = limits
     meta, compensation = _projected(splats, camera, settings, antialiased)
     if antialiased:
-        splats = dataclasses.replace(
-            splats, opacities=_inside(splats.opacities * compensation, _LEAST_OPACITY, _MOST_OPACITY)
-        )
+        splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
     meta["opacities"] = splats.opacities.detach().to(splats.means.dtype)
     # A Gaussian that is left out must not be drawn: the renderer itself knows no far plane and no smallest radius.
     kept = (meta["depths"] <= far) & (meta["depths"] > settings.near)
@@ -250,7 +203,7 @@ def _view(splats: _Splats, camera: Camera, settings, mode: str, antialiased: boo
     return torch.cat(channels, -1).to(kind), alpha.to(kind), meta
 
 
-def _projected(splats: _Splats, camera: Camera, settings: RenderSettings, antialiased: bool):
+def _projected(splats: Splats, camera: Camera, settings: RenderSettings, antialiased: bool):
     """gsplat's `meta` of a view, without a graph, and the compensation of opacities, (N,), with one.
 
     Sigma' = J W Sigma W^T J^T, J the derivative of the projection at the mean, its slopes clamped where the settings
@@ -328,11 +281,6 @@ def _settings(preset: str | RenderSettings, near: float, eps2d: float, mode: str
     return black
 
 
-def _inside(x: torch.Tensor, low: float, high: float) -> torch.Tensor:
-    """x moved into [low, high], with the derivative of x: at the ends gsplat's functions have one."""
-    return x + (x.detach().double().clamp(low, high) - x.detach()) if x.numel() else x
-
-
 def _refuse(**asked: bool) -> None:
     """Raise NotImplementedError for the first option of gsplat's that is asked for."""
     for name, is_asked in asked.items():
@@ -343,60 +291,3 @@ def _refuse(**asked: bool) -> None:
 def _one_of(name: str, value, allowed: Sequence[str]) -> None:
     if value not in allowed:
         raise ValueError(f"rasterization: {name} must be one of {', '.join(allowed)}, got {value!r}")
-
-
-def _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, degree, backgrounds):
-    """Leading axes, and the number of cameras."""
-    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    tensors |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
-    for name, x in tensors.items():
-        if not isinstance(x, torch.Tensor):
-            raise ValueError(
-                f"rasterization: {name} must be a torch tensor, got {type(x).__name__}; use torch.as_tensor"
-            )
-    if means.ndim < 2 or means.shape[-1] != 3:
-        raise ValueError(f"rasterization: means must have shape (..., N, 3), got {tuple(means.shape)}")
-    if viewmats.ndim < 3:
-        raise ValueError(
-            f"rasterization: viewmats must have shape (..., C, 4, 4), got {tuple(viewmats.shape)}; add an axis for the "
-            "cameras, viewmat[None]"
-        )
-    lead, n, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
-    if degree is None:
-        shown = [(n, "D"), (cameras, n, "D")]
-    else:
-        if degree not in (0, 1, 2, 3):
-            raise ValueError(f"rasterization: sh_degree must be None or 0 to 3, got {degree!r}")
-        shown = [(n, "K", 3), (cameras, n, "K", 3)]
-    wanted = {"quats": [(n, 4)], "scales": [(n, 3)], "opacities": [(n,)], "colors": shown}
-    wanted |= {"viewmats": [(cameras, 4, 4)], "Ks": [(cameras, 3, 3)]}
-    if backgrounds is not None:
-        wanted["backgrounds"] = [(cameras, 3 if degree is not None else colors.shape[-1])]
-    for name, shapes in wanted.items():
-        got = tuple(tensors[name].shape)
-        if not any(_fits(got, lead + shape) for shape in shapes):
-            allowed = " or ".join("(" + ", ".join(map(str, lead + shape)) + ")" for shape in shapes)
-            raise ValueError(
-                f"rasterization: {name} must have shape {allowed} (N = {n} from means, C = {cameras} from viewmats"
-                f"{'' if name != 'colors' else f', sh_degree = {degree}'}), got {got}"
-            )
-    if degree is not None and colors.shape[-2] < (degree + 1) ** 2:
-        raise ValueError(
-            f"rasterization: colors must have at least {(degree + 1) ** 2} coefficients for sh_degree {degree}, got "
-            f"{colors.shape[-2]}"
-        )
-    return lead, cameras
-
-
-def _fits(got: tuple, wanted: tuple) -> bool:
-    return len(got) == len(wanted) and all(isinstance(w, str) or g == w for g, w in zip(got, wanted, strict=True))
-
-
-def _check_values(scales: torch.Tensor, opacities: torch.Tensor) -> None:
-    """What logarithms and logits cannot hold; the renderer checks the rest."""
-    for name, x, high in (("scales", scales, math.inf), ("opacities", opacities, 1.0)):
-        bad = ~((x.detach() >= 0) & (x.detach() <= high))
-        if bool(bad.any()):
-            at = tuple(bad.nonzero()[0].tolist())
-            allowed = "[0, 1], as sigmoid gives" if name == "opacities" else "[0, inf), linear, as exp gives"
-            raise ValueError(f"rasterization: {name} must be in {allowed}, got {float(x[at]):g} at index {list(at)}")

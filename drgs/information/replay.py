@@ -59,7 +59,8 @@ class Replay:
         inverse = t.Float(dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0))
         d = [t.Float(x * t.Float64(inverse)) for x in away]
         basis = projection.sh_basis(d, K)
-        coefficient = lambda k, c: dr.gather(t.Float, p["sh"], 3 * K * i + (3 * k + c))  # noqa: E731
+        sh = t.Float(p["sh"])  # may be float64
+        coefficient = lambda k, c: dr.gather(t.Float, sh, 3 * K * i + (3 * k + c))  # noqa: E731
         rgb = projection.sh_color(basis, coefficient)
         lit = [dr.select(x > 0, t.Float(1), 0) for x in rgb]
         zero = dr.zeros(t.Float, self.count)
