@@ -19,9 +19,10 @@ sys.path.insert(0, str(ROOT))
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
 from drgs import runtime  # noqa: E402
-from drgs.lab import stress  # noqa: E402
+from drgs.commands.stress import markdown  # noqa: E402
 from drgs.lab.extremes import CASES  # noqa: E402
 from drgs.lab.refusals import REFUSALS  # noqa: E402
+from drgs.lab.stress import rows  # noqa: E402
 
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 
@@ -32,9 +33,9 @@ def main() -> int:
     args = parser.parse_args()
     found = []
     for case in (*CASES, *REFUSALS):
-        for row in stress.rows(case):
+        for row in rows(case):
             found.append(row)
-            print(stress.markdown([row])[-1], flush=True)
+            print(markdown([row])[-1], flush=True)
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     made = (
         f"`python benchmarks/numerics.py`, {runtime.info().get('cpu', 'CPU')}, {runtime.backend().variant}, "
@@ -44,7 +45,7 @@ def main() -> int:
         page = ROOT / "docs" / "numerics.md"
         text = page.read_text()
         head, tail = text.split(BEGIN)[0], text.split(END)[1]
-        page.write_text("\n".join([head + BEGIN, "", made, "", *stress.markdown(found), "", END]) + tail)
+        page.write_text("\n".join([head + BEGIN, "", made, "", *markdown(found), "", END]) + tail)
     return int(any(row.verdict == "FAILS" for row in found))
 
 

@@ -1,8 +1,8 @@
 """The `drgs` command: one level of subcommands, one line per error.
 
-Each command's dataclass (options.py) is its option list; the work is done by the module named in `_RUN`, loaded only
-when its command runs, so that `drgs --help` imports nothing heavy. A `run` function takes the dataclass and returns
-None or an exit code.
+Each command's dataclass (options.py) is its option list; the work is done by `run` of the module in drgs.commands that
+has the command's name, loaded only when the command runs, so that `drgs --help` imports nothing heavy. It takes the
+dataclass and returns None or an exit code.
 
 Exit codes: 0 done, 1 a wrong gradient (crossval) or a broken bound (stress), 2 bad usage or bad input (one line on
 stderr), 129, 130 or 143 ended by SIGHUP, Ctrl-C or SIGTERM.
@@ -15,7 +15,6 @@ import importlib
 import io
 import logging
 import os
-import re
 import sys
 import typing
 from typing import Annotated
@@ -31,19 +30,19 @@ from drgs.guards import interrupts
 __all__ = ["main"]
 
 
-# Command -> (its options, module, function). Modules load only when their command runs.
-_RUN = {
-    "info": (Info, "drgs.cli", "_run_info"),
-    "render": (Render, "drgs.commands.render", "run"),
-    "fit": (Fit, "drgs.train", "run_fit"),
-    "eval": (Eval, "drgs.metrics", "run_eval"),
-    "select": (Select, "drgs.commands.select", "run"),
-    "fisher": (Fisher, "drgs.commands.fisher", "run"),
-    "crossval": (Crossval, "drgs.commands.crossval", "run"),
-    "tradeoff": (Tradeoff, "drgs.commands.tradeoff", "run"),
-    "stress": (Stress, "drgs.lab.stress", "run"),
-    "sfm": (Sfm, "drgs.data.sfm", "run_command"),
-    "demo": (Demo, "drgs.commands.demo", "run"),
+# Command -> its options. The work is done by `run` of the module of drgs.commands that has the command's name.
+_OPTIONS = {
+    "info": Info,
+    "render": Render,
+    "fit": Fit,
+    "eval": Eval,
+    "select": Select,
+    "fisher": Fisher,
+    "crossval": Crossval,
+    "tradeoff": Tradeoff,
+    "stress": Stress,
+    "sfm": Sfm,
+    "demo": Demo,
 }
 
 
@@ -64,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
     args = _parse_arguments(argv)
     from drgs.guards import outputs  # not for --help
 
-    name, module, function = next((n, m, f) for n, (t, m, f) in _RUN.items() if type(args) is t)
+    name = next(name for name, options in _OPTIONS.items() if type(args) is options)
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])
     logging.getLogger("drgs").setLevel(logging.WARNING if args.quiet else logging.INFO)
     try:
@@ -80,8 +79,8 @@ def main(argv: list[str] | None = None) -> int:
                             from drgs import runtime
 
                             runtime.setup(args.variant, args.threads)
-                        run = getattr(importlib.import_module(module), function)
-                    return run(args) or 0
+                        command = importlib.import_module(f"drgs.commands.{name}")
+                    return command.run(args) or 0
             finally:
                 outputs.release_all()
     except (ValueError, NotImplementedError, OSError) as error:
@@ -111,7 +110,7 @@ class _Stderr(logging.StreamHandler):
 def _parse_arguments(argv: list[str]):
     """The dataclass of the command in argv; tyro's framed usage errors become one line."""
     commands = typing.Union[  # noqa: UP007 (built at run time)
-        tuple(Annotated[t, subcommand(name)] for name, (t, _, _) in _RUN.items())
+        tuple(Annotated[options, subcommand(name)] for name, options in _OPTIONS.items())
     ]
     errors = io.StringIO()
     try:
@@ -125,7 +124,7 @@ def _parse_arguments(argv: list[str]):
             )
     except SystemExit as end:
         if end.code:
-            command = next((a for a in argv if a in _RUN), None)
+            command = next((a for a in argv if a in _OPTIONS), None)
             line = _one_line(errors.getvalue())
             _complain(command, f"{line} (see `drgs {f'{command} ' if command else ''}--help`)")
         raise
@@ -161,40 +160,3 @@ def _complain(command: str | None, message: str) -> None:
     where = f"drgs {command}" if command else "drgs"
     message = " ".join(message.removeprefix("drgs: ").split())
     print(f"{where}: {message}", file=sys.stderr)
-
-
-def _run_info(args: Info) -> int:
-    """`drgs info`: exit code 2 when nothing can be rendered here."""
-    from drgs import runtime
-
-    report = runtime.info()
-    if args.json:
-        import json
-
-        print(json.dumps(report, indent=2))
-    else:
-        print(_plain(report))
-    if report["backend"]["error"]:
-        raise ValueError(report["backend"]["error"])
-    return 0
-
-
-def _plain(report: dict) -> str:
-    """The report of `runtime.info()` as aligned lines."""
-    llvm, cuda, optix = report["llvm"], report["cuda"], report["optix"]
-    cores = report["cores"]
-    others = [x["path"] for x in llvm["found"] if x["path"] != llvm["path"]]
-    rows = {
-        "drgs": f"{report['drgs']} (commit {report['commit'] or 'unknown'})",
-        "python": f"{report['python']} on {report['platform']}",
-        "cpu": f"{report['cpu']}, {cores['usable']} of {cores['machine']} cores",
-        "backend": report["backend"]["variant"] or "none",
-        "libLLVM": f"{llvm['version']} ({llvm['path']})" if llvm["version"] else "not in use",
-        "also found": ", ".join(others) or "no other libLLVM",
-        "threads": ", ".join(f"{name} {count}" for name, count in report["threads"].items()),
-        "CUDA": cuda["device"] or "yes" if cuda["available"] else f"no: {cuda['reason']}",
-        "OptiX": "yes" if optix["available"] else f"no: {optix['reason']}",
-        **{name: version or "not installed" for name, version in report["packages"].items()},
-    }
-    width = max(map(len, rows))
-    return re.sub(r" +$", "", "\n".join(f"{k:<{width}}  {v}" for k, v in rows.items()), flags=re.M)

@@ -1,4 +1,4 @@
-"""`drgs fit`: Gaussians from photographs with known cameras (static scenes, color).
+"""Gaussians from photographs with known cameras (static scenes, color).
 
 The loop around `drgs.fitting.trainer`: run folder, checkpoints, progress, previews, and metrics of held-out views at
 the end.
@@ -33,11 +33,10 @@ from drgs.guards import interrupts
 from drgs.guards.outputs import claim
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Fit
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["FitConfig", "FitResult", "Trainer", "fit", "run_fit"]
+__all__ = ["FitConfig", "FitResult", "Trainer", "fit"]
 
 _log = logging.getLogger(__name__)
 
@@ -160,31 +159,6 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
     )
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"])
     return FitResult(g, written, run, loop.seconds)
-
-
-def run_fit(args: Fit) -> None:
-    """`drgs fit DATA -o RUN`."""
-    from drgs.data import load
-
-    settings = args.settings()
-    names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
-    config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
-    active = args.active()
-    # Before minutes of reading images and triangulating points.
-    claim_run(Run(args.output), "fit", args.resume, [args.data])
-    dataset = load(
-        args.data,
-        test_every=config.test_every,
-        background=config.settings.background,
-        lazy=active is not None,
-        points=active is None or config.init_points == "all",
-        strict=args.strict,
-    )
-    result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
-    if args.quiet:
-        return
-    metrics.print_table(result.metrics)
-    print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
 
 
 def _start(

@@ -123,10 +123,8 @@ def test_failed_stage_says_nothing_at_its_end(soon, capsys):
 @pytest.mark.parametrize("quiet", [False, True])
 def test_every_command_reports(soon, monkeypatch, capsys, quiet):
     """A command that works without any bar of its own is not silent on a pipe, unless --quiet says so."""
-    module = types.ModuleType("_stub")
-    module.run = lambda args: time.sleep(0.15)
-    monkeypatch.setitem(sys.modules, "_stub", module)
-    monkeypatch.setitem(cli._RUN, "stress", (cli._RUN["stress"][0], "_stub", "run"))
+    stub = types.SimpleNamespace(run=lambda args: time.sleep(0.15))
+    monkeypatch.setitem(sys.modules, "drgs.commands.stress", stub)
     assert cli.main(["stress", *["--quiet"] * quiet]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert bool(lines) != quiet

@@ -97,7 +97,7 @@ def test_first_lines():
 
 def test_every_command_is_shown():
     """The list of commands is complete."""
-    assert {command[0] for command in _commands()} == set(cli._RUN)
+    assert {command[0] for command in _commands()} == set(cli._OPTIONS)
 
 
 def test_commands_run(folder, monkeypatch, capsys):

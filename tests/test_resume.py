@@ -180,7 +180,7 @@ def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
         "commands.render.load_scene",
         "commands.viewpoints.load_scene",
         "data.load",
-        "lab.stress.rows",
+        "commands.stress.rows",
         "files.load_ply",
     )
     for name in (f"drgs.{reader}" for reader in readers):

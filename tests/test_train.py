@@ -13,6 +13,8 @@ import torch
 import drgs
 from drgs import metrics
 from drgs.cameras import orbit
+from drgs.commands.eval import print_table, viewers_line
+from drgs.commands.eval import run as run_eval
 from drgs.data.views import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
@@ -103,14 +105,14 @@ def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys
 
     result = fit(dataset, tmp_path / "run", config(max_steps=5), progress=False)
     monkeypatch.setattr("drgs.data.load", lambda path, **_: dataset)
-    metrics.run_eval(Eval(run=tmp_path / "run"))
+    run_eval(Eval(run=tmp_path / "run"))
     again = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert again["mean"]["psnr"] == pytest.approx(result.metrics["mean"]["psnr"], abs=1e-3)
     assert again["viewers"]["psnr"] == pytest.approx(result.metrics["viewers"]["psnr"], abs=1e-3)
     said = capsys.readouterr().out
     assert "2 test views" in said
     assert f"In a viewer of PLY files (preset gsplat, {SIZE}x{SIZE}): PSNR {again['viewers']['psnr']:.2f} dB" in said
-    metrics.run_eval(Eval(run=tmp_path / "run", split="train"))
+    run_eval(Eval(run=tmp_path / "run", split="train"))
     again = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (again["split"], again["count"]) == ("train", 7)
 
@@ -122,7 +124,7 @@ def test_fit_says_how_viewers_show_it(dataset, tmp_path, preset, capsys):
     """
     settings = drgs.RenderSettings.preset(preset, background=(0.1, 0.2, 0.3))
     result = fit(dataset, tmp_path / "run", config(max_steps=5, settings=settings), progress=False)
-    metrics.print_table(result.metrics)
+    print_table(result.metrics)
     viewers, said = result.metrics["viewers"], capsys.readouterr().out
     if preset == "gsplat":
         assert viewers is None
@@ -152,7 +154,7 @@ def test_viewers_widen_what_is_small():
         frame = Frame("0", view, drgs.render(g, view, FAST).rgb.clamp(0, 1))
         viewers = metrics.through_viewers(g, [frame], FAST, "test")
         assert viewers["own_psnr"] == 100
-        assert metrics._viewers_line(viewers).endswith("to train for viewers, fit with --preset gsplat")
+        assert viewers_line(viewers).endswith("to train for viewers, fit with --preset gsplat")
         psnr.append(viewers["psnr"])
     assert psnr[0] < 22
     assert psnr[1] > 32

@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
-from drgs.display.progress import Bar
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Sfm
     from drgs.guards.outputs import Claim
 
-__all__ = ["SfmSummary", "run_command", "run_sfm"]
+__all__ = ["SfmSummary", "run_sfm"]
 
 _CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -216,28 +214,3 @@ def _install(partial: Path, output: Claim, image_dir: Path) -> None:
     for file in partial.glob("database.db*"):
         output.put(file, file.name)
     output.put(partial / "sparse", "sparse")
-
-
-def run_command(args: Sfm) -> None:
-    """`drgs sfm IMAGES -o OUT`."""
-    with Bar("features", show=not args.quiet) as bar:
-        summary = run_sfm(
-            args.images,
-            args.output,
-            bar.stage,
-            camera_model=args.camera_model,
-            matching=args.matcher,
-            seed=args.seed,
-        )
-    if args.quiet:
-        return
-    stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
-    print(
-        f"{summary.registered} of {summary.total} photos have a pose, {summary.points} points, "
-        f"mean reprojection error {summary.reprojection_error:.2f} px ({stages})"
-    )
-    if summary.missing:
-        print(f"without a pose: {', '.join(summary.missing)}")
-    if summary.models > 1:
-        print(f"the photos fell apart into {summary.models} models, the largest was kept")
-    print(f"next: drgs fit {args.output} -o RUN")

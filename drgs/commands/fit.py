@@ -1,0 +1,40 @@
+"""`drgs fit`: Gaussians from photographs with known cameras, and how well they show the held-out ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from drgs import data
+from drgs.commands.eval import print_table
+from drgs.files import Run
+from drgs.fitting.resume import claim_run
+from drgs.train import FitConfig, fit
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Fit
+
+__all__ = ["run"]
+
+
+def run(args: Fit) -> None:
+    """`drgs fit DATA -o RUN`."""
+    settings = args.settings()
+    names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
+    config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
+    active = args.active()
+    # Before minutes of reading images and triangulating points.
+    claim_run(Run(args.output), "fit", args.resume, [args.data])
+    dataset = data.load(
+        args.data,
+        test_every=config.test_every,
+        background=config.settings.background,
+        lazy=active is not None,
+        points=active is None or config.init_points == "all",
+        strict=args.strict,
+    )
+    result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
+    if args.quiet:
+        return
+    print_table(result.metrics)
+    print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")

@@ -1,0 +1,38 @@
+"""`drgs sfm`: photographs to a data set that `drgs fit` reads."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from drgs.data.sfm import run_sfm
+from drgs.display.progress import Bar
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Sfm
+
+__all__ = ["run"]
+
+
+def run(args: Sfm) -> None:
+    """`drgs sfm IMAGES -o OUT`."""
+    with Bar("features", show=not args.quiet) as bar:
+        summary = run_sfm(
+            args.images,
+            args.output,
+            bar.stage,
+            camera_model=args.camera_model,
+            matching=args.matcher,
+            seed=args.seed,
+        )
+    if args.quiet:
+        return
+    stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
+    print(
+        f"{summary.registered} of {summary.total} photos have a pose, {summary.points} points, "
+        f"mean reprojection error {summary.reprojection_error:.2f} px ({stages})"
+    )
+    if summary.missing:
+        print(f"without a pose: {', '.join(summary.missing)}")
+    if summary.models > 1:
+        print(f"the photos fell apart into {summary.models} models, the largest was kept")
+    print(f"next: drgs fit {args.output} -o RUN")
