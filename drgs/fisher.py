@@ -25,7 +25,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
-from drgs.gain import Prior, information_gain
+from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_scene, check_view
 from drgs.information.groups import GROUPS, Information, groups_of
@@ -50,7 +50,6 @@ __all__ = [
     "variance_map",
 ]
 
-METHODS = ("exact", "columns", "probes", "fisherrf")
 BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 _BATCH = 16  # tangents of one traversal
 

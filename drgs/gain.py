@@ -24,6 +24,7 @@ from drgs.guards.arguments import must_be
 __all__ = [
     "BLOCK_LAYOUT",
     "CRITERIA",
+    "METHODS",
     "Chain",
     "Gain",
     "Information",
@@ -39,6 +40,7 @@ __all__ = [
 Information = Mapping[str, torch.Tensor]
 
 CRITERIA = ("eig", "logdet", "trace_cov", "block_logdet")  # the first is the default everywhere
+METHODS = ("exact", "columns", "probes", "fisherrf")  # of `drgs.fisher.diagonal`; here, for that loads Dr.Jit
 
 BLOCK_LAYOUT = {
     "means": slice(0, 3),

@@ -1,7 +1,8 @@
 """Which cameras to add: policies over information, and simple baselines.
 
-A policy is a function from a `Pool` to a `Selection`; adding one is writing it and naming it in `POLICIES`. Policies
-with scores that depend on what has been picked are greedy: take the best, add its information to H, score again.
+A policy is a function from a `Pool` to a `Selection`; adding one is writing it here and naming it in `POLICIES`.
+Policies whose scores depend on what has been picked are greedy: take the best, add its information to H, score again
+(information/greedy.py). How a score comes from information is a `Scoring`; its criteria are in gain.py.
 
     fisher      `criterion` of the Fisher information (gain.py)
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
@@ -18,49 +19,25 @@ import itertools
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
-from drgs.gain import BLOCKS, CRITERIA, Information, Prior
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.gain import CRITERIA, METHODS, Information
+from drgs.guards.arguments import must_be
 from drgs.guards.doors import camera_list, check_scene
-from drgs.information.greedy import Cache, Pick, Selection, Source, greedy
+from drgs.information.cache import Cache
+from drgs.information.greedy import ViewInformation, greedy
+from drgs.information.pool import Pick, Pool, Scoring, Selection
 
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians
-    from drgs.settings import RenderSettings
-
-__all__ = ["POLICIES", "Cache", "Pick", "Pool", "Selection", "select"]
+__all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
 
 # One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
-
-
-@dataclasses.dataclass
-class Pool:
-    """Everything a policy may look at; see `select` for the fields."""
-
-    gaussians: Gaussians
-    candidates: Sequence[Camera]
-    train: Sequence[Camera]
-    k: int
-    criterion: str
-    settings: RenderSettings | None
-    method: str
-    prior: Prior
-    weights: dict[str, float] | None
-    rng: torch.Generator
-    cache: Cache | None
-    lazy: bool
-    progress: Callable[[int, int], object] | None
-    information: Callable[[Camera], Information] | None
-
-    def pick(self, index: int, score: float, parts: dict | None = None, margin: float | None = None) -> Pick:
-        """A `Pick` with plain numbers."""
-        return Pick(int(index), self.candidates[index].name, float(score), dict(parts or {}), margin)
 
 
 def select(
@@ -70,16 +47,13 @@ def select(
     k: int = 1,
     policy: str = "fisher",
     *,
-    criterion: str = "eig",
-    settings: RenderSettings | None = None,
-    method: str = "exact",
-    prior: Prior | None = None,
-    weights: dict[str, float] | None = None,
+    scoring: Scoring | None = None,
     rng: torch.Generator | None = None,
     cache: Cache | None = None,
     lazy: bool = True,
     progress: Callable[[int, int], object] | None = None,
     information: Callable[[Camera], Information] | None = None,
+    **fields: Any,
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
 
@@ -95,11 +69,7 @@ def select(
         train: Cameras whose views are known; may be empty if lambda is absolute and > 0.
         k: How many.
         policy: A name in `POLICIES`.
-        criterion: One of `drgs.gain.CRITERIA`; of `fisher` only.
-        settings: Of the renderer, default `exact`.
-        method: Of `drgs.fisher.diagonal`; of `fisher` only, not of `block_logdet`.
-        prior: Default `Prior()`: lambda = 1e-6. `coverage` takes its `value`, not its `groups`.
-        weights: Group -> factor, default 1; of `fisher` and `fisherrf` only.
+        scoring: How views are scored; default `Scoring()`.
         rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
         cache: Where to look for and keep information of single views.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
@@ -107,32 +77,29 @@ def select(
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
+        **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`; None is
+            the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, or information is negative, NaN
             or infinite.
     """
     started = time.perf_counter()
-    check_scene("select", gaussians, settings)
+    check_scene("select", gaussians, None)
     candidates, train = camera_list("select", "candidates", candidates), camera_list("select", "train", train)
     if not candidates:
         raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
     if not (isinstance(k, int) and 1 <= k <= len(candidates)):
         raise ValueError(f"select: k must be a whole number in 1..{len(candidates)} candidates, got {k!r}; correct it")
-    for what, value, known in (("policy", policy, POLICIES), ("criterion", criterion, CRITERIA)):
-        if value not in known:
-            raise ValueError(f"select: {what} must be one of {', '.join(known)}, got {value!r}; choose one")
+    if policy not in POLICIES:
+        raise ValueError(f"select: policy must be one of {', '.join(POLICIES)}, got {policy!r}; choose one")
     if rng is not None and not isinstance(rng, torch.Generator):
         raise ValueError(f"select: rng must be a torch.Generator that is kept between calls, got {rng!r}; make one")
     pool = Pool(
-        gaussians=gaussians,
+        scene=gaussians,
         candidates=candidates,
         train=train,
         k=k,
-        criterion=criterion,
-        settings=settings,
-        method=method,
-        prior=prior or Prior(),
-        weights=weights,
+        scoring=_scoring(scoring, fields),
         rng=rng or _GENERATOR,
         cache=cache,
         lazy=lazy,
@@ -144,33 +111,70 @@ def select(
     return selection
 
 
+def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:
+    """The one that was passed, or one of the fields that were."""
+    known = [field.name for field in dataclasses.fields(Scoring)]
+    if unknown := [name for name in fields if name not in known]:
+        raise TypeError(f"select() got an unexpected keyword argument {unknown[0]!r}; Scoring has {', '.join(known)}")
+    if scoring is None:
+        return Scoring(**{name: x for name, x in fields.items() if x is not None})
+    must_be("select", "scoring", scoring, Scoring, "e.g. drgs.select.Scoring(criterion=...)")
+    if fields:
+        raise ValueError(f"select: {', '.join(fields)} must be fields of scoring, got both; put them into Scoring(...)")
+    return scoring
+
+
 # -------------------------------------------------- policies that ask for information
 
 
 def fisher(pool: Pool) -> Selection:
     """Largest gain of Fisher information."""
-    if pool.criterion == "block_logdet":
-        return greedy(pool, Source(pool, "blocks", lambda fisher, *view: {BLOCKS: fisher.blocks(*view)}))
-    compute = lambda fisher, *view: fisher.diagonal(*view, method=pool.method)  # noqa: E731
-    return greedy(pool, Source(pool, f"diagonal {pool.method}", compute))
+    if pool.scoring.criterion == "block_logdet":
+        return _greedy(pool, "blocks")
+    return _greedy(pool, "diagonal", method=pool.scoring.method)
 
 
 def fisherrf(pool: Pool) -> Selection:
-    """Largest sum Hc / (H + lambda) of FisherRF's H."""
-    groups, weights = (
-        {k: v for k, v in x.items() if k != "rotations"} for x in (pool.prior.groups, pool.weights or {})
-    )
-    prior = dataclasses.replace(pool.prior, groups=groups)
-    pool = dataclasses.replace(pool, criterion="eig", prior=prior, weights=weights)
-    compute = lambda fisher, *view: fisher.diagonal(*view, method="fisherrf")  # noqa: E731
-    return greedy(pool, Source(pool, "diagonal fisherrf", compute))
+    """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations."""
+    prior, weights = pool.scoring.prior, _without_rotations(pool.scoring.weights)
+    prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights=weights), "diagonal", method="fisherrf")
 
 
 def coverage(pool: Pool) -> Selection:
     """Largest sum Wc / (W + lambda), W = sum over pixels of w^2."""
-    prior = dataclasses.replace(pool.prior, groups={})
-    pool = dataclasses.replace(pool, criterion="eig", prior=prior, weights=None)
-    return greedy(pool, Source(pool, "coverage", lambda fisher, *view: {"coverage": fisher.coverage(*view)}))
+    prior = dataclasses.replace(pool.scoring.prior, groups={})
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), "coverage")
+
+
+def _greedy(pool: Pool, function: str, **options: Hashable) -> Selection:
+    """`greedy` by what a function of `drgs.fisher` computes of each view, or by the pool's own information.
+
+    Args:
+        pool: Whose scoring says how much it counts.
+        function: Its name; where it returns one tensor, that is a group of the same name.
+        **options: Of the function, besides scene, camera and settings.
+    """
+    settings = pool.scoring.settings
+
+    def compute(camera: Camera) -> Information:
+        from drgs import fisher  # loads Dr.Jit, which the other policies need not have
+
+        found = getattr(fisher, function)(pool.scene, camera, settings, **options)
+        return {function: found} if isinstance(found, torch.Tensor) else found
+
+    if pool.information:
+        return greedy(pool, ViewInformation(pool, pool.information, (pool.information, settings)))
+    return greedy(pool, ViewInformation(pool, compute, (function, settings, *sorted(options.items()))))
+
+
+def _scored(pool: Pool, **fields: Any) -> Pool:
+    """The same pool with other fields of its scoring."""
+    return dataclasses.replace(pool, scoring=dataclasses.replace(pool.scoring, **fields))
+
+
+def _without_rotations(groups: Mapping[str, float]) -> dict[str, float]:
+    return {name: x for name, x in groups.items() if name != "rotations"}
 
 
 # -------------------------------------------------- policies that look at poses only, or at nothing

@@ -346,8 +346,8 @@ def test_one_default_criterion():
     from drgs.commands.options import Fit, Select
     from drgs.fitting.active import ActiveConfig
     from drgs.gain import check
-    from drgs.select import select
+    from drgs.select import Scoring
 
-    scoring = (information_gain, scorer, check, select)
+    scoring = (information_gain, scorer, check, Scoring)
     defaults = {inspect.signature(function).parameters["criterion"].default for function in scoring}
     assert {*defaults, ActiveConfig().criterion, Fit.criterion, Select.criterion} == {CRITERIA[0]} == {"eig"}

@@ -18,7 +18,8 @@ from scenes_random import gaussians
 from drgs import fisher, reference
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.gain import CRITERIA, Prior, dense, information_gain
-from drgs.select import POLICIES, Cache, select
+from drgs.information.cache import camera_key
+from drgs.select import POLICIES, Cache, Scoring, select
 from drgs.settings import RenderSettings
 
 SIZE = (12, 10)
@@ -384,6 +385,48 @@ def test_cache_keeps_kinds_apart(world, one_thread):
     assert len(cache) == 4 * len(kinds)
 
 
+@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Camera)])
+def test_every_field_of_a_camera_is_in_the_key(field):
+    """Cameras that differ in any one field never share information; copies do, whatever holds their pose."""
+    w2c = np.eye(4)
+    w2c[0, 3] = 1
+    camera = Camera(intrinsics_from_fov(40.0, *SIZE), np.eye(4), *SIZE, "opencv", (0.1, 0.0, 0.0, 0.0), "one")
+    other = {
+        "K": intrinsics_from_fov(41.0, *SIZE),
+        "w2c": w2c,
+        "width": SIZE[0] + 1,
+        "height": SIZE[1] + 1,
+        "model": "opencv_fisheye",
+        "distortion": (0.1, 0.0, 0.0, 1e-12),
+        "name": "two",
+        "time": 0.25,
+    }
+    assert camera_key(dataclasses.replace(camera)) == camera_key(camera)
+    changed = dataclasses.replace(camera, **{field: other[field]})
+    assert camera_key(changed) != camera_key(camera)
+    as_tensor = dataclasses.replace(changed, w2c=torch.tensor(changed.w2c, requires_grad=True))
+    assert camera_key(as_tensor) == camera_key(changed)
+    hash(camera_key(changed))
+
+
+def test_cache_knows_time_and_features():
+    """Two times at one pose do not share information, nor do a scene and itself with other features."""
+    g, counter, cache = scene(), _Counter(), Cache()
+    g = g.replace(features=torch.zeros(len(g), 2))
+    early, late = (dataclasses.replace(camera, time=t) for camera, t in zip(line([0, 0]), (0.0, 0.5), strict=True))
+    late = dataclasses.replace(late, name=early.name)
+    run = lambda: select(g, [early, late], line([5.0]), cache=cache, information=counter)  # noqa: E731
+    assert run().computed == 3
+    assert run().computed == 0
+    with torch.no_grad():
+        g.features[1, 1] = 1
+    assert run().computed == 3
+    g = g.replace(features=g.features.clone())
+    assert run().computed == 3
+    g = g.replace(features=None)
+    assert run().computed == 3
+
+
 def test_cache_does_not_keep_the_gaussians():
     """A cache outlives the state it was made for; the tensors must not."""
     g, cache = scene(), Cache()
@@ -508,6 +551,31 @@ def test_errors():
         choose(bad, ("c0",))
     with pytest.raises(ValueError, match="select: information must be of the same parameters in every view"):
         choose(bad, ("c0", "c2"))
+
+
+def test_scoring_is_its_fields():
+    """Fields as keywords mean the `Scoring` made of them, None the default; never both, and no others."""
+    cameras, pool = line(range(4)), random_pool(np.random.default_rng(2), 4)
+
+    def run(**options):
+        views = lambda camera: pool[camera.name]  # noqa: E731
+        return select(scene(), cameras[1:], cameras[:1], 2, information=views, **options)
+
+    options = {"criterion": "logdet", "prior": Prior(1e-2), "weights": {"means": 0.5}}
+    assert run(**options).picks == run(scoring=Scoring(**options)).picks
+    assert run(**options).picks != run().picks
+    assert run(criterion=None, settings=None, prior=None, weights=None).picks == run().picks
+    with pytest.raises(ValueError, match="select: criterion, prior, weights must be fields of scoring, got both"):
+        run(scoring=Scoring(), **options)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'criterium'"):
+        run(criterium="eig")
+    for field in ("scoring", "prior", "settings", "weights"):
+        with pytest.raises(ValueError, match=f"select: {field} must be a"):
+            run(**{field: "logdet"})
+    with pytest.raises(
+        ValueError, match="select: method must be one of exact, columns, probes, fisherrf, got 'columnz'"
+    ):
+        Scoring(method="columnz")
 
 
 def test_result_is_json(world):

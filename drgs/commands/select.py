@@ -15,7 +15,7 @@ from drgs.guards.outputs import check_file
 
 if TYPE_CHECKING:
     from drgs.commands.options import Select
-    from drgs.information.greedy import Selection
+    from drgs.select import Selection
 
 __all__ = ["print_table", "run"]
 
@@ -27,7 +27,7 @@ def run(args: Select) -> None:
     import torch
 
     from drgs.gain import Prior
-    from drgs.select import select
+    from drgs.select import Scoring, select
 
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior(value=args.prior, relative=args.relative_prior)
@@ -41,10 +41,7 @@ def run(args: Select) -> None:
             known.cameras,
             args.k,
             args.policy,
-            criterion=args.criterion,
-            settings=scene.settings,
-            method=args.method,
-            prior=prior,
+            scoring=Scoring(args.criterion, scene.settings, args.method, prior),
             rng=torch.Generator().manual_seed(args.seed),
             progress=bar.update,
         )

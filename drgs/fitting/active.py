@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.trainer import FitConfig
+    from drgs.select import Scoring
+    from drgs.settings import RenderSettings
 
 __all__ = [
     "SELECTION",
@@ -79,8 +81,7 @@ class ActiveConfig:
     pick_points: str = "auto"
 
     def __post_init__(self):
-        from drgs.fisher import METHODS
-        from drgs.gain import CRITERIA
+        from drgs.gain import CRITERIA, METHODS, Prior
         from drgs.select import POLICIES
 
         if self.add == 0:
@@ -89,13 +90,15 @@ class ActiveConfig:
         ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
         choices = {"policy": POLICIES, "criterion": CRITERIA, "method": METHODS, "pick_points": PICK_POINTS}
         check_fields("active", self, ranges, choices)
-        self.make_prior()
+        Prior(value=self.prior)
 
-    def make_prior(self):
-        """As `drgs.select` takes it."""
+    def scoring(self, settings: RenderSettings) -> Scoring:
+        """As `drgs.select` takes it, for views that are rendered with these settings."""
         from drgs.gain import Prior
+        from drgs.select import Scoring
 
-        return Prior(value=self.prior, relative=self.relative_prior)
+        prior = Prior(value=self.prior, relative=self.relative_prior)
+        return Scoring(criterion=self.criterion, settings=settings, method=self.method, prior=prior)
 
     def to_json(self) -> dict:
         """As config.json, selection.json and the checkpoint hold it."""
@@ -216,7 +219,7 @@ class ActiveViews:
         """
         from drgs.select import select
 
-        active, settings = self.active, self._config.settings
+        active = self.active
         left = [i for i in range(len(self.views)) if i not in self.chosen]
         pixels = active.info_pixels or self._config.max_pixels
         with Bar("choosing a view", len(left) + len(frames)) as bar:
@@ -226,10 +229,7 @@ class ActiveViews:
                 [at_most(frame.camera, pixels) for frame in frames],
                 1,
                 active.policy,
-                criterion=active.criterion,
-                settings=settings,
-                method=active.method,
-                prior=active.make_prior(),
+                scoring=active.scoring(self._config.settings),
                 rng=self._generator,
                 progress=bar.update,
             )

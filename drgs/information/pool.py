@@ -1,0 +1,128 @@
+"""What a policy is given, and what it returns: how views are scored, the views to choose from, the choice."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.gain import CRITERIA, METHODS, Information, Prior
+from drgs.guards.arguments import must_be
+from drgs.information.cache import Cache
+from drgs.settings import RenderSettings
+
+__all__ = ["Pick", "Pool", "Scoring", "Selection"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scoring:
+    """How much a view counts: what is computed of it, and how that becomes a number.
+
+    Attributes:
+        criterion: One of `drgs.gain.CRITERIA`; of policy `fisher` only.
+        settings: Of the renderer.
+        method: Of `drgs.fisher.diagonal`; of `fisher` only, not of `block_logdet`.
+        prior: lambda. `coverage` takes its `value`, not its `groups`.
+        weights: Group -> factor, 1 where none is given; of `fisher` and `fisherrf` only.
+    Raises:
+        ValueError: If a criterion or method is unknown, or something else is of the wrong kind.
+    """
+
+    criterion: str = CRITERIA[0]
+    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("exact"))
+    method: str = METHODS[0]
+    prior: Prior = dataclasses.field(default_factory=Prior)
+    weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        for name, known in (("criterion", CRITERIA), ("method", METHODS)):
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
+        must_be("select", "settings", self.settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')
+        must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
+        must_be("select", "weights", self.weights, Mapping, 'e.g. {"means": 0.5}')
+
+
+@dataclasses.dataclass(frozen=True)
+class Pick:
+    """A chosen candidate.
+
+    Attributes:
+        index: Place in the list of candidates.
+        name: Of its camera.
+        score: When it was picked.
+        parts: Group -> its share of the score; empty for policies without groups.
+        margin: This score minus the next best one's at that time; None when nothing else was left or the policy ranks
+            nothing. With several threads sums differ in their last digits, so that ties and near-ties may fall
+            differently from run to run.
+    """
+
+    index: int
+    name: str
+    score: float
+    parts: dict[str, float]
+    margin: float | None
+
+
+@dataclasses.dataclass
+class Selection:
+    """What a policy chose, in which order, and the scores that it chose by; `dataclasses.asdict` of it is plain JSON.
+
+    Attributes:
+        picks: In the order of picking.
+        scores: Of every candidate, before the first pick.
+        parts: Of every candidate, before the first pick: group -> share of its score.
+        unseen: Of every candidate: the share of its score from parameters that no training view has information
+            about (lambda alone decides how much they count).
+        left_out: Group -> parameters not counted because lambda = 0 and no training view has information about them.
+        evaluations: How often a candidate was scored.
+        computed: Views whose information was computed, not taken from the cache.
+        notes: What a reader of the result should know, one sentence each.
+        seconds: Wall time.
+    """
+
+    picks: list[Pick]
+    scores: list[float]
+    parts: list[dict[str, float]] = dataclasses.field(default_factory=list)
+    unseen: list[float] = dataclasses.field(default_factory=list)
+    left_out: dict[str, int] = dataclasses.field(default_factory=dict)
+    evaluations: int = 0
+    computed: int = 0
+    notes: list[str] = dataclasses.field(default_factory=list)
+    seconds: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pool:
+    """Everything that a policy may look at: the scene, the views that are known and those to choose from.
+
+    Attributes:
+        scene: As it is now.
+        candidates: Cameras to choose from, at least `k`; a policy names them by their place in this list.
+        train: Cameras whose views are known; may be empty.
+        k: How many to pick.
+        scoring: How views are scored, where the policy scores them by information.
+        rng: Where policies that draw take their numbers from.
+        cache: Where information of single views is looked up and kept; None: nowhere.
+        lazy: Whether greedy policies leave out scores that cannot win; see `drgs.information.greedy`.
+        progress: Called with (views done, views) after each view whose information is known.
+        information: Camera -> Information, in place of what `drgs.fisher` computes.
+    """
+
+    scene: Gaussians
+    candidates: Sequence[Camera]
+    train: Sequence[Camera]
+    k: int
+    scoring: Scoring
+    rng: torch.Generator
+    cache: Cache | None = None
+    lazy: bool = True
+    progress: Callable[[int, int], object] | None = None
+    information: Callable[[Camera], Information] | None = None
+
+    def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:
+        """A `Pick` with plain numbers."""
+        return Pick(int(index), self.candidates[index].name, float(score), dict(parts or {}), margin)
