@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import camera_list, check_scene
@@ -41,7 +41,7 @@ _GENERATOR = torch.Generator().manual_seed(0)
 
 
 def select(
-    gaussians: Gaussians,
+    gaussians: Scene,
     candidates: Sequence[Camera],
     train: Sequence[Camera],
     k: int = 1,
@@ -64,7 +64,7 @@ def select(
     still adds information, but less.
 
     Args:
-        gaussians: The scene as it is now.
+        gaussians: The scene as it is now: Gaussians, or a `drgs.ellipsoids.Scene`, seen at each camera's time.
         candidates: Cameras to choose from, at least k.
         train: Cameras whose views are known; may be empty if lambda is absolute and > 0.
         k: How many.
@@ -84,7 +84,8 @@ def select(
             or infinite.
     """
     started = time.perf_counter()
-    check_scene("select", gaussians, None)
+    if not isinstance(gaussians, Scene):
+        check_scene("select", gaussians, None)  # says what else it is
     candidates, train = camera_list("select", "candidates", candidates), camera_list("select", "train", train)
     if not candidates:
         raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
@@ -160,7 +161,7 @@ def _greedy(pool: Pool, function: str, **options: Hashable) -> Selection:
     def compute(camera: Camera) -> Information:
         from drgs import fisher  # loads Dr.Jit, which the other policies need not have
 
-        found = getattr(fisher, function)(pool.scene, camera, settings, **options)
+        found = getattr(fisher, function)(pool.scene.at(camera.time), camera, settings, **options)
         return {function: found} if isinstance(found, torch.Tensor) else found
 
     if pool.information:

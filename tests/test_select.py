@@ -427,6 +427,40 @@ def test_cache_knows_time_and_features():
     assert run().computed == 3
 
 
+class _Moving:
+    """Gaussians that a network of one weight moves along x."""
+
+    def __init__(self, g):
+        self.g, self.speed = g, torch.zeros(())
+
+    def at(self, time):
+        return self.g.replace(means=self.g.means + self.speed * time * torch.eye(3)[0])
+
+    def parameters(self):
+        return {**self.g.parameters(), "speed": self.speed}
+
+
+def test_scene_that_moves(world, one_thread):
+    """Each camera sees the Gaussians of its time, known views too; a weight that changes is another scene."""
+    g, train, candidates, _ = world
+    moving, cache = _Moving(g), Cache()
+    moving.speed.fill_(0.5)
+    cameras = [dataclasses.replace(candidates[0], time=t) for t in (0.0, 1.0)]
+    known = [dataclasses.replace(train[0], time=1.0)]
+    found = select(moving, cameras, known, cache=cache)
+    H = fisher.diagonal(moving.at(1.0), known)
+    for camera, score in zip(cameras, found.scores, strict=True):
+        part = fisher.diagonal(moving.at(camera.time), camera)
+        assert score == pytest.approx(information_gain(part, H).total, rel=1e-5)
+    assert found.scores[0] != pytest.approx(found.scores[1], rel=1e-2)
+    assert select(moving, cameras, known, cache=cache).computed == 0
+    moving.speed.fill_(0.25)
+    assert select(moving, cameras, known, cache=cache).computed == 3
+    other = _Moving(g)
+    other.speed = moving.speed
+    assert select(other, cameras, known, cache=cache).computed == 3
+
+
 def test_cache_does_not_keep_the_gaussians():
     """A cache outlives the state it was made for; the tensors must not."""
     g, cache = scene(), Cache()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import Information
 
 __all__ = ["Cache", "camera_key"]
@@ -21,8 +21,8 @@ class Cache:
     """Information of views, kept while the scene does not change: 4 bytes a parameter and view.
 
     Forgets everything when it is asked about another scene than last time. A scene is another one if a tensor of its
-    `parameters()` has come, gone, been replaced, or been changed in place by torch, or if its origin differs. Changes
-    behind torch's back (`.data`, NumPy views) need `invalidate`.
+    `parameters()` has come, gone, been replaced, or been changed in place by torch, or if its origin differs; one that
+    moves, also if it is another object. Changes behind torch's back (`.data`, NumPy views) need `invalidate`.
 
     Attributes:
         hits, misses: Views found and computed so far.
@@ -30,7 +30,7 @@ class Cache:
 
     def __init__(self) -> None:
         self._views: dict[Hashable, Information] = {}
-        self._scene: _Scene | None = None
+        self._scene: _State | None = None
         self.hits = self.misses = 0
 
     def __len__(self) -> int:
@@ -41,7 +41,7 @@ class Cache:
         self._views.clear()
         self._scene = None
 
-    def get(self, scene: Gaussians, key: Hashable, compute: Callable[[], Information]) -> Information:
+    def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
         """What is stored under a key for this scene, else what `compute` returns.
 
         Args:
@@ -51,7 +51,7 @@ class Cache:
         """
         if self._scene is None or not self._scene.is_still(scene):
             self.invalidate()
-            self._scene = _Scene(scene)
+            self._scene = _State(scene)
         if key not in self._views:
             self._views[key] = compute()
             self.misses += 1
@@ -60,20 +60,24 @@ class Cache:
         return self._views[key]
 
 
-class _Scene:
+class _State:
     """What a scene was when information was computed. Weak: a cache must not keep an earlier state alive."""
 
-    def __init__(self, scene: Gaussians):
+    def __init__(self, scene: Scene):
         self.parameters = {name: (weakref.ref(x), x._version) for name, x in scene.parameters().items()}
-        self.origin = scene.origin.tobytes()
+        # Gaussians are their parameters and an origin; what else another kind of scene is made of, only it knows.
+        self.origin = scene.origin.tobytes() if isinstance(scene, Gaussians) else None
+        self.itself = None if isinstance(scene, Gaussians) else weakref.ref(scene)
 
-    def is_still(self, scene: Gaussians) -> bool:
-        """Whether a scene has the same tensors, unchanged."""
-        now = scene.parameters()
-        if now.keys() != self.parameters.keys() or scene.origin.tobytes() != self.origin:
+    def is_still(self, scene: Scene) -> bool:
+        """Whether a scene has the same tensors, unchanged, and all else as it was."""
+        now = _State(scene)
+        if now.origin != self.origin or now.parameters.keys() != self.parameters.keys():
             return False
-        pairs = [(now[name], *then) for name, then in self.parameters.items()]
-        return all(then() is x and version == x._version for x, then, version in pairs)
+        if self.itself is not None and self.itself() is not scene:
+            return False
+        pairs = zip(now.parameters.values(), self.parameters.values(), strict=True)
+        return all(new() is old() and version == earlier for (new, version), (old, earlier) in pairs)
 
 
 def camera_key(camera: Camera) -> tuple:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
 from drgs.information.cache import Cache
@@ -100,7 +100,7 @@ class Pool:
     """Everything that a policy may look at: the scene, the views that are known and those to choose from.
 
     Attributes:
-        scene: As it is now.
+        scene: As it is now; the Gaussians that a camera sees are `scene.at(camera.time)`.
         candidates: Cameras to choose from, at least `k`; a policy names them by their place in this list.
         train: Cameras whose views are known; may be empty.
         k: How many to pick.
@@ -112,7 +112,7 @@ class Pool:
         information: Camera -> Information, in place of what `drgs.fisher` computes.
     """
 
-    scene: Gaussians
+    scene: Scene
     candidates: Sequence[Camera]
     train: Sequence[Camera]
     k: int
