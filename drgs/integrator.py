@@ -10,7 +10,8 @@ AD. Two `autograd.Function`s bridge torch: `_Reverse` keeps the graph of a call 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import drjit as dr
 import torch
@@ -19,7 +20,7 @@ from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import check_scene, check_view, gaussians_at
+from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
 from drgs.tracing.call import EPS_ALPHA, Output, Scene, to_drjit
 
@@ -32,22 +33,23 @@ _NAMES = {"depth": "depth", "median_depth": "median", "count": "count", "visibil
 @runtime.alone
 def render(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] = ("depth",),
 ) -> Output:
-    """Render a view.
+    """Render a view, or several of one size.
 
     Args:
         gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians at `camera.time` are seen.
-        camera: Its pose is differentiated when `camera.w2c` is a torch tensor that requires a gradient.
+        camera: Its pose is differentiated when `camera.w2c` is a torch tensor that requires a gradient. Or a list of
+            cameras of one image size.
         settings: Default `RenderSettings.preset("exact")`.
         outputs: What to compute besides rgb, alpha and features: any of `OUTPUTS`, or "all". What is not asked for
             costs nothing.
     Returns:
-        An `Output`.
+        An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
-        ValueError: If a parameter is not finite, or an output is unknown.
+        ValueError: If a parameter is not finite, an output is unknown, or cameras differ in size.
         NotImplementedError: If tiles are asked for with a camera that is no pinhole.
     Gradients:
         Of rgb, alpha, depth and features, with respect to means, quats, log_scales, logit_opacities, sh, features and
@@ -56,12 +58,26 @@ def render(
     Reference:
         Kerbl et al. 2023 (compositing, SH); Moenne-Loccoz et al. 2024 (response at the peak of the ray).
     """
+    if isinstance(camera, list | tuple):
+        cameras, wanted = cameras_of_one_size("render", camera), _wanted(outputs)
+        return _batch([_view(gaussians, each, settings, wanted) for each in cameras])
+    return _view(gaussians, camera, settings, _wanted(outputs))
+
+
+def _view(gaussians: Gaussians, camera: Camera, settings: RenderSettings | None, wanted: frozenset) -> Output:
     gaussians = gaussians_at("render", gaussians, camera)
     check_view("render", gaussians, camera, settings)
-    settings = settings or RenderSettings.preset("exact")
-    scene = Scene(gaussians, camera, settings, _wanted(outputs))
+    scene = Scene(gaussians, camera, settings or RenderSettings.preset("exact"), wanted)
     with _own_errors():
         return scene.output(_differentiable(scene))
+
+
+def _batch(views: list[Output]) -> Output:
+    """Views of one size with a leading axis."""
+    parts = {field.name: [getattr(view, field.name) for view in views] for field in dataclasses.fields(Output)}
+    certificates = parts.pop("certificate")
+    stacked = {name: None if x[0] is None else torch.stack(x) for name, x in parts.items()}
+    return Output(**stacked, certificate=certificates)
 
 
 @runtime.alone

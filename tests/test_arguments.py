@@ -37,7 +37,13 @@ LISTED = "it takes one view at a time"
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: drgs.render(G, [CAM, CAM]), rf"render: camera must be a Camera, got a list of 2 \(Camera\); {LISTED}"),
+        (lambda: drgs.render_jvp(G, [CAM, CAM], {}), rf"camera must be a Camera, got a list of 2 \(Camera\); {LISTED}"),
+        (lambda: drgs.render(G, [CAM, None]), r"render: camera\[1\] must be a Camera, got None"),
+        (lambda: drgs.render(G, []), "render: a list of cameras must have at least one, got none"),
+        (
+            lambda: drgs.render(G, [CAM, CAM, CAM.resized(8, 4)]),
+            rf"must have one image size, got {CAM.width}x{CAM.height} and camera\[2\] with 8x4; render each size",
+        ),
         (lambda: drgs.render(CAM, G), "render: gaussians must come first and the camera second"),
         (lambda: drgs.render("scene.ply", CAM), r"must be a Gaussians, got the str 'scene.ply'; drgs.load_ply"),
         (lambda: drgs.render(G.means, CAM), r"gaussians must be a Gaussians, got a Tensor of shape \(2, 3\)"),
@@ -105,6 +111,6 @@ def test_the_command_line_shows_one_line(monkeypatch, capsys):
     """An argument of the wrong kind that reaches a function from a command: exit code 2."""
     from test_cli import _command
 
-    _command(monkeypatch, "demo", lambda args: drgs.render(G, [CAM]))
+    _command(monkeypatch, "demo", lambda args: drgs.render(G, []))
     assert cli.main(["demo"]) == 2
     assert capsys.readouterr().err.count("\n") == 1

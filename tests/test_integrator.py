@@ -473,6 +473,30 @@ def test_outputs_asked_for(rng):
         render(g, cam, outputs=("normals",))
 
 
+@pytest.mark.parametrize("fields", [{}, {"traversal": "bvh", "order": "center"}])
+def test_list_of_cameras(rng, fields):
+    """A list is its views with a leading axis: bit for bit in images, to rounding in what threads add up.
+
+    Gradients and visibility are sums in an order that two threads do not fix: 1e-5 of them is float32's rounding.
+    """
+    settings, g = RenderSettings.preset("exact", **fields), gaussians(rng, 12, 4, 2)
+    cameras = [camera(rng, (9, 7)) for _ in range(2)]
+    u = torch.tensor(rng.normal(size=(2, 7, 9, 3))).float()
+    inputs = [*g.parameters().values(), *(cam.w2c for cam in cameras)]
+    every = render(g, tuple(cameras), settings, outputs="all")
+    slopes = torch.autograd.grad((u * every.rgb).sum() + every.depth.sum(), inputs, allow_unused=True)
+    single, total = [], 0.0
+    for cam, part in zip(cameras, u, strict=True):
+        single.append(render(g, cam, settings, outputs="all"))
+        total = total + (part * single[-1].rgb).sum() + single[-1].depth.sum()
+    assert len(every.certificate) == 2
+    for name in ("rgb", "alpha", "features", *OUTPUTS):
+        got, want = getattr(every, name), torch.stack([getattr(out, name) for out in single])
+        assert torch.equal(got, want) or (name == "visibility" and relative(got, want) < 1e-5), name
+    for got, want in zip(slopes, torch.autograd.grad(total, inputs, allow_unused=True), strict=True):
+        assert (got is None and want is None) or relative(got, want) < 1e-5
+
+
 # ------------------------------------------------------------------------------------- bad input
 
 

@@ -12,7 +12,15 @@ from drgs.ellipsoids import Gaussians, Scene
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.settings import RenderSettings
 
-__all__ = ["camera_list", "check_oracle", "check_path", "check_scene", "check_view", "gaussians_at"]
+__all__ = [
+    "camera_list",
+    "cameras_of_one_size",
+    "check_oracle",
+    "check_path",
+    "check_scene",
+    "check_view",
+    "gaussians_at",
+]
 
 _SCENE = "drgs.load_ply(path) or drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh) makes one"
 _CAMERA = "drgs.Camera(K=K, w2c=w2c, width=width, height=height) makes one"
@@ -55,6 +63,21 @@ def camera_list(where: str, name: str, cameras: Any) -> list[Camera]:
     cameras = list(cameras)
     for index, camera in enumerate(cameras):
         must_be(where, f"{name}[{index}]", camera, Camera, _CAMERA)
+    return cameras
+
+
+def cameras_of_one_size(where: str, cameras: Any) -> list[Camera]:
+    """A list of at least one Camera, all of one image size; the first one that differs is named."""
+    cameras = camera_list(where, "camera", cameras)
+    if not cameras:
+        raise ArgumentError(f"{where}: a list of cameras must have at least one, got none; pass one or more")
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    for index, (width, height) in enumerate(sizes):
+        if (width, height) != sizes[0]:
+            raise ArgumentError(
+                f"{where}: cameras of a list must have one image size, got {sizes[0][0]}x{sizes[0][1]} and "
+                f"camera[{index}] with {width}x{height}; render each size by itself"
+            )
     return cameras
 
 

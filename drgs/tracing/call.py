@@ -24,7 +24,7 @@ EPS_ALPHA = 1e-10
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Output:
-    """What one view shows (torch tensors; None where not asked for).
+    """What one view shows (torch tensors; None where not asked for); of a list of views with a leading axis.
 
     Attributes:
         rgb: (H, W, 3) linear blend of the colors, background included, not clamped.
@@ -34,7 +34,8 @@ class Output:
         count: (H, W) int32, composited hits.
         visibility: (N,) sum of w over all pixels; not differentiated.
         features: (H, W, D) when the Gaussians have features.
-        certificate: Of exact order: `rays`, `redone` (rays walked again, along sorted lists); `pairs` listed.
+        certificate: Of exact order: `rays`, `redone` (rays walked again, along sorted lists); `pairs` listed. Of a
+            list of views one for each.
     """
 
     rgb: torch.Tensor
@@ -44,7 +45,7 @@ class Output:
     count: torch.Tensor | None = None
     visibility: torch.Tensor | None = None
     features: torch.Tensor | None = None
-    certificate: dict = dataclasses.field(default_factory=dict)
+    certificate: dict | list[dict] = dataclasses.field(default_factory=dict)
 
 
 class Scene:
