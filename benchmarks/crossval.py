@@ -39,7 +39,7 @@ from drgs.files import load_ply  # noqa: E402
 from drgs.fitting.active import at_most  # noqa: E402
 from drgs.lab.crops import crops  # noqa: E402
 from drgs.lab.crossval import VERDICTS, crossval  # noqa: E402
-from drgs.lab.rasterizers import GROUPS, cotangents, function, load, raw_of  # noqa: E402
+from drgs.lab.rasterizers import PARAMETERS, cotangents, function, load, raw_of  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 
@@ -89,7 +89,7 @@ def heaviest(g: Gaussians, camera: Camera, count: int) -> tuple:
     """The Gaussians that weigh most in one view."""
     weight = drgs.render(g, camera, outputs=("visibility",)).visibility
     index = torch.topk(weight, min(count, len(g))).indices
-    return Gaussians(**{name: getattr(g, name)[index] for name in GROUPS}), [camera]
+    return Gaussians(**{name: getattr(g, name)[index] for name in PARAMETERS}), [camera]
 
 
 def wolf(count: int, width: int, height: int) -> tuple | None:

@@ -31,7 +31,8 @@ from drgs.data import load
 from drgs.files import Run, atomic_write
 from drgs.fitting.active import at_most
 from drgs.fitting.records import fit_record
-from drgs.lab.ladder import GROUPS, Pictures, ladder, table
+from drgs.lab.ladder import Pictures, ladder, table
+from drgs.lab.rasterizers import PARAMETERS
 from drgs.settings import RenderSettings
 
 BEGIN, END = "<!-- ladder: begin -->", "<!-- ladder: end -->"
@@ -248,7 +249,7 @@ def summary(heads: list[str], reports: list[dict], sizes: list[float]) -> list[s
         line(LABELS.get(name, name), cells)
     line("**RMS of the difference**", [f"{r['image']['total']['rms']:.1e}" for r in reports])
     line("largest difference", [f"{r['image']['total']['max']:.2f}" for r in reports])
-    for group in GROUPS:
+    for group in PARAMETERS:
         line(
             f"gradient of {group}: difference / gradient of `exact`",
             [percent(r["image"]["total"]["gradient"][group]["of_exact"]) for r in reports],

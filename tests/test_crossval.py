@@ -25,7 +25,7 @@ from drgs.files import load_ply, save_ply
 from drgs.lab import rasterizers
 from drgs.lab.crossval import crossval
 from drgs.lab.differences import _extrapolated, central
-from drgs.lab.rasterizers import GROUPS, function, raw_of
+from drgs.lab.rasterizers import PARAMETERS, function, raw_of
 from drgs.testing import assert_matches, random_scene
 
 BACKGROUND = (0.3, 0.6, 0.2)
@@ -54,7 +54,7 @@ CONVENTIONS = {
 def _made(seed):
     """A random scene of the broken rasterizers' own making."""
     s = torch_rasterizer.random_scene(seed)
-    g = Gaussians(**{name: s[name].float() for name in GROUPS})
+    g = Gaussians(**{name: s[name].float() for name in PARAMETERS})
     camera = Camera(K=s["K"].numpy(), w2c=s["viewmat"].numpy(), width=s["width"], height=s["height"])
     return g, [camera], tuple(float(x) for x in s["background"])
 
@@ -147,7 +147,7 @@ def test_a_real_scene(data_dir, name):
     camera = scene_orbit(g, 8, width=48, height=40, wish=Wish(fov=70, elevation=10.0))[0]
     weight = drgs.render(g, camera, outputs=("visibility",)).visibility
     index = torch.topk(weight, 250).indices
-    g = Gaussians(**{field: getattr(g, field)[index] for field in GROUPS})
+    g = Gaussians(**{field: getattr(g, field)[index] for field in PARAMETERS})
     if name == "correct":
         made = function(torch_rasterizer.rasterization, name)
         result = crossval(made, g, [camera], "gsplat", {"background": BACKGROUND})
@@ -208,11 +208,11 @@ def test_central_differences(dtype):
     assert made.dtype == dtype
     u = rasterizers.cotangents([camera], 0)[0]
     wanted = made.gradient(raw, camera, background, u)
-    entries = {name: torch.topk(wanted[name].abs().reshape(-1), 5).indices.tolist() for name in GROUPS}
+    entries = {name: torch.topk(wanted[name].abs().reshape(-1), 5).indices.tolist() for name in PARAMETERS}
     own = central(made, raw, camera, background, u, entries)
     there = made.gradient(raw, camera, background, u * own.kept[..., None])
     assert own.kept.double().mean() > 0.8
-    for name in GROUPS:
+    for name in PARAMETERS:
         assert len(own.entries[name]) >= 3
         error = (there[name].reshape(-1)[own.entries[name]] - own.values[name]).abs()
         size = own.values[name].abs().max()
@@ -304,7 +304,7 @@ def test_near_ties_are_no_difference(contrast, said, monkeypatch):
 def test_crops_show_something():
     """Of a scene too large for the oracle, each view is looked at where most is seen, and the report says so."""
     g, (camera,) = random_scene(0)
-    parts = {name: getattr(g, name) for name in GROUPS}
+    parts = {name: getattr(g, name) for name in PARAMETERS}
     many = Gaussians(**{name: x.repeat(6, *[1] * (x.dim() - 1)) for name, x in parts.items()})  # six of each
     many = many.replace(means=many.means + torch.randn(len(many), 3, generator=torch.manual_seed(0)) * 0.02)
     # A view eight times as wide and high: what is seen lies in its lower right corner.
@@ -407,7 +407,7 @@ def _dump(folder, call, name):
     """What the script for another machine writes, with a rasterizer of ours in place of gsplat."""
     with np.load(folder / "scene.npz") as file:
         s = dict(file)
-    raw = {k: torch.tensor(s[k], dtype=torch.float64).requires_grad_() for k in GROUPS}
+    raw = {k: torch.tensor(s[k], dtype=torch.float64).requires_grad_() for k in PARAMETERS}
     image, alpha, _ = call(
         raw["means"],
         raw["quats"],

@@ -11,7 +11,8 @@ import scenes_random
 import torch
 
 from drgs import integrator, reference
-from drgs.lab.ladder import GROUPS, Pictures, _detached, ladder, sequences, table
+from drgs.lab.ladder import Pictures, _detached, ladder, sequences, table
+from drgs.lab.rasterizers import PARAMETERS
 from drgs.settings import RenderSettings
 
 Preset = RenderSettings.preset
@@ -46,7 +47,7 @@ def test_shares_sum_to_one(report):
         assert by_name(part["forward"]).keys() - {"rest"} == by_name(part["reverse"]).keys()
     for rows in (*(found[p][o] for p in ("image", "crops") for o in ("forward", "reverse")), found["far"]["forward"]):
         assert sum(row["share"] for row in rows) == pytest.approx(1, abs=1e-9)
-        for name in GROUPS:
+        for name in PARAMETERS:
             assert sum(row["gradient"][name]["share"] for row in rows) == pytest.approx(1, abs=1e-9)
     assert found["image"]["total"]["rms"] > 1e-3
     json.dumps(found, allow_nan=False)

@@ -10,7 +10,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
-from drgs.lab.rasterizers import GROUPS
+from drgs.lab.rasterizers import PARAMETERS
 from drgs.settings import RenderSettings
 
 __all__ = ["crops"]
@@ -53,7 +53,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
             break
     seen = torch.stack(seen).any(0)
     index = torch.nonzero(seen)[:, 0]
-    fields = {name: getattr(g, name).detach()[index] for name in GROUPS}
+    fields = {name: getattr(g, name).detach()[index] for name in PARAMETERS}
     return Gaussians(**fields, origin=g.origin), parts, places
 
 

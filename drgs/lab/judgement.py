@@ -15,7 +15,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.lab.conventions import LEAST, Model
 from drgs.lab.differences import Differences, central
-from drgs.lab.rasterizers import GROUPS, Dump, Rasterizer
+from drgs.lab.rasterizers import PARAMETERS, Dump, Rasterizer
 
 __all__ = ["Case", "Compared", "compared", "judge"]
 
@@ -72,12 +72,12 @@ class Case:
             return dict(self.rasterizer.gradients)
         pairs = zip(self.cameras, u, strict=True)
         parts = [self.rasterizer.gradient(self.raw, camera, self.background, w) for camera, w in pairs]
-        return {name: None if parts[0][name] is None else sum(part[name] for part in parts) for name in GROUPS}
+        return {name: None if parts[0][name] is None else sum(part[name] for part in parts) for name in PARAMETERS}
 
     def ours(self, model: Model, u) -> dict:
         """The model's gradient, summed over views."""
         parts = [model.gradient(self.raw, c, w, self.oracle) for c, w in zip(self.cameras, u, strict=True)]
-        return {name: sum(part[name] for part in parts) for name in GROUPS}
+        return {name: sum(part[name] for part in parts) for name in PARAMETERS}
 
 
 @dataclasses.dataclass
@@ -116,7 +116,7 @@ def compared(case: Case, model: Model, signs, pictures, alphas, drawn, near_ties
             u = signs * ~(left | (off & agrees))[..., None]
         case.say("gradients")
         theirs, ours = case.theirs(u), case.ours(model, u)
-        groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in GROUPS}
+        groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in PARAMETERS}
         found = Compared(views, agrees, u, theirs, groups, ties, counted)
         if ties.any() or (agrees and all(row["verdict"] for row in groups.values())):
             return found

@@ -25,6 +25,7 @@ import torch
 
 from drgs import reference
 from drgs.integrator import render
+from drgs.lab.rasterizers import PARAMETERS
 from drgs.oracle import sh_colors
 from drgs.settings import RenderSettings
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["GROUPS", "RUNGS", "Pictures", "ladder", "sequences", "table"]
+__all__ = ["RUNGS", "Pictures", "ladder", "sequences", "table"]
 
 RUNGS = {
     "float32": (),
@@ -49,8 +50,6 @@ RUNGS = {
     "volume": (),
 }
 """Name of a rung -> the settings that it switches, in the order that they are switched in."""
-
-GROUPS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 _NEEDS = {"EWA": ("dilation", "culling"), "order": ("EWA",)}
 _BEYOND = ("response", "volume")
@@ -122,19 +121,19 @@ class Pictures:
         return self._made[key]
 
     def _leaves(self) -> Gaussians:
-        moving = {name: self.g.parameters()[name].clone().requires_grad_(self.gradients) for name in GROUPS}
+        moving = {name: self.g.parameters()[name].clone().requires_grad_(self.gradients) for name in PARAMETERS}
         return self.g.replace(features=None, **moving)
 
     def _state(self, g, images: list, cotangents: list) -> _State:
         gradient = {}
         if self.gradients:
             loss = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
-            leaves = [g.parameters()[name] for name in GROUPS]
+            leaves = [g.parameters()[name] for name in PARAMETERS]
             if loss.requires_grad:
                 found = torch.autograd.grad(loss, leaves, allow_unused=True)
             else:
                 found = [None] * len(leaves)
-            for name, leaf, x in zip(GROUPS, leaves, found, strict=True):
+            for name, leaf, x in zip(PARAMETERS, leaves, found, strict=True):
                 gradient[name] = torch.zeros_like(leaf) if x is None else x.detach().cpu()
         return _State(torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in images]), gradient)
 
@@ -209,7 +208,7 @@ def ladder(
         "views": len(cameras),
         "pixels": sum(c.width * c.height for c in cameras),
         "seed": seed,
-        "groups": list(GROUPS) if gradients else [],
+        "groups": list(PARAMETERS) if gradients else [],
         "image": {"total": None},
         "crops": {"windows": [list(w) for w in made.windows], "total": None},
     }

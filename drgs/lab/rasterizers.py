@@ -26,9 +26,9 @@ from drgs.guards.foreign import refuse_foreign
 from drgs.integrator import render
 from drgs.settings import PRESETS, RenderSettings
 
-__all__ = ["GROUPS", "Dump", "Rasterizer", "cotangents", "export", "is_export", "load", "raw_of"]
+__all__ = ["PARAMETERS", "Dump", "Rasterizer", "cotangents", "export", "is_export", "load", "raw_of"]
 
-GROUPS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # raw, as crossval and the ladder compare them
 _DUMPS = (".npz", ".safetensors")
 _EXPORT = "drgs_export"  # an array by which an export can be told from a dump, which holds more
 _LARGEST = 4 << 30  # bytes of a dump
@@ -97,7 +97,7 @@ class Dump:
 
 def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
     """Raw parameters in float64, world frame: what is differentiated."""
-    raw = {name: getattr(g, name).detach().double().cpu() for name in GROUPS}
+    raw = {name: getattr(g, name).detach().double().cpu() for name in PARAMETERS}
     raw["means"] = raw["means"] + torch.tensor(np.asarray(g.origin, float))
     return raw
 
@@ -309,7 +309,7 @@ def _dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple) ->
     scene = scene_arrays(g, cameras, background)
     count, size = len(cameras), (cameras[0].height, cameras[0].width)
     shapes = {"image": (*size, 3), "alpha": size, "cotangent": (*size, 3)}
-    names = [*shapes, *(f"grad_{name}" for name in GROUPS), *scene]
+    names = [*shapes, *(f"grad_{name}" for name in PARAMETERS), *scene]
     if missing := [name for name in names if name not in found]:
         raise ValueError(f"{path}: must hold {', '.join(names)}; {missing[0]} is missing; write it anew from --export")
     for name, array in found.items():
@@ -331,12 +331,12 @@ def _dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple) ->
         if got.shape != (count, *shape):
             raise ValueError(f"{path}: {name} must have shape {(count, *shape)}, got {found[name].shape}")
         found[name] = got
-    for name in GROUPS:
+    for name in PARAMETERS:
         if found[f"grad_{name}"].shape != scene[name].shape:
             wanted, got = scene[name].shape, found[f"grad_{name}"].shape
             raise ValueError(f"{path}: grad_{name} must have shape {wanted}, got {got}")
     as_tensor = {name: torch.tensor(found[name], dtype=torch.float64) for name in names if name not in scene}
-    gradients = {name: as_tensor[f"grad_{name}"] for name in GROUPS}
+    gradients = {name: as_tensor[f"grad_{name}"] for name in PARAMETERS}
     return Dump(str(path), as_tensor["image"], as_tensor["alpha"], as_tensor["cotangent"], gradients)
 
 
