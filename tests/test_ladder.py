@@ -11,7 +11,8 @@ import scenes_random
 import torch
 
 from drgs import integrator, reference
-from drgs.lab.ladder import Pictures, _detached, ladder, sequences, table
+from drgs.lab.ladder import Pictures, ladder, sequences, table
+from drgs.lab.ladder_pictures import constant_colors
 from drgs.lab.rasterizers import PARAMETERS
 from drgs.settings import RenderSettings
 
@@ -174,7 +175,7 @@ def test_detached_direction(rng):
     for detached in (False, True):
         means, sh = (x.clone().requires_grad_() for x in (g.means, g.sh))
         moving = g.replace(means=means, sh=sh)
-        out = integrator.render(_detached(moving, cam) if detached else moving, cam, EXACT).rgb.double()
+        out = integrator.render(constant_colors(moving, cam) if detached else moving, cam, EXACT).rgb.double()
         grads.append((out.detach(), *torch.autograd.grad((out * u).sum(), (means, sh))))
     (image, means, sh), (same, without, sh_too) = grads
     torch.testing.assert_close(same, image, rtol=0, atol=1e-6)
