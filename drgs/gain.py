@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping
 import torch
 
 from drgs.guards.arguments import must_be
+from drgs.information.chain import Chain, dense
 
 __all__ = [
     "BLOCK_LAYOUT",
@@ -39,7 +40,6 @@ __all__ = [
 
 Information = Mapping[str, torch.Tensor]
 
-CRITERIA = ("eig", "logdet", "trace_cov", "block_logdet")  # the first is the default everywhere
 METHODS = ("exact", "columns", "probes", "fisherrf")  # of `drgs.fisher.diagonal`; here, for that loads Dr.Jit
 
 BLOCK_LAYOUT = {
@@ -56,7 +56,6 @@ BLOCKS = "blocks"
 
 _ROUNDING = 1e-6  # relative to the diagonal: what float32 sums leave of an eigenvalue that is 0, on a real scene
 _CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is twice as fast
-_SINGULAR = 1e-13  # of a column's length: what float64 leaves of a column that depends on the others
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,6 +198,28 @@ def check(where: str, information: Information, criterion: str = "eig") -> None:
         )
 
 
+# -------------------------------------------------- parameters taken as independent
+
+
+def _eig(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    return ratio
+
+
+def _logdet(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    return ratio.log1p_()
+
+
+def _trace_cov(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    # 1/a - 1/(a + c) = (1/a) / (1 + a/c): no difference of nearly equal numbers; c = 0 gives 1 / inf.
+    return ratio.reciprocal_().add_(1).reciprocal_().mul_(variance)
+
+
+# Criterion -> what a parameter adds, of Hc / (H + l), which it may overwrite, and 1 / (H + l); float64.
+_TERMS = {"eig": _eig, "logdet": _logdet, "trace_cov": _trace_cov}
+CRITERIA = (*_TERMS, "block_logdet")
+"""Names of the criteria; the first is the default everywhere."""
+
+
 class _Diagonal:
     """Scores of candidates against a diagonal H."""
 
@@ -220,7 +241,7 @@ class _Diagonal:
                 f"information_gain: candidate must have the groups of train, {', '.join(self.inverse)}, got "
                 f"{', '.join(candidate)}; compute both alike"
             )
-        parts, unseen = {}, {}
+        parts, unseen, terms_of = {}, {}, _TERMS[self.criterion]
         for name, variance in self.inverse.items():
             Hc, weight = candidate[name], float(self.weights.get(name, 1.0))
             if Hc.shape != variance.shape:
@@ -228,12 +249,13 @@ class _Diagonal:
                     f"information_gain: {name} must have the shape of train, {tuple(variance.shape)}, got "
                     f"{tuple(Hc.shape)}; use the same Gaussians for both"
                 )
-            sums = [0.0, 0.0]
-            for one in zip(*(x.flatten().split(_CHUNK) for x in (Hc, variance, self.unseen[name])), strict=True):
-                value = self._values(*one[:2])
-                sums[0] += float(value.sum())
-                sums[1] += float(value @ one[2])
-            parts[name], unseen[name] = weight * sums[0], weight * sums[1]
+            seen_or_not = only_unseen = 0.0
+            chunks = (x.flatten().split(_CHUNK) for x in (Hc, variance, self.unseen[name]))
+            for new, known, is_unseen in zip(*chunks, strict=True):
+                terms = terms_of(new.to(torch.float64, copy=True).mul_(known), known)
+                seen_or_not += float(terms.sum())
+                only_unseen += float(terms @ is_unseen)
+            parts[name], unseen[name] = weight * seen_or_not, weight * only_unseen
         total = math.fsum(parts.values()) if all(map(math.isfinite, parts.values())) else math.nan
         if not math.isfinite(total):
             raise ValueError(
@@ -241,16 +263,6 @@ class _Diagonal:
                 "raise lambda or check the information for NaN"
             )
         return Gain(total, parts, dict(self.left_out), unseen)
-
-    def _values(self, Hc: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-        """The criterion's terms, float64, whatever Hc is."""
-        ratio = Hc.to(torch.float64, copy=True).mul_(variance)
-        if self.criterion == "logdet":
-            return ratio.log1p_()
-        if self.criterion == "trace_cov":
-            # 1/a - 1/(a + c) = (1/a) / (1 + a/c): no difference of nearly equal numbers; c = 0 gives 1 / inf.
-            return ratio.reciprocal_().add_(1).reciprocal_().mul_(variance)
-        return ratio
 
 
 # -------------------------------------------------- one block a Gaussian
@@ -340,73 +352,3 @@ class _Blocks:
         gains = after - self.before
         total, unseen = float(gains.sum()), float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())
         return Gain(total, {BLOCKS: total}, dict(self.left_out), {BLOCKS: unseen}, self.repaired + repaired)
-
-
-# -------------------------------------------------- everything, on scenes where it fits
-
-
-@dataclasses.dataclass(frozen=True)
-class Chain:
-    """From the exact expected information gain of a linear model to what is computed on real scenes, all in nats.
-
-    Attributes:
-        mutual_information: 0.5 logdet(I + R^-T Hc R^-1), R^T R = H + L, full matrices.
-        trace_bound: 0.5 tr((H + L)^-1 Hc) >= mutual_information.
-        block_logdet: 0.5 sum_b logdet(I + (H_b + L_b)^-1 Hc_b) over the diagonal blocks, None without labels.
-        logdet, eig: 0.5 times the criteria of the diagonals. Neither bounds the two above.
-        left_out: Parameters with lambda = 0 that no training row moves.
-    """
-
-    mutual_information: float
-    trace_bound: float
-    block_logdet: float | None
-    logdet: float
-    eig: float
-    left_out: int
-
-
-def dense(candidate: torch.Tensor, train: torch.Tensor, prior, labels: torch.Tensor | None = None) -> Chain:
-    """The chain of [1], section 3.3, from whole Jacobians: P up to a few thousand.
-
-    Args:
-        candidate, train: (M, P) and (M', P) Jacobians, one row a pixel and channel.
-        prior: lambda, a number or (P,).
-        labels: (P,) integers, the block each parameter belongs to.
-    Raises:
-        ValueError: If a shape is wrong, or H + lambda is singular after leaving out what no row moves.
-    """
-    Jc, J = candidate.to(torch.float64), train.to(torch.float64)
-    if Jc.ndim != 2 or J.ndim != 2 or Jc.shape[1] != J.shape[1]:
-        raise ValueError(
-            f"dense: candidate and train must be (M, P) and (M', P), got {tuple(Jc.shape)} and {tuple(J.shape)}; "
-            "one column a parameter"
-        )
-    added = torch.as_tensor(prior, dtype=torch.float64).expand(J.shape[1])
-    keep = (J != 0).any(0) | (added > 0)
-    Jc, J, added = Jc[:, keep], J[:, keep], added[keep]
-    # R from the rows themselves: H = J^T J would square the condition number.
-    rows = torch.cat([J, added.sqrt().diag()])
-    length = rows.norm(dim=0)
-    R = torch.linalg.qr(rows / length, mode="r")[1]
-    if len(R) and not bool((R.diagonal().abs() > _SINGULAR).all()):
-        raise ValueError(
-            "dense: H + lambda must be positive definite, got parameters that training rows cannot tell apart; "
-            "use lambda > 0"
-        )
-    whitened = torch.linalg.solve_triangular(R, Jc / length, upper=True, left=False)
-    spectrum = torch.linalg.svdvals(whitened).square()
-    H, Hc = J.square().sum(0) + added, Jc.square().sum(0)
-    ratio, blocks = Hc / H, None
-    if labels is not None:
-        labels, blocks = torch.as_tensor(labels)[keep], 0.0
-        for label in labels.unique():
-            one = labels == label
-            blocks += dense(Jc[:, one], J[:, one], added[one]).mutual_information
-    return Chain(
-        mutual_information=0.5 * float(spectrum.log1p().sum()),
-        trace_bound=0.5 * float(spectrum.sum()),
-        block_logdet=blocks,
-        logdet=0.5 * float(ratio.log1p().sum()),
-        eig=0.5 * float(ratio.sum()),
-        left_out=int((~keep).sum()),
-    )

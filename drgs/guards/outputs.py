@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
 import logging
 import os
@@ -20,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from drgs.guards import locks, unfinished
+from drgs.guards.authors import author_of, fingerprint, is_log, is_there
 
 __all__ = [
     "Claim",
@@ -31,13 +31,10 @@ __all__ = [
 ]
 
 JOURNAL = ".drgs.jsonl"
-_MAX_JSON = 64 << 20
-_LARGE = 1 << 20
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 _log = logging.getLogger(__name__)
 _claims: dict[Path, Claim] = {}
-_hashes: dict[tuple, str] = {}  # of checkpoints, which are moved and linked
 
 
 class Claim:
@@ -91,11 +88,11 @@ class Claim:
         if not path.is_symlink() and not path.is_file():
             return False
         made = self._made.get(path.relative_to(self.path).as_posix())
-        command = made.get(_hash(path)) if made else None
+        command = made.get(fingerprint(path)) if made else None
         if command is None and path.suffix == ".json":
-            command = _author(path)
+            command = author_of(path)
             command = command if command == self.command else None
-        if command is None and path.suffix == ".jsonl" and _is_log(path):
+        if command is None and path.suffix == ".jsonl" and is_log(path):
             command = self.command
         return command is not None and (by is None or command in by)
 
@@ -107,7 +104,7 @@ class Claim:
             content: A file or link with the same content.
             command: Default the one that holds the folder.
         """
-        row = {"file": name, "sha256": _hash(Path(content)), "command": command or self.command}
+        row = {"file": name, "sha256": fingerprint(Path(content)), "command": command or self.command}
         known = self._made.setdefault(name, {})
         if known.get(row["sha256"]) == row["command"]:
             return
@@ -205,7 +202,7 @@ class Claim:
                 rows.append(row)
                 self._made.setdefault(row["file"], {})[row["sha256"]] = row["command"]
         if len(rows) > 2 * len(self._made) + 100:
-            kept = [row for row in rows if _is_there(self.path / row["file"], row["sha256"])]
+            kept = [row for row in rows if is_there(self.path / row["file"], row["sha256"])]
             with replacing(path, claimed=False) as name:
                 Path(name).write_text("".join(json.dumps(row) + "\n" for row in kept))
 
@@ -262,7 +259,7 @@ def check_file(
         raise ValueError(f"{path}: must be a file, is a folder; name a file in it")
     if os.path.lexists(path):
         _refuse_inputs(path, [Path(os.path.realpath(x)) for x in inputs if os.path.exists(x)])
-        if path.is_symlink() or not (is_made(path) if is_made else _author(path) == command):
+        if path.is_symlink() or not (is_made(path) if is_made else author_of(path) == command):
             raise ValueError(
                 f"{path}: must not be replaced, `drgs {command}` did not make it; move it away or choose another output"
             )
@@ -372,42 +369,3 @@ def _refuse_inputs(target: Path, inputs: list[Path]) -> None:
 def _claim_of(folder: Path) -> Claim | None:
     """The innermost claim that a folder is in."""
     return next((_claims[x] for x in (folder, *folder.parents) if x in _claims), None)
-
-
-def _hash(path: Path) -> str:
-    if path.is_symlink():
-        return f"link to {os.readlink(path)}"
-    status = path.stat()
-    key = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
-    if key in _hashes:
-        return _hashes[key]
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if status.st_size > _LARGE:  # small ones are quick, and might be replaced within a tick of the clock
-        _hashes[key] = digest
-    return digest
-
-
-def _is_there(path: Path, digest: str) -> bool:
-    return os.path.lexists(path) and not (path.is_dir() and not path.is_symlink()) and _hash(path) == digest
-
-
-def _author(path: Path) -> str | None:
-    """The command that a JSON file of ours says it is of."""
-    try:
-        if path.stat().st_size > _MAX_JSON:
-            return None
-        value = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return None
-    return value.get("command") if isinstance(value, dict) and isinstance(value.get("schema"), int) else None
-
-
-def _is_log(path: Path) -> bool:
-    """Whether the first line is an event of `drgs.files.Run.log`."""
-    try:
-        with path.open("rb") as file:
-            value = json.loads(file.readline(_MAX_JSON))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(value, dict) and isinstance(value.get("schema"), int) and "event" in value
