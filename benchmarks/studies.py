@@ -23,8 +23,8 @@ from drgs import runtime  # noqa: E402
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
 from drgs.fitting.active import initial_views  # noqa: E402
-from drgs.fitting.density import Model  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.trainer import FitConfig, Trainer  # noqa: E402
 
 __all__ = [
@@ -76,7 +76,7 @@ def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") ->
     dense = any(view.depth_path is not None for view in views_seen)
     import torch
 
-    model = Model.from_points(
+    model = GaussianRows.from_points(
         torch.from_numpy(points),
         torch.from_numpy(colors),
         config.dense_opacity if dense else config.initial_opacity,
@@ -94,7 +94,7 @@ def continued(trainer: Trainer, frames: list, steps: int, seed: int = 0) -> Trai
     """A copy of a fit that goes on with other frames: schedule stretched, no density control, another order."""
     tensors, _ = trainer.state()
     config = dataclasses.replace(trainer.config, max_steps=trainer.config.max_steps + steps, refine_stop=0.0, seed=seed)
-    copy = Trainer(config, frames, Model.from_state({k: v.clone() for k, v in tensors.items()}), trainer.extent)
+    copy = Trainer(config, frames, GaussianRows.from_state({k: v.clone() for k, v in tensors.items()}), trainer.extent)
     copy.step_index = trainer.config.max_steps
     for _ in range(steps):
         copy.step()

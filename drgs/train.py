@@ -25,9 +25,9 @@ from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveConfig, ActiveViews
-from drgs.fitting.density import Model
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
+from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import FitConfig, Trainer
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
@@ -136,7 +136,7 @@ def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resum
     run.start(recorded, resume=resume)
     if plan:
         plan.write(run)  # forgets picks that no checkpoint knows of
-    run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.model))
+    run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.rows))
     loop = _Loop(run, trainer, held_out, source, seconds, plan)
     with _fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
@@ -178,7 +178,7 @@ def _start(
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
     dense = not given and any(view.depth_path is not None for view in views)
-    model = Model.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))
+    model = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))
     _log.info("%d initial points: %s", len(points), source)
     return Trainer(config, frames, model, extent), source
 
@@ -242,7 +242,7 @@ class _Loop:
                 if row["psnr"] is not None:
                     self._psnr = 0.98 * (self._psnr or row["psnr"]) + 0.02 * row["psnr"]
                 shown = "" if self._psnr is None else f"{self._psnr:.2f} dB, "
-                bar.update(done, text=f"{shown}{len(trainer.model)} Gaussians")
+                bar.update(done, text=f"{shown}{len(trainer.rows)} Gaussians")
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
                 if done % config.save_every == 0 and done < config.max_steps:
@@ -297,7 +297,7 @@ class _Loop:
                 step=done,
                 loss=float(np.mean(loss)) if loss else None,
                 psnr=float(np.mean(psnr)) if psnr else None,
-                gaussians=len(self.trainer.model),
+                gaussians=len(self.trainer.rows),
                 seconds=self.seconds,
             )
             self._recent = []
@@ -317,10 +317,10 @@ class _Loop:
                 pair = torch.cat([frame.image(), image], dim=1)
                 write_png(self.run_folder.renders / _preview_name(done), pair.numpy())
         psnr = float(np.mean(values)) if self.held_out else None
-        self.run_folder.log("preview", step=done, test_psnr=psnr, gaussians=len(trainer.model), seconds=self.seconds)
+        self.run_folder.log("preview", step=done, test_psnr=psnr, gaussians=len(trainer.rows), seconds=self.seconds)
         shown = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
         total = trainer.config.max_steps
-        bar.note(f"step {done} of {total}: {len(trainer.model)} Gaussians{shown}, {self.seconds:.0f} s")
+        bar.note(f"step {done} of {total}: {len(trainer.rows)} Gaussians{shown}, {self.seconds:.0f} s")
 
 
 @contextlib.contextmanager

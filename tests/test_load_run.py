@@ -100,3 +100,19 @@ def test_edited_ply_is_told_of(run, caplog):  # noqa: F811
     assert equal(load_run(run).gaussians, g)
     assert len(caplog.messages) == 2
     assert all("point_cloud.ply: does not hold what state.safetensors holds" in x for x in caplog.messages)
+
+
+def test_a_run_holds_features_and_networks(run, caplog):  # noqa: F811
+    """What a PLY has no room for comes from the checkpoint."""
+    tensors, header = load_state(run.state)
+    features, gain = torch.rand(len(tensors["parameter.means"]), 4), torch.rand(3)
+    more = {"parameter.features": features, "affine.parameter.gain": gain, "affine.adam.gain.exp_avg": gain / 2}
+    save_state(run.state, tensors | more, header | {"networks": ["affine"]})
+    loaded = load_run(run)
+    assert torch.equal(loaded.gaussians.features, features)
+    assert loaded.networks.keys() == {"affine"}
+    assert {name: x.tolist() for name, x in loaded.networks["affine"].items()} == {"gain": gain.tolist()}
+    assert not caplog.text
+    save_state(run.state, tensors | {"parameter.features": features[1:]}, header)
+    assert load_run(run).gaussians.features is None
+    assert "parameter.features must be torch.float32 of shape" in caplog.text

@@ -19,9 +19,9 @@ from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.checks import read_image
 from drgs.data.points import read_point_ply
 from drgs.files import SCHEMA, Run, load_ply, load_state, save_ply, save_state
-from drgs.fitting.density import Model
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint, fitted_views
+from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import FitConfig, Trainer
 
 
@@ -101,7 +101,7 @@ def test_llff(tmp_path, damage):
 def test_ply(tmp_path, damage):
     """100 damaged versions of Gaussians and of points each."""
     path = tmp_path / "a.ply"
-    save_ply(Model.from_points(torch.rand(5, 3), torch.rand(5, 3)).gaussians().detach(), path)
+    save_ply(GaussianRows.from_points(torch.rand(5, 3), torch.rand(5, 3)).gaussians().detach(), path)
     whole = path.read_bytes()
     head = whole.index(b"end_header") + 12
     for read in (load_ply, read_point_ply):
@@ -141,7 +141,7 @@ def test_checkpoints(tmp_path, damage):
     cameras = orbit((0, 0, 0), 3.0, 3, width=8, height=6)
     frames = [Frame(f"v{i}", camera, torch.zeros(6, 8, 3)) for i, camera in enumerate(cameras)]
     config = FitConfig(max_steps=50)
-    trainer = Trainer(config, frames, Model.from_points(torch.rand(9, 3), torch.rand(9, 3)), 1.0)
+    trainer = Trainer(config, frames, GaussianRows.from_points(torch.rand(9, 3), torch.rand(9, 3)), 1.0)
     trainer.step()
     tensors, header = trainer.state()
     header |= {"seconds": 1.0, "point_source": "x"}

@@ -19,9 +19,11 @@ from drgs.data.views import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state
-from drgs.fitting.density import Model, add_gaussians, divide, explore, relocate
+from drgs.fitting.density import add_gaussians, divide, explore, relocate
 from drgs.fitting.frames import Frame, load_frames
-from drgs.fitting.losses import photometric_loss, ssim, ssim_map
+from drgs.fitting.losses import Outside, Photometric, ssim, ssim_map
+from drgs.fitting.rows import GaussianRows
+from drgs.integrator import Output
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 32
@@ -67,7 +69,7 @@ def config(**fields):
 def trainer_of(dataset, cfg):
     frames = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask)
     points, colors = torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors)
-    return Trainer(cfg, frames, Model.from_points(points, colors, cfg.initial_opacity), 3.0)
+    return Trainer(cfg, frames, GaussianRows.from_points(points, colors, cfg.initial_opacity), 3.0)
 
 
 def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
@@ -261,24 +263,25 @@ def test_images_are_reduced_with_their_cameras(dataset):
     assert frame.camera.K[0, 0] == pytest.approx(dataset.views[0].camera.K[0, 0] * 17 / SIZE)
 
 
-def test_bad_gradients_skip_the_step_and_ten_end_the_fit(dataset, monkeypatch):
+def test_bad_gradients_skip_the_step_and_ten_end_the_fit(dataset):
     """A NaN costs one step, leaves no trace in parameters, and is counted; ten in a row end the fit."""
     trainer = trainer_of(dataset, config(noise=0.0))
-    real = Trainer._loss
+    good = trainer.terms
 
-    def bad(self, frame, out):
-        return real(self, frame, out) * math.nan
+    class Bad(Photometric):
+        def __call__(self, output, frame, gaussians):
+            return super().__call__(output, frame, gaussians) * math.nan
 
     trainer.step()
     before = trainer.gaussians().means.clone()
-    monkeypatch.setattr(Trainer, "_loss", bad)
+    trainer.terms = [Bad(0.2)]
     row = trainer.step()
     assert [e["event"] for e in row["events"] if e["event"] == "skipped"] == ["skipped"]
     assert torch.equal(before, trainer.gaussians().means)
-    monkeypatch.setattr(Trainer, "_loss", real)
+    trainer.terms = good
     trainer.step()
     assert trainer.bad_steps == 1
-    monkeypatch.setattr(Trainer, "_loss", bad)
+    trainer.terms = [Bad(0.2)]
     for _ in range(9):
         trainer.step()
     with pytest.raises(ValueError, match="fit: loss and gradients must be finite, were not for 10 steps in a row"):
@@ -311,55 +314,55 @@ def test_division_keeps_center_and_integral(n):
         assert float(torch.trapezoid(copies, x)) == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-9)
 
 
-def random_model(n=30, dead=10):
+def random_rows(n=30, dead=10):
     g = scene(n)
-    model = Model.from_points(g.means, torch.full((n, 3), 0.5), opacity=0.8)
+    rows = GaussianRows.from_points(g.means, torch.full((n, 3), 0.5), opacity=0.8)
     with torch.no_grad():
-        model.tensors["log_scales"].copy_(g.log_scales)
-        model.tensors["quats"].copy_(g.quats)
-        model.tensors["sh_dc"].copy_(g.sh)
-        model.tensors["logit_opacities"][:dead] = -9.0
-    for x in model.tensors.values():
+        rows.tensors["log_scales"].copy_(g.log_scales)
+        rows.tensors["quats"].copy_(g.quats)
+        rows.tensors["sh_dc"].copy_(g.sh)
+        rows.tensors["logit_opacities"][:dead] = -9.0
+    for x in rows.tensors.values():
         x.grad = torch.ones_like(x)
-    model.set_rates(dict.fromkeys(model.tensors, 0.0))
-    model.optimizer.step()
-    return model
+    rows.set_rates(dict.fromkeys(rows.tensors, 0.0))
+    rows.optimizer.step()
+    return rows
 
 
 @pytest.mark.parametrize("kind", ["relocate", "add"])
 def test_relocation_keeps_the_picture(kind):
     """Dead Gaussians move, or new ones come, and alpha stays within 0.05 (mean; measured: 0.01)."""
-    model, camera = random_model(), orbit((0, 0, 0), 3.0, 1, width=SIZE, height=SIZE)[0]
-    before = drgs.render(model.gaussians().detach(), camera, FAST)
+    rows, camera = random_rows(), orbit((0, 0, 0), 3.0, 1, width=SIZE, height=SIZE)[0]
+    before = drgs.render(rows.gaussians().detach(), camera, FAST)
     generator = torch.Generator().manual_seed(0)
     if kind == "relocate":
-        assert relocate(model, 0.005, 0.01, generator) == 10
-        assert relocate(model, 0.005, 0.01, generator) == 0
-        assert len(model) == 30
+        assert relocate(rows, 0.005, 0.01, generator) == 10
+        assert relocate(rows, 0.005, 0.01, generator) == 0
+        assert len(rows) == 30
     else:
-        assert add_gaussians(model, 12, 0.005, 0.01, generator) == 12
-        assert len(model) == 42
-    after = drgs.render(model.gaussians().detach(), camera, FAST)
+        assert add_gaussians(rows, 12, 0.005, 0.01, generator) == 12
+        assert len(rows) == 42
+    after = drgs.render(rows.gaussians().detach(), camera, FAST)
     assert float((after.alpha - before.alpha).abs().mean()) < 0.05
     assert float((after.rgb - before.rgb).abs().mean()) < 0.05
 
 
 def test_copies_are_jittered_and_start_without_moments():
     """No two Gaussians coincide, and moments are 0 exactly where something was replaced or added."""
-    model = random_model()
-    source_opacity = model.tensors["logit_opacities"].detach().clone()
-    relocate(model, 0.005, 0.1, torch.Generator().manual_seed(0))
-    means = model.tensors["means"].detach()
+    rows = random_rows()
+    source_opacity = rows.tensors["logit_opacities"].detach().clone()
+    relocate(rows, 0.005, 0.1, torch.Generator().manual_seed(0))
+    means = rows.tensors["means"].detach()
     assert float(torch.pdist(means).min()) > 1e-4
-    first = model.optimizer.state[model.tensors["means"]]["exp_avg"]
+    first = rows.optimizer.state[rows.tensors["means"]]["exp_avg"]
     assert torch.equal(first[:10], torch.zeros(10, 3))
     assert bool((first[10:] != 0).all())
-    divided = (model.tensors["logit_opacities"].detach() != source_opacity)[10:]
-    opacity_moment = model.optimizer.state[model.tensors["logit_opacities"]]["exp_avg_sq"][10:]
+    divided = (rows.tensors["logit_opacities"].detach() != source_opacity)[10:]
+    opacity_moment = rows.optimizer.state[rows.tensors["logit_opacities"]]["exp_avg_sq"][10:]
     assert torch.equal(opacity_moment == 0, divided)
-    add_gaussians(model, 5, 0.005, 0.1, torch.Generator().manual_seed(0))
-    for x in model.tensors.values():
-        state = model.optimizer.state[x]
+    add_gaussians(rows, 5, 0.005, 0.1, torch.Generator().manual_seed(0))
+    for x in rows.tensors.values():
+        state = rows.optimizer.state[x]
         assert state["exp_avg"].shape == x.shape
         if x.numel():
             assert not state["exp_avg"][-5:].any()
@@ -368,22 +371,22 @@ def test_copies_are_jittered_and_start_without_moments():
 def test_density_control_without_anything_to_do():
     """No Gaussian dead, all dead, or none to add: nothing happens."""
     generator = torch.Generator().manual_seed(0)
-    assert relocate(random_model(dead=0), 0.005, 0.1, generator) == 0
-    assert relocate(random_model(5, dead=5), 0.005, 0.1, generator) == 0
-    assert add_gaussians(random_model(), -3, 0.005, 0.1, generator) == 0
+    assert relocate(random_rows(dead=0), 0.005, 0.1, generator) == 0
+    assert relocate(random_rows(5, dead=5), 0.005, 0.1, generator) == 0
+    assert add_gaussians(random_rows(), -3, 0.005, 0.1, generator) == 0
 
 
 def test_noise_moves_only_the_transparent():
     """Opaque Gaussians stay where the gradient put them, whatever the unit of length."""
     moved = []
     for unit in (1.0, 1000.0):
-        model = random_model()
+        rows = random_rows()
         with torch.no_grad():
-            model.tensors["means"] *= unit
-            model.tensors["log_scales"] += math.log(unit)
-        before = model.tensors["means"].detach().clone()
-        explore(model, 1.6e-4, 5.0 * unit, 5e5, torch.Generator().manual_seed(0))
-        moved.append((model.tensors["means"].detach() - before) / unit)
+            rows.tensors["means"] *= unit
+            rows.tensors["log_scales"] += math.log(unit)
+        before = rows.tensors["means"].detach().clone()
+        explore(rows, 1.6e-4, 5.0 * unit, 5e5, torch.Generator().manual_seed(0))
+        moved.append((rows.tensors["means"].detach() - before) / unit)
     assert torch.equal(moved[0][10:], torch.zeros(20, 3))
     assert bool((moved[0][:10] != 0).all())
     assert torch.allclose(moved[0], moved[1], rtol=1e-3, atol=1e-6)
@@ -391,28 +394,28 @@ def test_noise_moves_only_the_transparent():
 
 def test_growing_the_degree_keeps_rows_and_moments():
     """New SH coefficients are 0, old ones and their moments stay."""
-    model = random_model()
-    model.raise_sh_degree()
+    rows = random_rows()
+    rows.raise_sh_degree()
     with torch.no_grad():
-        model.tensors["sh_rest"].copy_(torch.randn(30, 3, 3))
-    old = model.tensors["sh_rest"].detach().clone()
-    model.raise_sh_degree()
-    assert (model.sh_degree, model.gaussians().sh.shape) == (2, (30, 9, 3))
-    assert torch.equal(model.tensors["sh_rest"].detach()[:, :3], old)
-    assert not model.tensors["sh_rest"].detach()[:, 3:].any()
-    model.raise_sh_degree()
-    assert model.sh_degree == 3
+        rows.tensors["sh_rest"].copy_(torch.randn(30, 3, 3))
+    old = rows.tensors["sh_rest"].detach().clone()
+    rows.raise_sh_degree()
+    assert (rows.sh_degree, rows.gaussians().sh.shape) == (2, (30, 9, 3))
+    assert torch.equal(rows.tensors["sh_rest"].detach()[:, :3], old)
+    assert not rows.tensors["sh_rest"].detach()[:, 3:].any()
+    rows.raise_sh_degree()
+    assert rows.sh_degree == 3
 
 
 def test_initial_scales_are_neighbor_distances():
     """sqrt(mean squared distance to the 3 nearest), as 3DGS; coincident points stay apart from 0."""
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [9, 9, 9], [9, 9, 9]])
-    model = Model.from_points(points, torch.zeros(6, 3))
-    scales = model.tensors["log_scales"].detach().exp()[:, 0]
+    rows = GaussianRows.from_points(points, torch.zeros(6, 3))
+    scales = rows.tensors["log_scales"].detach().exp()[:, 0]
     assert float(scales[0]) == pytest.approx(math.sqrt(14 / 3), rel=1e-5)
-    same = Model.from_points(torch.zeros(5, 3), torch.zeros(5, 3)).tensors["log_scales"]
+    same = GaussianRows.from_points(torch.zeros(5, 3), torch.zeros(5, 3)).tensors["log_scales"]
     assert bool(torch.isfinite(same).all())
-    assert torch.isfinite(Model.from_points(torch.zeros(1, 3), torch.zeros(1, 3)).tensors["log_scales"]).all()
+    assert torch.isfinite(GaussianRows.from_points(torch.zeros(1, 3), torch.zeros(1, 3)).tensors["log_scales"]).all()
 
 
 # ---- losses
@@ -449,10 +452,12 @@ def test_loss_sees_only_the_mask(rng):
     mask = torch.zeros(20, 20)
     mask[:10] = 1
     rgb.requires_grad_()
-    photometric_loss(rgb, target * mask[..., None], mask=mask, alpha=alpha).backward()
+    shown, frame = Output(rgb, alpha), Frame("a", None, target, mask, is_object=True)
+    (Photometric(0.2)(shown, frame, None) + Outside(1.0)(shown, frame, None)).backward()
     assert not rgb.grad[10:].any()
     assert bool((rgb.grad[:10] != 0).any())
     assert not alpha.grad[:10].any()
     assert bool((alpha.grad[10:] > 0).all())
+    assert Outside(1.0)(shown, dataclasses.replace(frame, is_object=False), None) is None
     exact = torch.zeros(12, 12, 3)
-    assert float(photometric_loss(exact, exact)) == pytest.approx(0, abs=1e-6)
+    assert float(Photometric(0.2)(Output(exact, alpha), Frame("a", None, exact), None)) == pytest.approx(0, abs=1e-6)

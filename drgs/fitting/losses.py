@@ -1,4 +1,4 @@
-"""Image losses of training: L1 and structural similarity, cheap enough for two CPU cores.
+"""What a step minimizes: a list of terms, among them L1 and structural similarity, cheap enough for two CPU cores.
 
 SSIM is the training variant of 3DGS: 11x11 Gaussian window with sigma 1.5, zero padding, one value per pixel and
 channel, mean over all of them. `drgs.metrics` also reports the variant without padding that papers print.
@@ -6,48 +6,118 @@ channel, mean over all of them. `drgs.metrics` also reports the variant without 
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import torch
 
-__all__ = ["photometric_loss", "ssim", "ssim_map"]
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.trainer import FitConfig
+    from drgs.integrator import Output
+
+__all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "ssim", "ssim_map", "terms_of"]
 
 _RADIUS = 5
 _SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
 
-def photometric_loss(
-    rgb: torch.Tensor,
-    target: torch.Tensor,
-    *,
-    mask: torch.Tensor | None = None,
-    alpha: torch.Tensor | None = None,
-    ssim_weight: float = 0.2,
-    outside_weight: float = 1.0,
-) -> torch.Tensor:
-    """(1 - w) L1 + w (1 - SSIM), restricted to a mask where there is one.
+class LossTerm(Protocol):
+    """A part of what a step minimizes. `terms_of` lists those of a fit; another one is a class like those below.
 
-    Args:
-        rgb: (H, W, 3) rendered image.
-        target: (H, W, 3) photograph in [0, 1], already multiplied by `mask`.
-        mask: (H, W) in [0, 1], 1 where the photograph counts, or None. Both images are black elsewhere.
-        alpha: (H, W) rendered opacity, pushed to 0 outside the mask; None leaves what is outside free.
-        ssim_weight: w.
-        outside_weight: Weight of the mean opacity outside the mask.
-    Returns:
-        A scalar, a mean over all pixels of the image.
-    Gradients:
-        w.r.t. `rgb` and `alpha`.
+    Attributes:
+        name: Of its own among the terms of a fit.
+        outputs: What it needs of `drgs.render` besides rgb, alpha and features.
     """
-    if mask is not None:
-        rgb = rgb * mask[..., None]
-    loss = (1 - ssim_weight) * (rgb - target).abs().mean()
-    if ssim_weight:
-        loss = loss + ssim_weight * (1 - ssim(rgb, target))
-    if mask is not None and alpha is not None and outside_weight:
-        loss = loss + outside_weight * ((1 - mask) * alpha).mean()
-    return loss
+
+    name: str
+    outputs: tuple[str, ...]
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """The term for one view.
+
+        Args:
+            output: What `drgs.render` shows of `gaussians`.
+            frame: The photograph.
+            gaussians: As they are at this step; gradients reach them.
+        Returns:
+            A scalar with the term's weight in it, or None where the term has nothing to say about this view.
+        """
+
+
+def terms_of(config: FitConfig, extent: float) -> list[LossTerm]:
+    """The terms of a fit, in the order in which they are added up; `extent` of the scene is its unit of length."""
+    terms: list[LossTerm] = [Photometric(config.ssim_weight)]
+    if config.outside_weight:
+        terms.append(Outside(config.outside_weight))
+    if config.opacity_weight:
+        terms.append(Opacity(config.opacity_weight))
+    if config.scale_weight:
+        terms.append(Scale(config.scale_weight, extent))
+    return terms
+
+
+@dataclasses.dataclass(frozen=True)
+class Photometric:
+    """(1 - w) L1 + w (1 - SSIM), a mean over all pixels; both images are black outside the mask, if there is one."""
+
+    ssim_weight: float
+    name: ClassVar = "photometric"
+    outputs: ClassVar = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
+        """See `LossTerm`."""
+        rgb, target = output.rgb, frame.target()
+        if frame.mask is not None:
+            rgb = rgb * frame.mask[..., None]
+        loss = (1 - self.ssim_weight) * (rgb - target).abs().mean()
+        return loss + self.ssim_weight * (1 - ssim(rgb, target)) if self.ssim_weight else loss
+
+
+@dataclasses.dataclass(frozen=True)
+class Outside:
+    """Opacity outside the mask of an object, where nothing is; a mask of valid pixels leaves what is outside free."""
+
+    weight: float
+    name: ClassVar = "outside"
+    outputs: ClassVar = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """See `LossTerm`."""
+        if frame.mask is None or not frame.is_object:
+            return None
+        return self.weight * ((1 - frame.mask) * output.alpha).mean()
+
+
+@dataclasses.dataclass(frozen=True)
+class Opacity:
+    """Opacity of all Gaussians: those that no photograph needs become transparent, and density control moves them."""
+
+    weight: float
+    name: ClassVar = "opacity"
+    outputs: ClassVar = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
+        """See `LossTerm`."""
+        return self.weight * gaussians.opacities.mean()
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """Scales of all Gaussians, in units of the scene's extent: those that no photograph needs shrink."""
+
+    weight: float
+    extent: float
+    name: ClassVar = "scale"
+    outputs: ClassVar = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
+        """See `LossTerm`."""
+        # The weight of MCMC's authors is for scenes with an extent of about 5.
+        return self.weight * gaussians.scales.mean() * (5 / self.extent)
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -69,6 +139,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """(H, W, C) structural similarity of each window, centered at each pixel; windows are zero-padded at the border."""
+    # A measure, not a loss: its values alone.
     planes = (x.detach().permute(2, 0, 1).contiguous() for x in (image, target))
     return _ssim_parts(*planes)[-1].permute(1, 2, 0)
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.files import load_ply, load_state
-from drgs.fitting.density import Model
+from drgs.fitting.networks import saved_networks
+from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import FitConfig
 from drgs.guards.json_files import check_json, read_json
 
@@ -67,11 +68,13 @@ class LoadedRun:
         gaussians: As the last checkpoint has them, or the PLY where there is none that can be read.
         record: How they were fitted.
         step: Of the checkpoint; None where only the PLY could be read.
+        networks: What was fitted beside them, by name: what `torch.nn.Module.load_state_dict` takes.
     """
 
     gaussians: Gaussians
     record: FitRecord
     step: int | None
+    networks: dict[str, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
 
 
 def load_run(run: Run) -> LoadedRun:
@@ -88,7 +91,7 @@ def load_run(run: Run) -> LoadedRun:
     try:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
-        gaussians = Model.from_state(tensors).gaussians().detach()
+        gaussians = GaussianRows.from_state(tensors).gaussians().detach()
         gaussians.validate(str(run.state))
     except (FileNotFoundError, ValueError) as error:
         if not run.point_cloud.is_file():
@@ -108,7 +111,7 @@ def load_run(run: Run) -> LoadedRun:
             run.point_cloud,
             run.state.name,
         )
-    return LoadedRun(gaussians, record, header["step"])
+    return LoadedRun(gaussians, record, header["step"], saved_networks(tensors, header))
 
 
 def _shows(path: Path, gaussians: Gaussians) -> bool:
@@ -168,6 +171,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     """
     advice = "restore the file, or fit again in another folder"
     kind = _HEADER | ({"active": _ACTIVE} if header.get("active") is not None else {})
+    kind |= {"networks": [str]} if "networks" in header else {}
     check_json(str(path), header, kind, advice)
     least = {"step": 0, "bad_steps": 0, "start_count": 1, "seconds": 0}
     for name, low in least.items():
@@ -197,7 +201,11 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     rest = next((k for k in (0, 3, 8, 15) if k >= rest), 0)
     columns = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh_dc": (1, 3)}
     expected = {}
-    for name, tail in (columns | {"sh_rest": (rest, 3)}).items():
+    columns |= {"sh_rest": (rest, 3)}
+    for key, x in tensors.items():  # of any other tensor it is known only that it has a row a Gaussian
+        if key.startswith("parameter."):
+            columns.setdefault(key.removeprefix("parameter."), tuple(x.shape[1:]))
+    for name, tail in columns.items():
         expected[f"parameter.{name}"] = torch.float32, (count, *tail)
         if any(key.startswith(f"adam.{name}.") for key in tensors):
             expected[f"adam.{name}.exp_avg"] = expected[f"adam.{name}.exp_avg_sq"] = torch.float32, (count, *tail)

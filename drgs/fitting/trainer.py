@@ -9,23 +9,29 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-import drgs
-from drgs.fitting.density import Model, add_gaussians, explore, relocate
-from drgs.fitting.losses import photometric_loss
+from drgs.fitting.density import add_gaussians, explore, relocate
+from drgs.fitting.losses import LossTerm, terms_of
+from drgs.fitting.networks import Network, Rate, rate_at
+from drgs.fitting.rows import GaussianRows
 from drgs.guards.arguments import check_fields, must_be
+from drgs.integrator import render
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.frames import Frame
+    from drgs.integrator import Output
 
 __all__ = ["FitConfig", "Trainer"]
 
 _MAX_BAD_STEPS = 10
+_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # what a checkpoint has besides networks
 
 _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
@@ -149,28 +155,58 @@ class Trainer:
     Attributes:
         config: The `FitConfig`.
         frames: Training photographs.
-        model: The Gaussians and their optimizer.
+        rows: The Gaussians and their optimizer.
+        extent: Of the scene, its unit of length.
+        terms: Of the loss, in the order in which they are added up.
+        networks: What else is fitted.
+        rates: Learning rates by the name of the tensor in `rows`.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
     """
 
-    def __init__(self, config: FitConfig, frames: list[Frame], model: Model, extent: float):
+    def __init__(
+        self,
+        config: FitConfig,
+        frames: list[Frame],
+        rows: GaussianRows,
+        extent: float,
+        *,
+        terms: Sequence[LossTerm] | None = None,
+        networks: Sequence[Network] = (),
+        rates: Mapping[str, Rate] = MappingProxyType({}),
+    ):
+        """A fit at its first step.
+
+        Args:
+            terms: Default those of `config` (`losses.terms_of`).
+            networks: What terms call that is to be fitted, too.
+            rates: Of tensors in `rows` that `config` has no learning rate for.
+        Raises:
+            ValueError: If there is no photograph or no Gaussian, a tensor has no rate, or two networks have one name.
+        """
         if not frames:
             raise ValueError("fit: there must be at least one training view, got none; add photographs")
-        if not len(model):
+        if not len(rows):
             raise ValueError("fit: there must be at least one initial point, got none; check the data set")
-        self.config, self.frames, self.model, self.extent = config, frames, model, extent
+        self.config, self.frames, self.rows, self.extent = config, frames, rows, extent
+        self.terms = list(terms_of(config, extent) if terms is None else terms)
+        self.networks, self.rates = list(networks), {**self._own_rates(), **rates}
+        if missing := sorted(set(rows.tensors) - set(self.rates)):
+            raise ValueError(f"fit: every tensor must have a learning rate, {missing[0]} has none; add it to rates")
+        names = [network.name for network in self.networks]
+        if len(set(names)) < len(names) or set(names) & _RESERVED:
+            raise ValueError(f"fit: networks must have names of their own, got {', '.join(names)}; rename one")
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._queue = torch.zeros(0, dtype=torch.int64)
-        self._start_count, self.reserved = len(model), 0
+        self._start_count, self.reserved = len(rows), 0
 
     def add_points(self, points: torch.Tensor, colors: torch.Tensor, opacity: float, scale: float) -> None:
-        """More Gaussians, arguments as of `Model.from_points`; what there is stays as it is."""
-        rows = {name: x.detach() for name, x in Model.from_points(points, colors, opacity, scale).tensors.items()}
-        rows["sh_rest"] = torch.zeros(len(points), *self.model.tensors["sh_rest"].shape[1:])
-        self.model.append(rows)
+        """More Gaussians, arguments as of `GaussianRows.from_points`; what there is stays as it is."""
+        new = GaussianRows.from_points(points, colors, opacity, scale).take(torch.arange(len(points)))
+        del new["sh_rest"]  # 0 up to the degree that the others have
+        self.rows.append(new)
 
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
@@ -181,24 +217,29 @@ class Trainer:
         """One view, one optimizer step, and what is due at it.
 
         Returns:
-            loss, psnr (of this view, before the step), view, and events (a list of dicts, for the log).
+            loss, terms (by name, those that this view has), psnr (of this view, before the step), view, and events (a
+            list of dicts, for the log).
         Raises:
             ValueError: After 10 steps in a row without a finite loss and gradient.
         """
-        config, model, done = self.config, self.model, self.step_index
+        config, rows, done = self.config, self.rows, self.step_index
         events = self._prepare(done)
-        frame = self.frames[self._next_view()]
-        out = drgs.render(model.gaussians(), frame.camera, config.settings, outputs=())
-        loss = self._loss(frame, out)
-        model.optimizer.zero_grad(set_to_none=True)
+        frame, gaussians = self.frames[self._next_view()], rows.gaussians()
+        outputs = {name: None for term in self.terms for name in term.outputs}  # each once, in their order
+        out = render(gaussians, frame.camera, config.settings, outputs=tuple(outputs))
+        loss, parts = self._loss(out, frame, gaussians)
+        optimizers = [rows.optimizer, *(network.optimizer for network in self.networks)]
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        with torch.no_grad():
+        with torch.no_grad():  # told, not optimized
             mse = self._mse(frame, out.rgb)
         if self._is_finite(loss):
             self._bad_in_a_row = 0
-            model.optimizer.step()
+            for optimizer in optimizers:
+                optimizer.step()
             if config.noise and done < config.refine_stop * config.max_steps:
-                explore(model, self._means_rate(done), self.extent, config.noise, self._generator)
+                explore(rows, self._means_rate(self._part()), self.extent, config.noise, self._generator)
         else:
             self.bad_steps += 1
             self._bad_in_a_row += 1
@@ -211,6 +252,7 @@ class Trainer:
         self.step_index += 1
         return {
             "loss": float(loss.detach()),
+            "terms": parts,
             "psnr": -10 * math.log10(max(mse, 1e-10)) if math.isfinite(mse) else None,
             "view": frame.name,
             "events": events,
@@ -218,11 +260,13 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are, without a graph."""
-        return self.model.gaussians().detach()
+        return self.rows.gaussians().detach()
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header of a checkpoint."""
-        tensors = {**self.model.state(), "rng": self._generator.get_state(), "queue": self._queue}
+        tensors = {**self.rows.state(), "rng": self._generator.get_state(), "queue": self._queue}
+        for network in self.networks:
+            tensors |= network.state()
         header = {
             "step": self.step_index,
             "bad_steps": self.bad_steps,
@@ -230,15 +274,23 @@ class Trainer:
             "extent": self.extent,
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
+            **({"networks": [network.name for network in self.networks]} if self.networks else {}),
         }
         return tensors, header
 
     @classmethod
-    def from_state(cls, config: FitConfig, frames: list[Frame], tensors: dict, header: dict, where: str) -> Trainer:
+    def from_state(
+        cls, config: FitConfig, frames: list[Frame], tensors: dict, header: dict, where: str, **others: Any
+    ) -> Trainer:
         """Continue from a checkpoint.
 
+        Args:
+            config, frames: As they were; `save_every` may change.
+            tensors, header: Of the checkpoint.
+            where: It, for messages.
+            others: `terms`, `networks` (which are overwritten) and `rates`, as they were.
         Raises:
-            ValueError: If the checkpoint belongs to another config or other views.
+            ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
         free = ("save_every",)
         new, old = config.to_json(), header["config"]
@@ -252,51 +304,67 @@ class Trainer:
             raise ValueError(
                 f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
-        trainer = cls(config, frames, Model.from_state(tensors), header["extent"])
+        trainer = cls(config, frames, GaussianRows.from_state(tensors), header["extent"], **others)
+        was, now = header.get("networks", []), [network.name for network in trainer.networks]
+        if was != now:
+            raise ValueError(
+                f"{where}: --resume must continue the same fit, networks were {was} and are {now}; "
+                "repeat the options or choose another run folder"
+            )
+        for network in trainer.networks:
+            network.restore(tensors, where)
         trainer.step_index, trainer.bad_steps = header["step"], header["bad_steps"]
         trainer._start_count = header["start_count"]
         trainer._generator.set_state(tensors["rng"])
         trainer._queue = tensors["queue"]
         return trainer
 
+    def _part(self) -> float:
+        """The fraction of the fit that is done."""
+        return self.step_index / self.config.max_steps
+
     def _prepare(self, done: int) -> list[dict]:
         """Schedules and density control before step `done`."""
-        config, model, events = self.config, self.model, []
-        while model.sh_degree < min(config.sh_degree, done / max(1, round(config.sh_every * config.max_steps)) - 1e-9):
-            model.raise_sh_degree()
-            events.append({"event": "sh_degree", "degree": model.sh_degree})
+        config, rows, events = self.config, self.rows, []
+        while rows.sh_degree < min(config.sh_degree, done / max(1, round(config.sh_every * config.max_steps)) - 1e-9):
+            rows.raise_sh_degree()
+            events.append({"event": "sh_degree", "degree": rows.sh_degree})
         every = max(1, round(config.refine_every * config.max_steps))
         start, stop = config.refine_start * config.max_steps, config.refine_stop * config.max_steps
         if done % every == 0 and max(start, 1) <= done < stop:
             events.append(self._refine(done, start))
-        model.set_rates(
-            {
-                "means": self._means_rate(done) * self.extent,
-                "quats": config.rotation_rate,
-                "log_scales": config.scale_rate,
-                "logit_opacities": config.opacity_rate,
-                "sh_dc": config.dc_rate,
-                "sh_rest": config.rest_rate,
-            }
-        )
+        rows.set_rates({name: rate_at(self.rates[name], self._part()) for name in rows.tensors})
+        for network in self.networks:
+            network.set_rate(self._part())
         return events
 
     def _refine(self, done: int, start: float) -> dict:
-        config, model = self.config, self.model
-        moved = relocate(model, config.min_opacity, config.jitter, self._generator)
+        """Density control at step `done`; `start` is the step of the first one. What it did, for the log."""
+        config, rows = self.config, self.rows
+        moved = relocate(rows, config.min_opacity, config.jitter, self._generator)
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
         full = max(config.grow_until * config.max_steps - start, 1)
         part = min(1.0, (done - start + config.refine_every * config.max_steps) / full)
         budget = config.max_gaussians - self.reserved
         wanted = round(self._start_count * (budget / self._start_count) ** part) if self._start_count < budget else 0
-        added = add_gaussians(
-            model, min(wanted, budget) - len(model), config.min_opacity, config.jitter, self._generator
-        )
-        return {"event": "density", "moved": moved, "added": added, "gaussians": len(model)}
+        added = add_gaussians(rows, min(wanted, budget) - len(rows), config.min_opacity, config.jitter, self._generator)
+        return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
 
-    def _means_rate(self, done: int) -> float:
+    def _own_rates(self) -> dict[str, Rate]:
+        """Learning rates of the tensors that every fit has."""
+        config = self.config
+        return {
+            "means": lambda part: self._means_rate(part) * self.extent,
+            "quats": config.rotation_rate,
+            "log_scales": config.scale_rate,
+            "logit_opacities": config.opacity_rate,
+            "sh_dc": config.dc_rate,
+            "sh_rest": config.rest_rate,
+        }
+
+    def _means_rate(self, part: float) -> float:
         first, last = self.config.means_rate
-        return first * (last / first) ** (done / self.config.max_steps)
+        return first * (last / first) ** part
 
     def _next_view(self) -> int:
         if not len(self._queue):
@@ -304,21 +372,17 @@ class Trainer:
         view, self._queue = int(self._queue[0]), self._queue[1:].clone()
         return view
 
-    def _loss(self, frame: Frame, out) -> torch.Tensor:
-        config, t = self.config, self.model.tensors
-        loss = photometric_loss(
-            out.rgb,
-            frame.target(),
-            mask=frame.mask,
-            alpha=out.alpha if frame.is_object else None,
-            ssim_weight=config.ssim_weight,
-            outside_weight=config.outside_weight,
-        )
-        if config.opacity_weight:
-            loss = loss + config.opacity_weight * t["logit_opacities"].sigmoid().mean()
-        if config.scale_weight:
-            loss = loss + config.scale_weight * t["log_scales"].exp().mean() * (5 / self.extent)
-        return loss
+    def _loss(self, out: Output, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, dict[str, float]]:
+        """The sum of the terms that a view has, and each of them by name."""
+        total, parts = None, {}
+        for term in self.terms:
+            value = term(out, frame, gaussians)
+            if value is not None:
+                total = value if total is None else total + value
+                parts[term.name] = float(value.detach())  # told, not optimized
+        if total is None:
+            raise ValueError(f"fit: a view must have a term of the loss, {frame.name} has none; add one")
+        return total, parts
 
     def _mse(self, frame: Frame, rgb: torch.Tensor) -> float:
         error = (rgb.clamp(0, 1) - frame.image()).square().mean(2)
@@ -327,5 +391,7 @@ class Trainer:
         return float((error * frame.mask).sum() / frame.mask.sum().clamp(min=1))
 
     def _is_finite(self, loss: torch.Tensor) -> bool:
-        sums = [loss.detach(), *(x.grad.sum() for x in self.model.tensors.values() if x.grad is not None)]
+        """Whether the loss and every gradient are; a sum is not finite where one of its numbers is not."""
+        fitted = [*self.rows.tensors.values(), *(x for network in self.networks for x in network.module.parameters())]
+        sums = [loss.detach(), *(x.grad.sum() for x in fitted if x.grad is not None)]
         return all(math.isfinite(float(x)) for x in sums)

@@ -1,0 +1,78 @@
+"""Torch modules that are fitted beside the Gaussians: what has no row a Gaussian, and density control leaves alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+__all__ = ["Network", "Rate", "rate_at", "saved_networks"]
+
+Rate = float | Callable[[float], float]
+"""A learning rate, or what gives it from the fraction of the fit that is done."""
+
+
+def rate_at(rate: Rate, part: float) -> float:
+    """The learning rate when the fraction `part` of the fit is done."""
+    return rate(part) if callable(rate) else rate
+
+
+class Network:
+    """A torch module with its optimizer, its learning rate and its entries in a checkpoint.
+
+    Parts of a module with rates of their own are networks of their own: `Network("field.grid", field.grid, 1.6e-3)`.
+
+    Attributes:
+        name: Of its entries in a checkpoint: `NAME.parameter.*` (parameters and buffers) and `NAME.adam.*`.
+        module: What losses, or the scene, call.
+        rate: Its learning rate.
+        optimizer: Adam, with torch's defaults.
+    """
+
+    def __init__(self, name: str, module: torch.nn.Module, rate: Rate):
+        self.name, self.module, self.rate = name, module, rate
+        self.optimizer = torch.optim.Adam(module.parameters(), lr=rate_at(rate, 0.0))
+
+    def set_rate(self, part: float) -> None:
+        """The learning rate for a step after the fraction `part` of the fit."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate_at(self.rate, part)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything that a checkpoint needs, by name."""
+        out = {f"{self.name}.parameter.{key}": x for key, x in self.module.state_dict().items()}
+        for key, x in self.module.named_parameters():
+            moments = self.optimizer.state.get(x, {})
+            out |= {f"{self.name}.adam.{key}.{moment}": value for moment, value in moments.items()}
+        return out
+
+    def restore(self, tensors: dict[str, torch.Tensor], where: str) -> None:
+        """Continue from `state`; other keys are ignored.
+
+        Args:
+            tensors: Of a checkpoint.
+            where: It, for the message.
+        Raises:
+            ValueError: If a parameter is missing, or has another shape.
+        """
+        saved = _below(tensors, f"{self.name}.parameter.")
+        for key, x in self.module.state_dict().items():
+            got = tuple(saved[key].shape) if key in saved else "none"
+            if got != tuple(x.shape):
+                raise ValueError(
+                    f"{where}: {self.name}.parameter.{key} must have shape {tuple(x.shape)}, got {got}; fit into "
+                    "another run folder (-o)"
+                )
+        self.module.load_state_dict({key: saved[key] for key in self.module.state_dict()})
+        for key, x in self.module.named_parameters():
+            if moments := _below(tensors, f"{self.name}.adam.{key}."):
+                self.optimizer.state[x] = {moment: value.clone() for moment, value in moments.items()}
+
+
+def saved_networks(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, dict[str, torch.Tensor]]:
+    """What `Module.load_state_dict` takes, by the names of the networks of a checkpoint."""
+    return {name: _below(tensors, f"{name}.parameter.") for name in header.get("networks", ())}
+
+
+def _below(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {key.removeprefix(prefix): x for key, x in tensors.items() if key.startswith(prefix)}

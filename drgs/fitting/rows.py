@@ -1,0 +1,162 @@
+"""The parameters of the Gaussians that are fitted: tensors with one row a Gaussian, and their Adam moments.
+
+Density control (density.py) adds, moves and replaces rows of all tensors alike, whatever they mean. What has no row a
+Gaussian is fitted beside them (networks.py).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from drgs.ellipsoids import Gaussians
+
+__all__ = ["GaussianRows"]
+
+_Change = Callable[[torch.Tensor], torch.Tensor]
+
+
+class GaussianRows:
+    """N Gaussians as leaf tensors, one a parameter group, with an Adam optimizer whose rows follow theirs.
+
+    SH coefficients above degree 0 exist only up to the active degree: what is not there yet costs nothing.
+
+    Attributes:
+        tensors: means, quats, log_scales, logit_opacities, sh_dc (N, 1, 3) and sh_rest (N, K - 1, 3), perhaps features
+            (N, D), and any others (N, ...) whose rows shall follow the Gaussians.
+        optimizer: One parameter group a tensor, named as in `tensors`.
+    """
+
+    def __init__(self, tensors: dict[str, torch.Tensor]):
+        # Leaves of their own: what the caller has is neither changed nor differentiated.
+        self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
+        groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
+        # eps as in 3DGS: gradients of a mean over pixels are far below torch's default of 1e-8.
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+
+    @classmethod
+    def from_points(
+        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0
+    ) -> GaussianRows:
+        """One isotropic Gaussian a point, as wide as the points around it are far apart.
+
+        Args:
+            points: (N, 3) world.
+            colors: (N, 3) in [0, 1].
+            opacity: Of all of them.
+            scale: Times the root of the mean squared distance to the three nearest points.
+        """
+        n = len(points)
+        quats = torch.zeros(n, 4)
+        quats[:, 0] = 1
+        return cls(
+            {
+                "means": points.float(),
+                "quats": quats,
+                "log_scales": (scale * _spacing(points)).log().float()[:, None].repeat(1, 3),
+                "logit_opacities": torch.full((n,), math.log(opacity / (1 - opacity))),
+                "sh_dc": ((colors.float() - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
+                "sh_rest": torch.zeros(n, 0, 3),
+            }
+        )
+
+    def __len__(self) -> int:
+        return len(self.tensors["means"])
+
+    @property
+    def sh_degree(self) -> int:
+        """0..3."""
+        return math.isqrt(1 + self.tensors["sh_rest"].shape[1]) - 1
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians; gradients reach `tensors`."""
+        t = self.tensors
+        sh = torch.cat([t["sh_dc"], t["sh_rest"]], dim=1) if self.sh_degree else t["sh_dc"]
+        return Gaussians(t["means"], t["quats"], t["log_scales"], t["logit_opacities"], sh, t.get("features"))
+
+    def set_rates(self, rates: dict[str, float]) -> None:
+        """Learning rates by tensor name."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rates[group["name"]]
+
+    def raise_sh_degree(self) -> None:
+        """Add the coefficients of the next degree, 0 and with no moments."""
+        missing = 2 * self.sh_degree + 3
+        self._map("sh_rest", lambda x: torch.cat([x, x.new_zeros(len(x), missing, 3)], dim=1))
+
+    def append(self, rows: dict[str, torch.Tensor]) -> None:
+        """Add Gaussians with zero moments; their rows of tensors that `rows` lacks are 0."""
+        count = len(rows["means"])
+        for name, old in list(self.tensors.items()):
+            new = rows[name] if name in rows else old.new_zeros(count, *old.shape[1:])
+            self._map(name, lambda x, new=new: torch.cat([x, new]), lambda m, new=new: torch.cat([m, 0 * new]))
+
+    def overwrite(self, index: torch.Tensor, rows: dict[str, torch.Tensor]) -> None:
+        """Replace Gaussians at `index` (unique) and forget the moments of the given tensors there."""
+        with torch.no_grad():  # leaves are changed in place
+            for name, new in rows.items():
+                self.tensors[name][index] = new
+                for moment in self._moments(name):
+                    moment[index] = 0
+
+    def take(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Copies of rows, values without a graph."""
+        return {name: x.detach()[index] for name, x in self.tensors.items()}
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything that a checkpoint needs, by name; values without a graph."""
+        out = {f"parameter.{name}": x.detach() for name, x in self.tensors.items()}
+        for name, x in self.tensors.items():
+            out |= {f"adam.{name}.{key}": v for key, v in self.optimizer.state.get(x, {}).items()}
+        return out
+
+    @classmethod
+    def from_state(cls, state: dict[str, torch.Tensor]) -> GaussianRows:
+        """The inverse of `state`; other keys are ignored."""
+        prefix = "parameter."
+        rows = cls({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        for name, x in rows.tensors.items():
+            prefix = f"adam.{name}."
+            moments = {k.removeprefix(prefix): v.clone() for k, v in state.items() if k.startswith(prefix)}
+            if moments:
+                rows.optimizer.state[x] = moments
+        return rows
+
+    def _moments(self, name: str) -> list[torch.Tensor]:
+        state = self.optimizer.state.get(self.tensors[name], {})
+        return [state[key] for key in ("exp_avg", "exp_avg_sq") if key in state]
+
+    @torch.no_grad()
+    def _map(self, name: str, change: _Change, change_moments: _Change | None = None) -> None:
+        """Replace one tensor by `change(tensor)`, and its moments likewise: a new leaf without the old one's graph."""
+        old = self.tensors[name]
+        new = change(old.detach()).requires_grad_()
+        group = next(g for g in self.optimizer.param_groups if g["name"] == name)
+        group["params"] = [new]
+        state = self.optimizer.state.pop(old, {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key] = (change_moments or change)(state[key])
+        if state:
+            self.optimizer.state[new] = state
+        self.tensors[name] = new
+
+
+def _spacing(points: torch.Tensor) -> torch.Tensor:
+    """(N,) root of the mean squared distance to the three nearest other points, at least 1e-3 of the median."""
+    import cv2
+    import numpy as np
+
+    n = len(points)
+    if n < 2:
+        return torch.ones(n)
+    table = points.double().numpy()
+    table = np.ascontiguousarray(table - table.mean(0), np.float32)
+    # Algorithm 4 is one kd-tree; checks = -1 makes its search exact.
+    tree = cv2.flann.Index(table, {"algorithm": 4, "leaf_max_size": 10})
+    _, squared = tree.knnSearch(table, min(4, n), params={"checks": -1})
+    spacing = torch.from_numpy(squared[:, 1:]).mean(1).sqrt()
+    # Coincident points must not become Gaussians of no size; where all coincide, any small size will do.
+    return spacing.clamp(min=float(spacing.median()) * 1e-3 or 1e-7)

@@ -1,0 +1,210 @@
+"""A fit is made of parts: terms of the loss, rows that follow the Gaussians, and networks that do not.
+
+Each new part is written here, in a few lines, as a file of its own would be.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from test_train import config, dataset, random_rows  # noqa: F401 (a fixture)
+
+from drgs.files import load_state, save_state
+from drgs.fitting.density import add_gaussians, relocate
+from drgs.fitting.frames import load_frames
+from drgs.fitting.losses import Photometric, terms_of
+from drgs.fitting.networks import Network, saved_networks
+from drgs.fitting.records import check_checkpoint
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.trainer import Trainer
+
+
+class Affine(torch.nn.Module):
+    """A gain and an offset a color channel, as a camera's white balance has."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain, self.offset = (torch.nn.Parameter(torch.full((3,), value)) for value in (1.1, 0.0))
+        self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return self.gain * rgb + self.offset
+
+
+@dataclasses.dataclass
+class Corrected:
+    """The photometric term of colors that a network has corrected."""
+
+    correction: torch.nn.Module
+    name = "corrected"
+    outputs = ()
+
+    def __call__(self, output, frame, gaussians):
+        return Photometric(0.2)(dataclasses.replace(output, rgb=self.correction(output.rgb)), frame, gaussians)
+
+
+class Near:
+    """Features are the photograph, weighted by depth; the first view has none."""
+
+    name = "near"
+    outputs = ("depth", "count")
+
+    def __call__(self, output, frame, gaussians):
+        if frame.name == "1":
+            return None
+        return ((output.features - frame.target()) * output.depth[..., None]).square().mean()
+
+
+def trainer_of(dataset, state=None) -> Trainer:  # noqa: F811
+    """A fit with both terms, features and a network: new, or from a checkpoint."""
+    cfg = config(max_steps=20, refine_start=0.1, refine_every=0.1, max_gaussians=50)
+    frames, affine = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask), Affine()
+    parts = {
+        "terms": [Corrected(affine), Near(), *terms_of(cfg, 3.0)[1:]],
+        "networks": [Network("affine", affine, lambda part: 1e-2 * (1 - part))],
+        "rates": {"features": 1e-2},
+    }
+    if state is not None:
+        return Trainer.from_state(cfg, frames, *state, "here", **parts)
+    points, colors = torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors)
+    rows = GaussianRows.from_points(points, colors)
+    return Trainer(cfg, frames, GaussianRows({**rows.tensors, "features": torch.zeros(len(rows), 3)}), 3.0, **parts)
+
+
+@pytest.fixture
+def one_thread():
+    """Sums of several threads come in any order."""
+    import drjit as dr
+
+    threads = dr.thread_count(), torch.get_num_threads()
+    dr.set_thread_count(1)
+    torch.set_num_threads(1)
+    yield
+    dr.set_thread_count(threads[0])
+    torch.set_num_threads(threads[1])
+
+
+def steps(trainer: Trainer, count: int) -> list[dict]:
+    return [trainer.step() for _ in range(count)]
+
+
+def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path, one_thread):  # noqa: F811
+    """A term, features and a network take part in every step, and a checkpoint in the middle changes no bit."""
+    whole, first = trainer_of(dataset), trainer_of(dataset)
+    rows = steps(whole, 20)
+    assert rows[-1]["loss"] < rows[0]["loss"]
+    assert len(whole.rows) > len(dataset.points)
+    features = whole.gaussians().features
+    assert features.shape == (len(whole.rows), 3)
+    assert bool(features.any())
+    told = {row["view"]: set(row["terms"]) for row in rows}
+    assert told["1"] == {"corrected", "opacity", "scale"}
+    assert told["2"] == {"corrected", "near", "opacity", "scale"}
+    assert rows[5]["loss"] == pytest.approx(sum(rows[5]["terms"].values()), rel=1e-5)
+    steps(first, 9)
+    tensors, header = first.state()
+    path = tmp_path / "state.safetensors"
+    save_state(path, tensors, {**header, "seconds": 1.0, "point_source": "x"})
+    saved = load_state(path)
+    check_checkpoint(path, *saved)
+    network = first.networks[0].module.state_dict()
+    assert network["calls"] == 9
+    assert not torch.equal(network["gain"], Affine().gain)
+    assert all(torch.equal(x, network[name]) for name, x in saved_networks(*saved)["affine"].items())
+    second = trainer_of(dataset, saved)
+    steps(second, 11)
+    one, other = whole.state()[0], second.state()[0]
+    assert one.keys() == other.keys()
+    assert {"affine.parameter.gain", "affine.adam.gain.exp_avg", "parameter.features"} <= one.keys()
+    assert [name for name, x in one.items() if not torch.equal(x, other[name])] == []
+
+
+def test_a_fit_without_networks_says_nothing_of_them(dataset):  # noqa: F811
+    """Checkpoints of plain fits are what they were."""
+    cfg = config()
+    frames = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask)
+    rows = GaussianRows.from_points(torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors))
+    tensors, header = Trainer(cfg, frames, rows, 3.0).state()
+    fields = "means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest"
+    assert tensors.keys() == {"rng", "queue", *(f"parameter.{name}" for name in fields)}
+    assert header.keys() == {"step", "bad_steps", "start_count", "extent", "views", "config"}
+
+
+def test_parts_that_do_not_fit_are_refused(dataset):  # noqa: F811
+    """Another network or one of another shape, a tensor without a rate, names that clash: one line each."""
+    trainer = trainer_of(dataset)
+    trainer.step()
+    tensors, header = trainer.state()
+    whole = {"terms": trainer.terms, "rates": trainer.rates}
+    load = lambda **parts: Trainer.from_state(trainer.config, trainer.frames, tensors, header, "here", **parts)  # noqa: E731
+    with pytest.raises(ValueError, match=r"^here: --resume .*networks were \['affine'\] and are \[\]; repeat"):
+        load(**whole)
+    wide = Network("affine", torch.nn.Linear(2, 2), 1e-2)
+    with pytest.raises(ValueError, match=r"^here: affine\.parameter\.weight must have shape \(2, 2\), got none; "):
+        load(**whole, networks=[wide])
+    with pytest.raises(ValueError, match="every tensor must have a learning rate, features has none"):
+        load(terms=trainer.terms, networks=trainer.networks)
+    for names in (("rng",), ("a", "a")):
+        networks = [Network(name, Affine(), 1e-2) for name in names]
+        with pytest.raises(ValueError, match="networks must have names of their own"):
+            Trainer(trainer.config, trainer.frames, trainer.rows, 3.0, rates={"features": 0.0}, networks=networks)
+    trainer.terms = [Near()]
+    trainer._queue = torch.tensor([[frame.name for frame in trainer.frames].index("1")])
+    with pytest.raises(ValueError, match="a view must have a term of the loss, 1 has none"):
+        trainer.step()
+
+
+def test_a_step_that_is_not_finite_leaves_networks_alone(dataset):  # noqa: F811
+    """A NaN that only a network's gradient has skips the step of all."""
+    trainer = trainer_of(dataset)
+    steps(trainer, 2)
+    trainer.networks[0].module.gain.register_hook(lambda gradient: gradient * torch.nan)
+    before = {name: x.clone() for name, x in trainer.networks[0].state().items() if not name.endswith("calls")}
+    assert trainer.step()["events"][-1]["event"] == "skipped"
+    after = trainer.networks[0].state()
+    assert [name for name, x in before.items() if not torch.equal(x, after[name])] == []
+
+
+@pytest.mark.parametrize("kind", ["relocate", "add"])
+def test_rows_of_any_tensor_follow_density_control(kind):
+    """A copy has the features, and whatever else has a row, of the Gaussian that it copies; moments start at 0."""
+    plain = random_rows()
+    ids = torch.arange(30.0)
+    rows = GaussianRows({**plain.tensors, "features": ids[:, None].repeat(1, 4), "phases": ids})
+    for x in rows.tensors.values():
+        x.grad = torch.ones_like(x)
+    rows.optimizer.step()
+    means = rows.tensors["means"].detach().clone()
+    generator = torch.Generator().manual_seed(0)
+    if kind == "relocate":
+        assert relocate(rows, 0.005, 0.0, generator) == 10
+        new = torch.arange(10)
+    else:
+        assert add_gaussians(rows, 12, 0.005, 0.0, generator) == 12
+        new = torch.arange(30, 42)
+    source = torch.cdist(rows.tensors["means"].detach()[new], means).argmin(1)
+    assert len(source.unique()) > 3
+    assert torch.equal(rows.tensors["phases"].detach()[new], source.float())
+    assert torch.equal(rows.gaussians().features.detach()[new], source[:, None].repeat(1, 4).float())
+    for name in ("features", "phases"):
+        moment = rows.optimizer.state[rows.tensors[name]]["exp_avg"]
+        assert moment.shape == rows.tensors[name].shape
+        assert not moment[new].any()
+        assert bool(moment[10:30].all())
+
+
+def test_points_of_a_new_view_have_rows_of_every_tensor(dataset):  # noqa: F811
+    """What points do not say is 0: higher SH coefficients and features."""
+    trainer = trainer_of(dataset)
+    steps(trainer, 3)
+    trainer.rows.raise_sh_degree()
+    count, degree = len(trainer.rows), trainer.rows.sh_degree
+    trainer.add_points(torch.rand(5, 3), torch.rand(5, 3), 0.1, 1.0)
+    g = trainer.gaussians()
+    assert (len(g), g.sh_degree) == (count + 5, degree)
+    assert not g.features[-5:].any()
+    assert not g.sh[-5:, 1:].any()
+    steps(trainer, 1)
