@@ -17,8 +17,7 @@ import numpy as np
 import studies
 from studies import ROOT, SCALES
 
-from drgs.fitting.active import ActiveConfig
-from drgs.train import FitConfig, fit
+from drgs.train import ActiveConfig, FitConfig, fit
 
 BEGIN, END = "<!-- active: begin -->", "<!-- active: end -->"
 POLICIES = {

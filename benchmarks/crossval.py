@@ -34,9 +34,9 @@ import drgs  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.commands.orbits import Wish, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
+from drgs.data.sizes import at_most  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
-from drgs.fitting.active import at_most  # noqa: E402
 from drgs.lab.crops import crops  # noqa: E402
 from drgs.lab.crossval import VERDICTS, crossval  # noqa: E402
 from drgs.lab.rasterizers import PARAMETERS, cotangents, function, load, raw_of  # noqa: E402

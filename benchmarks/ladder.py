@@ -28,8 +28,8 @@ from drgs.cameras import intrinsics_from_fov
 from drgs.commands.orbits import Wish, scene_orbit
 from drgs.commands.viewpoints import evenly
 from drgs.data import load
+from drgs.data.sizes import at_most
 from drgs.files import Run, atomic_write
-from drgs.fitting.active import at_most
 from drgs.fitting.records import fit_record
 from drgs.lab.ladder import Pictures, ladder, table
 from drgs.lab.rasterizers import PARAMETERS

@@ -21,6 +21,7 @@ import torch
 
 from drgs.guards.arguments import must_be
 from drgs.information.chain import Chain, dense
+from drgs.information.choices import METHODS
 
 __all__ = [
     "BLOCK_LAYOUT",
@@ -40,7 +41,6 @@ __all__ = [
 
 Information = Mapping[str, torch.Tensor]
 
-METHODS = ("exact", "columns", "probes", "fisherrf")  # of `drgs.fisher.diagonal`; here, for that loads Dr.Jit
 
 BLOCK_LAYOUT = {
     "means": slice(0, 3),

@@ -8,24 +8,16 @@ changes an image lives anywhere else. Symbols: ``a`` opacity of one hit, ``alpha
 from __future__ import annotations
 
 import dataclasses
+import typing
+from typing import Literal
 
 from drgs.guards.arguments import check_fields, must_be
 
-__all__ = ["PRESETS", "RenderSettings", "legal"]
+__all__ = ["PRESETS", "Preset", "RenderSettings", "legal"]
 
-PRESETS = ("exact", "fast", "inria", "gsplat", "mitsuba")
+Preset = Literal["exact", "fast", "inria", "gsplat", "mitsuba"]
+PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
 
-_CHOICES = {
-    "response": ("peak", "integral", "ewa"),
-    "order": ("center", "ray", "entry"),
-    "traversal": ("tiles", "bvh"),
-    "depth_key": ("distance", "z"),
-    "alpha_max_gradient": ("zero", "pass"),
-    "stop": ("after", "before", "before_eq"),
-    "fov_clamp": ("none", "inria", "gsplat"),
-    "culling": ("extent", "inria", "gsplat"),
-    "sh_direction": ("gaussian", "ray"),
-}
 _RANGES = {
     "extent": (0.0, 1e3),
     "alpha_min": (0.0, 1.0),
@@ -67,26 +59,26 @@ class RenderSettings:
         background: RGB composited behind everything.
     """
 
-    response: str = "peak"
-    order: str = "center"
-    traversal: str = "tiles"
-    depth_key: str = "distance"
+    response: Literal["peak", "integral", "ewa"] = "peak"
+    order: Literal["center", "ray", "entry"] = "center"
+    traversal: Literal["tiles", "bvh"] = "tiles"
+    depth_key: Literal["distance", "z"] = "distance"
     extent: float | None = None
     alpha_min: float = 0.0
     alpha_max: float = 1.0
-    alpha_max_gradient: str = "zero"
+    alpha_max_gradient: Literal["zero", "pass"] = "zero"
     transmittance_min: float = 1e-10
-    stop: str = "after"
+    stop: Literal["after", "before", "before_eq"] = "after"
     max_hits: int | None = None
     dilation: float = 0.0
     near: float = 0.0
-    fov_clamp: str = "none"
-    culling: str = "extent"
-    sh_direction: str = "gaussian"
+    fov_clamp: Literal["none", "inria", "gsplat"] = "none"
+    culling: Literal["extent", "inria", "gsplat"] = "extent"
+    sh_direction: Literal["gaussian", "ray"] = "gaussian"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        check_fields("RenderSettings", self, _RANGES, _CHOICES)
+        check_fields("RenderSettings", self, _RANGES)
         for name in ("extent", "alpha_max"):
             if getattr(self, name) == 0:
                 raise ValueError(f"RenderSettings: {name} must be > 0, got 0")

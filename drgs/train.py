@@ -24,11 +24,12 @@ from drgs.data.views import check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.files import Run, save_ply, save_state
-from drgs.fitting.active import ActiveConfig, ActiveViews
+from drgs.fitting.active import ActiveViews
+from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.trainer import FitConfig, Trainer
+from drgs.fitting.trainer import Trainer
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["FitConfig", "FitResult", "Trainer", "fit"]
+__all__ = ["ActiveConfig", "FitConfig", "FitResult", "Trainer", "fit"]
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,8 @@ from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
-from drgs.fitting.active import ActiveConfig, ActiveViews, initial_views
+from drgs.fitting.active import ActiveViews, initial_views
+from drgs.fitting.config import ActiveConfig
 from drgs.fitting.records import fitted_views
 from drgs.train import FitConfig, Trainer, fit
 

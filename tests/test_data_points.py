@@ -12,9 +12,9 @@ from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import Dataset, View, added_points, initial_points, load
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
-from drgs.fitting.active import ActiveConfig, ActiveViews
+from drgs.fitting.active import ActiveViews
+from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import load_frames
-from drgs.fitting.trainer import FitConfig
 
 cv2 = pytest.importorskip("cv2")
 WIDTH, HEIGHT = 320, 240

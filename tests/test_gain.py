@@ -344,7 +344,7 @@ def test_one_default_criterion():
     import inspect
 
     from drgs.commands.options import Fit, Select
-    from drgs.fitting.active import ActiveConfig
+    from drgs.fitting.config import ActiveConfig
     from drgs.gain import check
     from drgs.select import Scoring
 

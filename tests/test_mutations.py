@@ -19,10 +19,11 @@ from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.checks import read_image
 from drgs.data.points import read_point_ply
 from drgs.files import SCHEMA, Run, load_ply, load_state, save_ply, save_state
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint, fitted_views
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.trainer import FitConfig, Trainer
+from drgs.fitting.trainer import Trainer
 
 
 def attempt(read, path, versions) -> None:

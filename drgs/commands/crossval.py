@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from drgs import runtime
 from drgs.commands.viewpoints import seen_views
+from drgs.data.sizes import at_most
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
-from drgs.fitting.active import at_most
 from drgs.guards.outputs import check_file, claim
 from drgs.lab import rasterizers
 

@@ -1,6 +1,7 @@
 """The options of every command: a dataclass each, its docstrings the help texts.
 
-Imports nothing heavy: `drgs --help` reads them all.
+What can be chosen, and what is chosen by default, is read from the record that an option ends up in. Imports nothing
+heavy: `drgs --help` reads them all.
 """
 
 from __future__ import annotations
@@ -11,6 +12,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
+
+from drgs.fitting.config import ActiveConfig, Degree, FitConfig, InitPoints, Mask, PickPoints
+from drgs.information.choices import Criterion, Method, Policy
+from drgs.settings import Preset, RenderSettings
 
 __all__ = [
     "Crossval",
@@ -27,6 +32,7 @@ __all__ = [
 ]
 
 _Output = Annotated[Path, arg(aliases=["-o"])]
+Split = Literal["all", "train", "test"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,7 +53,7 @@ class _Common:
 class _Settings(_Common):
     """Options of commands that render."""
 
-    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "exact"
+    preset: Preset = "exact"
     """Render settings of a named system."""
     overrides: Annotated[
         tuple[str, ...],
@@ -55,14 +61,12 @@ class _Settings(_Common):
         UseAppendAction,
     ] = ()
 
-    def settings(self):
+    def settings(self) -> RenderSettings:
         """The `RenderSettings` that --preset and --set describe.
 
         Raises:
             ValueError: If an override is no KEY=VALUE, names no field or has the wrong type.
         """
-        from drgs.settings import RenderSettings
-
         return RenderSettings.preset(self.preset, **self.replaced())
 
     def replaced(self) -> dict:
@@ -71,8 +75,6 @@ class _Settings(_Common):
         Raises:
             ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
         """
-        from drgs.settings import RenderSettings
-
         hints = typing.get_type_hints(RenderSettings)
         values = {}
         for text in self.overrides:
@@ -116,13 +118,13 @@ class _Around:
 class _Information(_Settings):
     """Options of commands that compute Fisher information."""
 
-    method: Literal["exact", "columns", "probes", "fisherrf"] = "exact"
+    method: Method = ActiveConfig.method
     """How information is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
-    prior: float = 1e-6
+    prior: float = ActiveConfig.prior
     """How firmly every parameter counts as known beforehand (lambda); 0 leaves out what no training view has seen."""
-    relative_prior: bool = False
+    relative_prior: bool = ActiveConfig.relative_prior
     """lambda is --prior times the median information of a parameter's group, where it is not 0."""
-    info_pixels: int | None = None
+    info_pixels: int | None = ActiveConfig.info_pixels
     """Information is computed on views of at most this many pixels; default as in the fit."""
 
 
@@ -130,9 +132,9 @@ class _Information(_Settings):
 class _Policy(_Information):
     """Options of commands that choose views."""
 
-    policy: Literal["fisher", "fisherrf", "coverage", "farthest", "uniform", "random"] = "fisher"
+    policy: Policy = ActiveConfig.policy
     """How the next view is chosen (docs/information.md)."""
-    criterion: Literal["eig", "logdet", "trace_cov", "block_logdet"] = "eig"
+    criterion: Criterion = ActiveConfig.criterion
     """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
     seed: int = 0
     """Seed of everything random."""
@@ -170,7 +172,7 @@ class Render(_Settings, _Around, _Data):
     """Frames a second of the video."""
     depth: bool = False
     """Write color-mapped depth too; exr files hold it anyway."""
-    split: Literal["all", "train", "test"] = "all"
+    split: Split = "all"
     """Which views of a data set."""
     limit: int | None = None
     """At most this many views."""
@@ -184,56 +186,54 @@ class Fit(_Policy, _Data):
     """A data set: COLMAP, transforms.json, LLFF, or a folder made by drgs sfm."""
     output: _Output
     """The run folder."""
-    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
+    preset: Preset = "fast"
     """Render settings of a named system. Train with what will be rendered with: gsplat for viewers of PLY files."""
-    max_steps: int = 3000
+    max_steps: int = FitConfig.max_steps
     """Optimizer steps."""
-    max_pixels: int = 130_000
+    max_pixels: int = FitConfig.max_pixels
     """Images are reduced to at most this many pixels."""
-    max_gaussians: int = 30_000
+    max_gaussians: int = FitConfig.max_gaussians
     """How many Gaussians there may be."""
-    init_points: Literal["auto", "views", "all"] = "auto"
+    init_points: InitPoints = FitConfig.init_points
     """Initial points: of the training views (views) or of the data set (all); auto: all, or views if --views active."""
-    test_every: int = 8
+    test_every: int = FitConfig.test_every
     """Every n-th view, by name, is held out; 0 holds out none."""
-    sh_degree: Literal[0, 1, 2, 3] = 3
+    sh_degree: Degree = FitConfig.sh_degree
     """Highest degree of the view-dependent color."""
-    deterministic: bool = False
+    deterministic: bool = FitConfig.deterministic
     """Same seed, same bits; slower."""
     resume: bool = False
     """Continue from the last checkpoint in the run folder."""
-    save_every: int = 1000
+    save_every: int = FitConfig.save_every
     """Steps between checkpoints."""
-    mask: Literal["auto", "object", "valid", "ignore"] = "auto"
+    mask: Mask = FitConfig.mask
     """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] = RenderSettings.background
     """RGB in [0, 1] behind everything."""
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
-    initial: int = 2
+    initial: int = ActiveConfig.initial
     """Views at the start: the first one, then those farthest away."""
-    add: int = 10
+    add: int = ActiveConfig.add
     """Views to be chosen on the way, one at a time; others are not read."""
-    every: int = 200
+    every: int = ActiveConfig.every
     """Steps before the first of them, and between two."""
-    pick_points: Literal["auto", "uncovered", "none"] = "auto"
+    pick_points: PickPoints = ActiveConfig.pick_points
     """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
 
-    def settings(self):
+    def settings(self) -> RenderSettings:
         """As for every command, with the background that the photographs are composited on."""
         if any(text.startswith("background=") for text in self.overrides):
             raise ValueError("--set background: must be --background here, which photographs are composited on as well")
         check_color("--background", self.background)
         return super().settings().replace(background=self.background)
 
-    def active(self):
+    def active(self) -> ActiveConfig | None:
         """The `ActiveConfig` of --views active, else None.
 
         Raises:
             ValueError: If an option is out of range, or belongs to --views active and that is missing.
         """
-        from drgs.fitting.active import ActiveConfig
-
         fields = dataclasses.fields(ActiveConfig)
         if self.views == "active":
             return ActiveConfig(**{field.name: getattr(self, field.name) for field in fields})
@@ -252,7 +252,7 @@ class _Views(_Information, _Around, _Data):
     """A run folder or a 3DGS point_cloud.ply."""
     train: str | None = None
     """Views that are known: a data set, a run, or a cameras.json; default the run's."""
-    split: Literal["all", "train", "test"] = "all"
+    split: Split = "all"
     """Which of the other views, where they are a data set's."""
     count: int = 40
     """Cameras of an orbit or a dome."""
@@ -268,7 +268,7 @@ class Select(_Policy, _Views):
     """Views to pick, each given the ones before."""
     output: _Output = Path("out/select.json")
     """The JSON file."""
-    preset: Literal["exact", "fast", "inria", "gsplat", "mitsuba"] = "fast"
+    preset: Preset = "fast"
     """Render settings of a named system; fast ranks as exact does, in a fraction of the time (docs)."""
 
 
@@ -294,7 +294,7 @@ class _Seen(_Settings, _Around, _Data):
     """A 3DGS point_cloud.ply or a run folder."""
     cameras: str | None = None
     """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
-    split: Literal["all", "train", "test"] = "all"
+    split: Split = "all"
     """Which views of a data set."""
     limit: int = 2
     """At most this many views, evenly spaced."""
@@ -312,7 +312,7 @@ class Crossval(_Seen):
 
     rasterizer: str = "drgs:ewa"
     """drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors)."""
-    preset: Literal["auto", "exact", "fast", "inria", "gsplat", "mitsuba"] = "auto"
+    preset: Literal["auto", Preset] = "auto"
     """The model that it claims to compute; auto: the one whose image is nearest."""
     ladder: bool = True
     """Say which approximations make that model differ from the exact one; --no-ladder saves the time."""
@@ -354,7 +354,7 @@ class Eval(_Common, _Data):
 
     run: Positional[Path]
     """A run folder."""
-    split: Literal["all", "train", "test"] = "test"
+    split: Split = "test"
     """Which views."""
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""

@@ -192,7 +192,7 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
     import torch
 
     import drgs
-    from drgs.fitting.active import at_most
+    from drgs.data.sizes import at_most
     from drgs.settings import RenderSettings
 
     def distance(camera: Camera) -> float | None:

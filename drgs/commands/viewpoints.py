@@ -16,8 +16,8 @@ from drgs.cameras import Camera, orbit
 from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
 from drgs.commands.render import cameras_of, is_camera_list, load_scene
 from drgs.data.camera_lists import load_cameras_json
+from drgs.data.sizes import at_most, resized_alike
 from drgs.files import Run
-from drgs.fitting.active import at_most, resized_alike
 from drgs.fitting.records import fit_record, fitted_views
 from drgs.settings import RenderSettings
 

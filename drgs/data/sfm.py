@@ -19,9 +19,9 @@ from drgs.guards.unfinished import temporary_folder
 if TYPE_CHECKING:
     from drgs.guards.outputs import Claim
 
-__all__ = ["SfmSummary", "run_sfm"]
+__all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
 
-_CAMERA_MODELS = (
+CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
     "SIMPLE_RADIAL",
@@ -29,6 +29,7 @@ _CAMERA_MODELS = (
     "OPENCV",
     "OPENCV_FISHEYE",
 )
+MATCHING = ("auto", "exhaustive", "sequential")
 _MAX_EXHAUSTIVE = 60
 _WINDOW = 10
 
@@ -96,9 +97,9 @@ def run_sfm(
     spaced = next((name for name in names if any(c.isspace() for c in name)), None)
     if spaced:
         raise ValueError(f"{image_dir}: photo names must be without spaces for COLMAP, got {spaced!r}; rename it")
-    if camera_model not in _CAMERA_MODELS:
-        raise ValueError(f"run_sfm: camera_model must be one of {', '.join(_CAMERA_MODELS)}, got {camera_model!r}")
-    if matching not in ("auto", "exhaustive", "sequential"):
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}")
+    if matching not in MATCHING:
         raise ValueError(f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one")
     with claim(out_dir, "sfm", inputs=[image_dir]) as output:
         _check_output(output, image_dir)

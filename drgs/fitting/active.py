@@ -19,90 +19,28 @@ import numpy as np
 import torch
 
 from drgs.data.guided import Matches
+from drgs.data.sizes import at_most, resized_alike
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, Run, write_json
-from drgs.fitting.frames import Frame, load_frames, reduced_size
-from drgs.guards.arguments import check_fields
+from drgs.fitting.frames import Frame, load_frames
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
-    from drgs.fitting.trainer import FitConfig
-    from drgs.select import Scoring
-    from drgs.settings import RenderSettings
+    from drgs.fitting.config import ActiveConfig, FitConfig
 
 __all__ = [
     "SELECTION",
-    "ActiveConfig",
     "ActiveViews",
-    "at_most",
     "initial_views",
-    "resized_alike",
 ]
 
 SELECTION = "selection.json"
-PICK_POINTS = ("auto", "uncovered", "none")
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ActiveConfig:
-    """How views are chosen during a fit.
-
-    Attributes:
-        policy: A name in `drgs.select.POLICIES`.
-        criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
-        method: Of the diagonal, see `drgs.fisher.diagonal`.
-        initial: Views at the start: the first of the training split, then those farthest from all before.
-        add: Views to be added, one at a time.
-        every: Steps between two of them, and before the first.
-        info_pixels: Pixels of the views that information is computed from; None: those of the fit.
-        prior: lambda, the prior precision of every parameter.
-        relative_prior: lambda is `prior` times the median of the group's positive information.
-        pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
-            Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
-            evenly among the views. `none`: no points after the start [1]. `auto`: `none` with initial points of the
-            whole data set, else `uncovered`.
-    """
-
-    policy: str = "fisher"
-    criterion: str = "eig"
-    method: str = "exact"
-    initial: int = 2
-    add: int = 10
-    every: int = 200
-    info_pixels: int | None = None
-    prior: float = 1e-6
-    relative_prior: bool = False
-    pick_points: str = "auto"
-
-    def __post_init__(self):
-        from drgs.gain import CRITERIA, METHODS, Prior
-        from drgs.select import POLICIES
-
-        if self.add == 0:
-            raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
-        count = (1, 10**9)
-        ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
-        choices = {"policy": POLICIES, "criterion": CRITERIA, "method": METHODS, "pick_points": PICK_POINTS}
-        check_fields("active", self, ranges, choices)
-        Prior(value=self.prior)
-
-    def scoring(self, settings: RenderSettings) -> Scoring:
-        """As `drgs.select` takes it, for views that are rendered with these settings."""
-        from drgs.gain import Prior
-        from drgs.select import Scoring
-
-        prior = Prior(value=self.prior, relative=self.relative_prior)
-        return Scoring(criterion=self.criterion, settings=settings, method=self.method, prior=prior)
-
-    def to_json(self) -> dict:
-        """As config.json, selection.json and the checkpoint hold it."""
-        return dataclasses.asdict(self)
 
 
 class ActiveViews:
@@ -318,22 +256,6 @@ class ActiveViews:
         if not view.is_checked:
             camera = resized_alike(camera, self._sizes)
         return at_most(camera, self._config.max_pixels)
-
-
-def at_most(camera: Camera, pixels: int) -> Camera:
-    """The camera with its image reduced to at most so many pixels."""
-    return camera.resized(*reduced_size(camera, pixels))
-
-
-def resized_alike(camera: Camera, sizes: dict[tuple[int, int], tuple[int, int]]) -> Camera:
-    """The camera at the size that its image probably has: images reduced after calibration are reduced alike.
-
-    Args:
-        camera: Of the size that the camera file states.
-        sizes: Stated (width, height) -> that of the file, of images that have been opened.
-    """
-    size = sizes.get((camera.width, camera.height))
-    return camera.resized(*size) if size else camera
 
 
 def initial_views(cameras: list[Camera], count: int) -> list[int]:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from drgs.data.sizes import reduced_size
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
 
-__all__ = ["Frame", "load_frames", "reduced_size"]
+__all__ = ["Frame", "load_frames"]
 
 _FLOAT_CACHE = 2 << 30  # bytes of images kept as float32; beyond it they are kept as 8 bits
 
@@ -78,9 +78,3 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
         )
         bar.advance()
     return frames
-
-
-def reduced_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
-    """(width, height) of a camera's image at no more than `max_pixels` pixels, and never larger than it is."""
-    scale = min(1.0, math.sqrt(max_pixels / (camera.width * camera.height)))
-    return max(1, int(camera.width * scale)), max(1, int(camera.height * scale))

@@ -14,8 +14,8 @@ import torch
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
+    from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
-    from drgs.fitting.trainer import FitConfig
     from drgs.integrator import Output
 
 __all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "ssim", "ssim_map", "terms_of"]

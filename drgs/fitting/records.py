@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.files import load_ply, load_state
+from drgs.fitting.config import FitConfig
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.trainer import FitConfig
 from drgs.guards.json_files import check_json, read_json
 
 if TYPE_CHECKING:

@@ -6,8 +6,6 @@ of random order. `drgs.train` adds files, progress and the command.
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -15,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.losses import LossTerm, terms_of
 from drgs.fitting.networks import Network, Rate, rate_at
 from drgs.fitting.rows import GaussianRows
-from drgs.guards.arguments import check_fields, must_be
 from drgs.integrator import render
-from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -32,121 +29,6 @@ __all__ = ["FitConfig", "Trainer"]
 
 _MAX_BAD_STEPS = 10
 _RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # what a checkpoint has besides networks
-
-_COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
-_RANGES = {
-    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
-    "test_every": (0, 10**9),
-    "seed": (0, 2**31 - 1),  # what COLMAP takes
-    "means_rate": (1e-30, 1e6),  # their logarithms are interpolated
-    **dict.fromkeys(("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate"), _RATE),
-    **dict.fromkeys(("outside_weight", "opacity_weight", "scale_weight", "noise"), _WEIGHT),
-    **dict.fromkeys(("initial_opacity", "dense_opacity"), (1e-6, 1 - 1e-6)),
-    **dict.fromkeys(("ssim_weight", "sh_every", "refine_start", "refine_stop", "refine_every"), _SHARE),
-    **dict.fromkeys(("min_opacity", "grow_until"), _SHARE),
-    "dense_scale": (1e-6, 1e6),
-    "jitter": (0.0, 1e3),
-}
-_CHOICES = {
-    "mask": ("auto", "object", "valid", "ignore"),
-    "init_points": ("auto", "views", "all"),
-    "sh_degree": (0, 1, 2, 3),
-}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FitConfig:
-    """Everything that determines a fit besides its data. Fractions are of `max_steps`.
-
-    Attributes:
-        settings: What `drgs.render` computes.
-        max_steps: Optimizer steps.
-        max_pixels: Images are reduced to at most this many pixels.
-        max_gaussians: Budget of the density control, at the start as later.
-        init_points: `auto` (the data set's points, else `views`), `views` (only what the training views show) or, in
-            an active fit, where `auto` is `views`, `all` (the data set's points, else what all its views show).
-        test_every: Every n-th view by name is held out; 0 holds out none.
-        seed: Of everything random.
-        sh_degree: Highest degree of the view-dependent color.
-        deterministic: One Dr.Jit thread, hence the same bits for the same seed.
-        save_every: Steps between checkpoints.
-        mask: `object` (nothing is outside), `valid` (anything may be outside), `ignore`, or `auto`: `object` where
-            the data set has mask files, `valid` where undistorted photographs have empty corners.
-        means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
-        dc_rate, rest_rate, opacity_rate, scale_rate, rotation_rate: Learning rates of the other parameters.
-        ssim_weight: Of 1 - SSIM against L1.
-        outside_weight: Of the opacity outside an `object` mask.
-        opacity_weight, scale_weight: Regularizers of MCMC density control.
-        initial_opacity: Of every Gaussian at the start.
-        dense_opacity, dense_scale: The same, and a factor of the scales, for points from depth maps: these cover the
-            surfaces already, and wide transparent Gaussians would only make every ray meet hundreds of them (half the
-            time, for the same PSNR, on the still life and on `office`).
-        sh_every: Fraction between two degrees of SH.
-        refine_start, refine_stop, refine_every: Fractions between which, and how often, density is controlled.
-        min_opacity: Below it a Gaussian is moved elsewhere.
-        grow_until: Fraction at which the budget is reached, at a constant rate of growth.
-        noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it
-            cost 0.4 dB of held-out PSNR (28.0 against 28.4).
-        jitter: Displacement of copies in their own standard deviations.
-    """
-
-    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
-    max_steps: int = 3000
-    max_pixels: int = 130_000
-    max_gaussians: int = 30_000
-    init_points: str = "auto"
-    test_every: int = 8
-    seed: int = 0
-    sh_degree: int = 3
-    deterministic: bool = False
-    save_every: int = 1000
-    mask: str = "auto"
-    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
-    dc_rate: float = 2.5e-3
-    rest_rate: float = 1.25e-4
-    opacity_rate: float = 0.05
-    scale_rate: float = 5e-3
-    rotation_rate: float = 1e-3
-    ssim_weight: float = 0.2
-    outside_weight: float = 1.0
-    opacity_weight: float = 0.01
-    scale_weight: float = 0.01
-    initial_opacity: float = 0.1
-    dense_opacity: float = 0.3
-    dense_scale: float = 0.5
-    sh_every: float = 1 / 30
-    refine_start: float = 1 / 30
-    refine_stop: float = 0.8
-    refine_every: float = 1 / 30
-    min_opacity: float = 0.005
-    grow_until: float = 0.5
-    noise: float = 0.0
-    jitter: float = 0.1
-
-    def __post_init__(self):
-        check_fields("fit", self, _RANGES, _CHOICES)
-        if self.test_every == 1:
-            raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
-
-    def start_of(self, dense: bool) -> tuple[float, float]:
-        """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
-        return (self.dense_opacity, self.dense_scale) if dense else (self.initial_opacity, 1.0)
-
-    def to_json(self) -> dict:
-        """As config.json holds it."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
-
-    @classmethod
-    def from_json(cls, value: dict) -> FitConfig:
-        """The inverse of `to_json`; unknown fields raise ValueError."""
-        known = {field.name for field in dataclasses.fields(cls)}
-        must_be("fit", "config", value, dict, "as FitConfig.to_json() makes it")
-        must_be("fit", "settings", value.get("settings", {}), dict, "the fields of a RenderSettings")
-        if unknown := sorted(set(value) - known):
-            raise ValueError(f"fit: config must hold known fields, got {unknown[0]!r}; was it written by a newer drgs?")
-        settings = RenderSettings().replace(**value.get("settings", {}))
-        value = {k: tuple(v) if isinstance(v, list) else v for k, v in value.items()}
-        return cls(**{**value, "settings": settings})
 
 
 class Trainer:

@@ -7,7 +7,7 @@ import functools
 import math
 import numbers
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 __all__ = ["ArgumentError", "check_fields", "kind_of", "must_be"]
@@ -53,24 +53,23 @@ def check_fields(
     where: str,
     record: Any,
     ranges: Mapping[str, tuple[float, float]] = {},
-    choices: Mapping[str, Sequence] = {},
 ) -> None:
     """Raise ValueError unless the fields of a frozen dataclass have their annotated types and lie in their ranges.
 
-    Numbers are finite; a whole number may stand for a float, and a NumPy or torch scalar for a Python one, which
-    replaces it in the record.
+    Of a field annotated as a `Literal`, the value is one of those. Numbers are finite; a whole number may stand for a
+    float, and a NumPy or torch scalar for a Python one, which replaces it in the record.
 
     Args:
         where: The record, for the message.
         record: An instance of a dataclass.
         ranges: Field -> (lowest, highest), both allowed; of tuples, each of their numbers.
-        choices: Field -> what it may be.
     """
     for name, hint in _hints(type(record)).items():
         value = getattr(record, name)
-        if name in choices:
-            if isinstance(value, bool) or not any(isinstance(value, type(x)) and value == x for x in choices[name]):
-                shown = ", ".join(map(str, choices[name]))
+        if typing.get_origin(hint) is typing.Literal:
+            choices = typing.get_args(hint)
+            if isinstance(value, bool) or not any(isinstance(value, type(x)) and value == x for x in choices):
+                shown = ", ".join(map(str, choices))
                 raise ValueError(f"{where}: {name} must be one of {shown}, got {value!r}")
             continue
         low, high = ranges.get(name, (-math.inf, math.inf))

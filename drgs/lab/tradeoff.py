@@ -1,8 +1,7 @@
-"""Times and errors of render settings against preset `exact`, for `drgs tradeoff` (tradeoff.py says what they mean)."""
+"""Times and errors of render settings against preset `exact`, (what they are: commands/tradeoff.py)."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import random
 import statistics
@@ -16,12 +15,13 @@ import torch
 import drgs
 from drgs import runtime
 from drgs.lab.tradeoff_advice import interval
+from drgs.lab.tradeoff_rows import one_line, rows_of
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.tradeoff import Variant
     from drgs.ellipsoids import Gaussians
+    from drgs.lab.tradeoff_rows import Variant
 
 __all__ = ["clocked", "measure", "placed"]
 
@@ -63,7 +63,7 @@ def measure(
     """
     gaussians = placed(gaussians)
     stage = _Stage(gaussians, cameras, seed)
-    rows = _rows_of(variants, fields or {})
+    rows = rows_of(variants, fields or {})
     turns = [_Turn(row, stage) for row in rows if row["skipped"] is None and row["by"] == "view"]
     truth, others = turns[0], turns[1:]
     again = _Turn(dict(truth.row), stage)  # the truth once more in every round: how much equal work scatters
@@ -183,7 +183,7 @@ class _Turn:
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
             if number % len(self.stage.cameras) not in self.stage.truth:
                 raise  # this is the truth
-            self.row["skipped"] = _line(error)
+            self.row["skipped"] = one_line(error)
 
     def _take(self, number, timed):
         stage, view, share = self.stage, number % len(self.stage.cameras), self.row["share"]
@@ -201,7 +201,7 @@ class _Turn:
             try:
                 parts, took["fisher"] = clocked(lambda: stage.information(camera, self.settings, share))
             except NotImplementedError as error:
-                self.row["notes"]["information"] = _line(error)
+                self.row["notes"]["information"] = one_line(error)
         if number == 0:
             self.first = sum(took.values())
         if timed:
@@ -252,28 +252,6 @@ class _Turn:
         self.row["first_call"] = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
 
 
-def _rows_of(variants, fields: dict) -> list[dict]:
-    """Rows without numbers; those that cannot or need not be measured say why."""
-    rows, seen = [], {}
-    for variant in variants:
-        row = {"name": variant.name, "kind": variant.kind, "share": variant.share, "by": variant.by, "skipped": None}
-        row |= {"settings": None, "image": None, "gradient": None, "information": None, "notes": {}}
-        row |= {"seconds": None, "ratio": None, "times": None, "first_call": None, "full": {}}
-        try:
-            settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
-        except (ValueError, NotImplementedError) as error:
-            if not rows:
-                raise  # the truth itself
-            row["skipped"] = _line(error)
-        else:
-            row["settings"] = dataclasses.asdict(settings)
-            same = seen.setdefault((settings, variant.share, variant.by == "oracle"), variant.name)
-            if same != variant.name:
-                row["skipped"] = f"the same as {same}, with these --set"
-        rows.append(row)
-    return rows
-
-
 def _sampled(rows, stage: _Stage, truth: _Turn, seed: int) -> dict:
     """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
     camera, count = stage.cameras[stage.sampled], len(stage.gaussians)
@@ -288,7 +266,7 @@ def _sampled(rows, stage: _Stage, truth: _Turn, seed: int) -> dict:
         try:
             found = _by_rays(row, stage, truth, chosen)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
-            row["skipped"] = _line(error)
+            row["skipped"] = one_line(error)
             continue
         if row["by"] == "oracle":
             own = found
@@ -431,7 +409,3 @@ def _clock_name() -> str:
     """With one thread, time of the processor: what else runs on the machine does not stretch it."""
     backend = runtime.backend()
     return "processor" if backend.name == "llvm" and backend.threads == 1 else "wall"
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()).removeprefix("RenderSettings: ") or type(error).__name__

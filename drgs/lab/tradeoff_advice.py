@@ -53,7 +53,7 @@ def recommend(measured: dict, use: str, budgets) -> list[dict]:
     """For each budget the fastest setting with a gain, the most exact one of those as fast, or why there is none.
 
     Args:
-        measured: Of `tradeoff_measure.measure`, and what `tradeoff_full.measure_full` added to its rows under `full`:
+        measured: Of `tradeoff.measure`, and what `tradeoff_full.measure_full` added to its rows under `full`:
             where a clock was read at full size, only that counts. Rows of a reduced resolution and rows that were
             measured on a sample of the rays are no candidates.
         use: One of `USES`.

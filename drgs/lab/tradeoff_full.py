@@ -15,7 +15,7 @@ from collections.abc import Callable
 import torch
 
 import drgs
-from drgs.fitting.active import at_most
+from drgs.data.sizes import at_most
 from drgs.lab.tradeoff import clocked, placed
 from drgs.lab.tradeoff_advice import interval, leaders
 from drgs.settings import RenderSettings
@@ -33,7 +33,7 @@ def measure_full(
     """Times at full size, into the rows' `full`: clock -> ratio, low, high, rounds, seconds.
 
     Args:
-        measured: Of `tradeoff_measure.measure`.
+        measured: Of `tradeoff.measure`.
         gaussians: On the device that they are rendered on.
         cameras: Pinhole, as large as they are drawn.
         budgets: Of errors.

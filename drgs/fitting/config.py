@@ -1,0 +1,185 @@
+"""What a fit does, as two frozen records; imports nothing heavy, for the options of the command line read it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import TYPE_CHECKING, Literal
+
+from drgs.guards.arguments import check_fields, must_be
+from drgs.information.choices import Criterion, Method, Policy
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.select import Scoring
+
+__all__ = ["ActiveConfig", "Degree", "FitConfig", "InitPoints", "Mask", "PickPoints"]
+
+InitPoints = Literal["auto", "views", "all"]
+Mask = Literal["auto", "object", "valid", "ignore"]
+PickPoints = Literal["auto", "uncovered", "none"]
+Degree = Literal[0, 1, 2, 3]
+
+_COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
+_RANGES = {
+    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
+    "test_every": (0, 10**9),
+    "seed": (0, 2**31 - 1),  # what COLMAP takes
+    "means_rate": (1e-30, 1e6),  # their logarithms are interpolated
+    **dict.fromkeys(("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate"), _RATE),
+    **dict.fromkeys(("outside_weight", "opacity_weight", "scale_weight", "noise"), _WEIGHT),
+    **dict.fromkeys(("initial_opacity", "dense_opacity"), (1e-6, 1 - 1e-6)),
+    **dict.fromkeys(("ssim_weight", "sh_every", "refine_start", "refine_stop", "refine_every"), _SHARE),
+    **dict.fromkeys(("min_opacity", "grow_until"), _SHARE),
+    "dense_scale": (1e-6, 1e6),
+    "jitter": (0.0, 1e3),
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """Everything that determines a fit besides its data. Fractions are of `max_steps`.
+
+    Attributes:
+        settings: What `drgs.render` computes.
+        max_steps: Optimizer steps.
+        max_pixels: Images are reduced to at most this many pixels.
+        max_gaussians: Budget of the density control, at the start as later.
+        init_points: `auto` (the data set's points, else `views`), `views` (only what the training views show) or, in
+            an active fit, where `auto` is `views`, `all` (the data set's points, else what all its views show).
+        test_every: Every n-th view by name is held out; 0 holds out none.
+        seed: Of everything random.
+        sh_degree: Highest degree of the view-dependent color.
+        deterministic: One Dr.Jit thread, hence the same bits for the same seed.
+        save_every: Steps between checkpoints.
+        mask: `object` (nothing is outside), `valid` (anything may be outside), `ignore`, or `auto`: `object` where
+            the data set has mask files, `valid` where undistorted photographs have empty corners.
+        means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
+        dc_rate, rest_rate, opacity_rate, scale_rate, rotation_rate: Learning rates of the other parameters.
+        ssim_weight: Of 1 - SSIM against L1.
+        outside_weight: Of the opacity outside an `object` mask.
+        opacity_weight, scale_weight: Regularizers of MCMC density control.
+        initial_opacity: Of every Gaussian at the start.
+        dense_opacity, dense_scale: The same, and a factor of the scales, for points from depth maps: these cover the
+            surfaces already, and wide transparent Gaussians would only make every ray meet hundreds of them (half the
+            time, for the same PSNR, on the still life and on `office`).
+        sh_every: Fraction between two degrees of SH.
+        refine_start, refine_stop, refine_every: Fractions between which, and how often, density is controlled.
+        min_opacity: Below it a Gaussian is moved elsewhere.
+        grow_until: Fraction at which the budget is reached, at a constant rate of growth.
+        noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it
+            cost 0.4 dB of held-out PSNR (28.0 against 28.4).
+        jitter: Displacement of copies in their own standard deviations.
+    """
+
+    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
+    max_steps: int = 3000
+    max_pixels: int = 130_000
+    max_gaussians: int = 30_000
+    init_points: InitPoints = "auto"
+    test_every: int = 8
+    seed: int = 0
+    sh_degree: Degree = 3
+    deterministic: bool = False
+    save_every: int = 1000
+    mask: Mask = "auto"
+    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
+    dc_rate: float = 2.5e-3
+    rest_rate: float = 1.25e-4
+    opacity_rate: float = 0.05
+    scale_rate: float = 5e-3
+    rotation_rate: float = 1e-3
+    ssim_weight: float = 0.2
+    outside_weight: float = 1.0
+    opacity_weight: float = 0.01
+    scale_weight: float = 0.01
+    initial_opacity: float = 0.1
+    dense_opacity: float = 0.3
+    dense_scale: float = 0.5
+    sh_every: float = 1 / 30
+    refine_start: float = 1 / 30
+    refine_stop: float = 0.8
+    refine_every: float = 1 / 30
+    min_opacity: float = 0.005
+    grow_until: float = 0.5
+    noise: float = 0.0
+    jitter: float = 0.1
+
+    def __post_init__(self):
+        check_fields("fit", self, _RANGES)
+        if self.test_every == 1:
+            raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
+
+    def start_of(self, dense: bool) -> tuple[float, float]:
+        """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
+        return (self.dense_opacity, self.dense_scale) if dense else (self.initial_opacity, 1.0)
+
+    def to_json(self) -> dict:
+        """As config.json holds it."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    @classmethod
+    def from_json(cls, value: dict) -> FitConfig:
+        """The inverse of `to_json`; unknown fields raise ValueError."""
+        known = {field.name for field in dataclasses.fields(cls)}
+        must_be("fit", "config", value, dict, "as FitConfig.to_json() makes it")
+        must_be("fit", "settings", value.get("settings", {}), dict, "the fields of a RenderSettings")
+        if unknown := sorted(set(value) - known):
+            raise ValueError(f"fit: config must hold known fields, got {unknown[0]!r}; was it written by a newer drgs?")
+        settings = RenderSettings().replace(**value.get("settings", {}))
+        value = {k: tuple(v) if isinstance(v, list) else v for k, v in value.items()}
+        return cls(**{**value, "settings": settings})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActiveConfig:
+    """How views are chosen during a fit.
+
+    Attributes:
+        policy: A name in `drgs.select.POLICIES`.
+        criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
+        method: Of the diagonal, see `drgs.fisher.diagonal`.
+        initial: Views at the start: the first of the training split, then those farthest from all before.
+        add: Views to be added, one at a time.
+        every: Steps between two of them, and before the first.
+        info_pixels: Pixels of the views that information is computed from; None: those of the fit.
+        prior: lambda, the prior precision of every parameter.
+        relative_prior: lambda is `prior` times the median of the group's positive information.
+        pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
+            Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
+            evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
+            initial points of the whole data set, else `uncovered`.
+    """
+
+    policy: Policy = "fisher"
+    criterion: Criterion = "eig"
+    method: Method = "exact"
+    initial: int = 2
+    add: int = 10
+    every: int = 200
+    info_pixels: int | None = None
+    prior: float = 1e-6
+    relative_prior: bool = False
+    pick_points: PickPoints = "auto"
+
+    def __post_init__(self):
+        from drgs.gain import Prior
+
+        if self.add == 0:
+            raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
+        count = (1, 10**9)
+        ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
+        check_fields("active", self, ranges)
+        Prior(value=self.prior)
+
+    def scoring(self, settings: RenderSettings) -> Scoring:
+        """As `drgs.select` takes it, for views that are rendered with these settings."""
+        from drgs.gain import Prior
+        from drgs.select import Scoring
+
+        prior = Prior(value=self.prior, relative=self.relative_prior)
+        return Scoring(criterion=self.criterion, settings=settings, method=self.method, prior=prior)
+
+    def to_json(self) -> dict:
+        """As config.json, selection.json and the checkpoint hold it."""
+        return dataclasses.asdict(self)

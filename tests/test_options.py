@@ -1,0 +1,86 @@
+"""Options of the command line offer what there is, and default to what a call from Python would do."""
+
+import ast
+import dataclasses
+import inspect
+import subprocess
+import sys
+import typing
+from pathlib import Path
+
+import pytest
+
+from drgs import fisher, gain, select
+from drgs.commands import options
+from drgs.data import sfm
+from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.settings import PRESETS, RenderSettings
+
+
+def _choices(command: type, name: str) -> tuple:
+    """What an option may be, by its type."""
+    return typing.get_args(typing.get_type_hints(command)[name])
+
+
+@pytest.mark.parametrize("config", [FitConfig, ActiveConfig])
+def test_fit_options_are_those_of_its_configs(config):
+    """Every option of `fit` named as a field of FitConfig or ActiveConfig has its default and its type, choices
+    included; and every field of ActiveConfig is an option.
+    """
+    fields, offered = typing.get_type_hints(config), typing.get_type_hints(options.Fit)
+    shared = set(fields) & {field.name for field in dataclasses.fields(options.Fit)}
+    assert len(shared) >= 10
+    for name in shared:
+        assert getattr(options.Fit, name) == getattr(config, name), name
+        assert offered[name] == fields[name], name
+    if config is ActiveConfig:
+        assert shared == set(fields)
+
+
+@pytest.mark.parametrize("command", [options.Select, options.Fisher])
+def test_information_options_are_those_of_an_active_fit(command):
+    """`select` and `fisher` weigh views as an active fit does; Python's `Prior()` and `Scoring()` agree."""
+    for name in ("method", "prior", "relative_prior", "info_pixels", "policy", "criterion"):
+        if hasattr(command, name):
+            assert getattr(command, name) == getattr(ActiveConfig, name)
+    prior, scoring = gain.Prior(), select.Scoring()
+    assert (command.prior, command.relative_prior) == (prior.value, prior.relative)
+    assert (command.method, ActiveConfig.criterion) == (scoring.method, scoring.criterion)
+
+
+def test_choices_are_what_there_is():
+    """Presets, policies, criteria, methods, lenses and ways of matching: no more and no fewer than the code knows."""
+    for command in (options.Render, options.Fit, options.Select, options.Fisher, options.Tradeoff):
+        assert _choices(command, "preset") == PRESETS
+    assert _choices(options.Crossval, "preset") == ("auto", *PRESETS)
+    assert len({RenderSettings.preset(name) for name in PRESETS}) == len(PRESETS)
+    assert options.Fit.preset == next(name for name in PRESETS if RenderSettings.preset(name) == FitConfig().settings)
+    for command in (options.Fit, options.Select):
+        assert _choices(command, "policy") == tuple(select.POLICIES)
+        assert _choices(command, "criterion") == gain.CRITERIA
+        assert _choices(command, "method") == fisher.METHODS
+    parameters = inspect.signature(sfm.run_sfm).parameters
+    assert _choices(options.Sfm, "camera_model") == sfm.CAMERA_MODELS
+    assert _choices(options.Sfm, "matcher") == sfm.MATCHING
+    assert options.Sfm.camera_model == parameters["camera_model"].default
+    assert options.Sfm.matcher == parameters["matching"].default
+    assert options.Sfm.seed == parameters["seed"].default
+
+
+def test_options_import_nothing_heavy():
+    """The lists and records that options are read from come without torch, NumPy and Dr.Jit."""
+    code = "import sys; import drgs.cli; print([x for x in ('torch', 'numpy', 'drjit', 'cv2') if x in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_arrows_point_down_from_commands():
+    """Nothing outside of drgs/commands and the command line imports a command, not even for its types."""
+    root = Path(options.__file__).parents[1]
+    above = {root / "cli.py", *(root / "commands").glob("*.py")}
+    for path in set(root.rglob("*.py")) - above:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
+            assert not any(name.startswith("drgs.commands") for name in names), path
