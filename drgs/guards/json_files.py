@@ -104,6 +104,7 @@ def _is(value: Any, kind: Any) -> bool:
 
 
 def _name(kind: Any) -> str:
+    """What a value of a kind is called in an error."""
     if isinstance(kind, list | dict):
         kind = type(kind)
     names = {

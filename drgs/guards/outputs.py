@@ -321,6 +321,7 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
 
 
 def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim:
+    """A new claim: the folder made and locked, its journal read; all undone if that fails."""
     if held is not None:
         raise ValueError(f"{folder}: must not be written by two threads at once; choose another folder")
     made, new = Claim(path, command), _make(folder, path)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
 from drgs.lab.accuracy import random_camera, random_gaussians
 from drgs.settings import RenderSettings
 
@@ -20,6 +22,9 @@ __all__ = ["CASES", "SIZE", "Case"]
 
 SIZE = (9, 7)
 """Width and height of the images, unless a case says otherwise."""
+
+Built = tuple[Gaussians, Camera]
+Builder = Callable[[np.random.Generator], Built]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Case:
     """
 
     name: str
-    build: Callable
+    build: Builder
     preset: str = "exact"
     fields: dict = dataclasses.field(default_factory=dict)
     bvh: str = "holds"
@@ -58,14 +63,16 @@ class Case:
         return ("tiles",) if self.bvh == "skip" or self.settings.response == "ewa" else ("tiles", "bvh")
 
 
-def _base(rng, size=SIZE, n=12, K=4, D=0, **options):
+def _base(
+    rng: np.random.Generator, size: tuple[int, int] = SIZE, n: int = 12, K: int = 4, D: int = 0, **options
+) -> Built:
     return random_gaussians(rng, n, K, D, **options), random_camera(rng, size)
 
 
-def _change(change, **options):
+def _change(change: Callable[[Gaussians, Camera], None], **options) -> Builder:
     """A case's builder: a random scene, changed in place by `change(g, cam)`."""
 
-    def build(rng):
+    def build(rng: np.random.Generator) -> Built:
         g, cam = _base(rng, **options)
         with torch.no_grad():
             change(g, cam)
@@ -74,10 +81,10 @@ def _change(change, **options):
     return build
 
 
-def _at_camera(offset, scale=0.3):
+def _at_camera(offset: Sequence[float], scale: float = 0.3) -> Builder:
     """The first Gaussian, round, at `offset` (camera axes) from the camera center."""
 
-    def change(g, cam):
+    def change(g: Gaussians, cam: Camera) -> None:
         c2w = cam.c2w
         g.means[0] = torch.tensor(c2w[:3, :3] @ np.asarray(offset, float) + c2w[:3, 3])
         g.log_scales[0] = math.log(scale) + torch.tensor([0.0, 0.2, -0.2])
@@ -86,7 +93,7 @@ def _at_camera(offset, scale=0.3):
     return _change(change)
 
 
-def _on_axes(rng):
+def _on_axes(rng: np.random.Generator) -> Built:
     """Means exactly on the camera's axes and diagonal, Gaussians aligned with them: ties of every choice of a frame."""
     g, cam = random_gaussians(rng, 12, 4), random_camera(rng, SIZE, turn=0.0)
     places = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]
@@ -100,10 +107,10 @@ def _on_axes(rng):
     return g, cam
 
 
-def _scaled(factor):
+def _scaled(factor: float) -> Builder:
     """Everything, the camera's distance included, in other units."""
 
-    def build(rng):
+    def build(rng: np.random.Generator) -> Built:
         g, cam = _base(rng)
         with torch.no_grad():
             g.means.mul_(factor)
@@ -115,45 +122,52 @@ def _scaled(factor):
     return build
 
 
-def _on_rays(g, cam, which):
+def _on_rays(g: Gaussians, cam: Camera, which: Sequence[int]) -> None:
     """Move Gaussians onto rays through pixel centers, so that even the thinnest is hit."""
     d = cam.pixel_directions().reshape(-1, 3)[3 :: len(cam.pixel_directions().reshape(-1, 3)) // len(g) or 1]
     for k, i in enumerate(which):
         g.means[i] = torch.tensor(cam.center + (3.5 + 0.1 * i) * d[k % len(d)])
 
 
-def _scales(g, cam):
+def _scales(g: Gaussians, cam: Camera) -> None:
+    """The thinnest and the widest, both in the picture."""
     _on_rays(g, cam, range(4))
     g.log_scales[:4] = math.log(1e-7)
     g.log_scales[4:6] = math.log(1e4)
 
 
-def _huge(g, cam):
+def _huge(g: Gaussians, cam: Camera) -> None:
+    """Three so wide that the camera is inside."""
     g.log_scales[:3] = math.log(1e4)
     g.logit_opacities[:3] = -2.0
 
 
-def _needles(g, cam):
+def _needles(g: Gaussians, cam: Camera) -> None:
+    """Each on a ray of its own."""
     _on_rays(g, cam, range(len(g)))
     g.log_scales[:, 0], g.log_scales[:, 1:] = 0.0, math.log(1e-6)
 
 
-def _sheets(g, cam):
+def _sheets(g: Gaussians, cam: Camera) -> None:
+    """As wide as the scene, and without thickness."""
     g.log_scales[:, :2], g.log_scales[:, 2] = math.log(0.5), math.log(0.5e-6)
 
 
-def _opacities(g, cam):
+def _opacities(g: Gaussians, cam: Camera) -> None:
+    """From nothing to 1 - 1e-7, and logits whose sigmoid is 0 or 1 in float32."""
     g.logit_opacities[:4] = math.log(1e-8)
     g.logit_opacities[4:8] = 16.1
     g.logit_opacities[8:10] = -100.0
     g.logit_opacities[10:] = 100.0
 
 
-def _half(g, cam):
+def _half(g: Gaussians, cam: Camera) -> None:
+    """Half of the Gaussians: logit 0, where the two branches of a stable sigmoid meet."""
     g.logit_opacities[::2] = 0.0
 
 
-def _coincident(g, cam):
+def _coincident(g: Gaussians, cam: Camera) -> None:
+    """All at one place, of one shape, faint enough that the last one shows."""
     for x in (g.means, g.quats, g.log_scales):
         x[:] = x[:1]
     g.means[:] = 0
@@ -161,7 +175,7 @@ def _coincident(g, cam):
     g.logit_opacities[:] = -5.0 + torch.rand(len(g), generator=torch.Generator().manual_seed(0))
 
 
-def _equal_depths(rng):
+def _equal_depths(rng: np.random.Generator) -> Built:
     """A plane of equal camera z, mirrored pairs at equal distance."""
     g, cam = random_gaussians(rng, 12, 4), random_camera(rng, SIZE, turn=0.0)
     with torch.no_grad():
@@ -172,7 +186,7 @@ def _equal_depths(rng):
     return g, cam
 
 
-def _offset(rng, where):
+def _offset(rng: np.random.Generator, where: str) -> Built:
     """A world 1e6 from zero whose detail is 1e-2: float64 means, or float32 means relative to `origin`."""
     g, cam = _base(rng)
     shift = np.array([1e6, -7e5, 3e5])
@@ -188,8 +202,10 @@ def _offset(rng, where):
     return g.replace(means=means, origin=origin), dataclasses.replace(cam, w2c=pose.requires_grad_())
 
 
-def _focal(focal):
-    def build(rng):
+def _focal(focal: float) -> Builder:
+    """A view with this focal length in pixels; with a long one, of Gaussians small and close enough to be in it."""
+
+    def build(rng: np.random.Generator) -> Built:
         g = random_gaussians(rng, 12, 4)
         cam = random_camera(rng, SIZE, focal=focal, turn=0.0)
         if focal > 100:
@@ -202,12 +218,13 @@ def _focal(focal):
     return build
 
 
-def _covering(g, cam):
+def _covering(g: Gaussians, cam: Camera) -> None:
+    """One that is opaque over the whole picture, one unit away."""
     g.means[0] = torch.tensor(cam.c2w[:3, :3] @ [0, 0, 1.0] + cam.c2w[:3, 3])
     g.log_scales[0] = math.log(100.0)
 
 
-def _layers(rng, n=1000):
+def _layers(rng: np.random.Generator, n: int = 1000) -> Built:
     """Opaque layers: T underflows within a few of them."""
     g, cam = random_gaussians(rng, n, 1), random_camera(rng, SIZE)
     with torch.no_grad():
@@ -216,26 +233,20 @@ def _layers(rng, n=1000):
     return g, cam
 
 
-def _quaternions(g, cam):
+def _quaternions(g: Gaussians, cam: Camera) -> None:
+    """Lengths far from 1, and the negative, which is the same rotation."""
     g.quats[:4] *= 1e-20
     g.quats[4:8] *= 1e15
     g.quats[8:] *= -1
 
 
-def _negative(g, cam):
+def _negative(g: Gaussians, cam: Camera) -> None:
+    """Colors below 0, which are clamped; every other one in two channels only."""
     g.sh[:, 0] = -4.0
     g.sh[::2, 0, 1] = 1.0
 
 
-def _one(rng):
-    return _base(rng, n=1)
-
-
-def _none(rng):
-    return _base(rng, n=0)
-
-
-def _subpixel(g, cam):
+def _subpixel(g: Gaussians, cam: Camera) -> None:
     """Standard deviations of 1e-3 pixels; the second half between pixel centers, where only a dilation shows them."""
     sigma = 1e-3 * 4 / float(cam.K[0, 0])
     g.log_scales[:] = math.log(sigma) + torch.tensor([0.0, 0.3, -0.3])
@@ -243,7 +254,7 @@ def _subpixel(g, cam):
     g.means[:6] += 0.5 * sigma * torch.tensor([1.0, -1.0, 0.0])
 
 
-def _behind_clamp(g, cam):
+def _behind_clamp(g: Gaussians, cam: Camera) -> None:
     """On all four sides, beyond the field of view at which rasterizers clamp x/z and y/z, and large enough to show."""
     tan = cam.width / (2 * cam.K[0, 0]), cam.height / (2 * cam.K[1, 1])
     for i, (x, y) in enumerate(((3, 0.2), (-3, 0.1), (0.1, 3), (-0.3, -3), (2, 2), (1.31, 0))):
@@ -253,10 +264,10 @@ def _behind_clamp(g, cam):
         g.logit_opacities[i] = 0.0
 
 
-def _at_near(near):
+def _at_near(near: float) -> Builder:
     """One just beyond the near plane, one just before it, both reaching through it."""
 
-    def change(g, cam):
+    def change(g: Gaussians, cam: Camera) -> None:
         for i, z in enumerate((1.001 * near, 0.999 * near)):
             g.means[i] = torch.tensor(cam.c2w[:3, :3] @ [0.3 * z, -0.2 * z, z] + cam.c2w[:3, 3])
             g.log_scales[i] = math.log(near)
@@ -265,7 +276,7 @@ def _at_near(near):
     return _change(change)
 
 
-def _translucent_layers(rng):
+def _translucent_layers(rng: np.random.Generator) -> Built:
     """Layers that end a ray at a transmittance of 1e-4 and are not clamped, so that no product is a tie."""
     g, cam = _layers(rng, 300)
     with torch.no_grad():
@@ -273,7 +284,7 @@ def _translucent_layers(rng):
     return g, cam
 
 
-def _beyond_float32(g, cam):
+def _beyond_float32(g: Gaussians, cam: Camera) -> None:
     """Activations that overflow or vanish in float32."""
     g.log_scales[0], g.log_scales[1] = 60.0, -60.0
     g.log_scales[2] = torch.tensor([-40.0, 0.0, 40.0])
@@ -281,7 +292,7 @@ def _beyond_float32(g, cam):
     g.means[5], g.means[6] = 1e15, -1e15
 
 
-def _hidden(g, cam):
+def _hidden(g: Gaussians, cam: Camera) -> None:
     """Two Gaussians behind the camera, two that only a view of what is to the right of the image sees."""
     for i, place in enumerate(([0, 0, -3.0], [0.5, 0.3, -2.0], [3.2, 0, 4.0], [3.4, 0.2, 4.0])):
         g.means[i] = torch.tensor(cam.c2w[:3, :3] @ place + cam.c2w[:3, 3])
@@ -297,7 +308,7 @@ _MODES = {
 }
 
 
-def _cases(name: str, build: Callable, modes: str = "exact", **options) -> list[Case]:
+def _cases(name: str, build: Builder, modes: str = "exact", **options) -> list[Case]:
     """A scene in each of the modes, which are named where they are not `exact`."""
     fields = options.pop("fields", {})
     return [

@@ -17,10 +17,12 @@ from drgs.settings import RenderSettings
 
 __all__ = ["REFUSALS", "Refusal"]
 
+Attempts = Iterator[tuple[Callable[[], object], str]]
+
 
 @dataclasses.dataclass(frozen=True)
 class Refusal:
-    """One kind of it.
+    """One kind of such input.
 
     Attributes:
         name: As printed.
@@ -29,7 +31,7 @@ class Refusal:
     """
 
     name: str
-    attempts: Callable[[], Iterator[tuple[Callable, str]]]
+    attempts: Callable[[], Attempts]
     warns: bool = False
 
 
@@ -45,7 +47,8 @@ def _with(field: str, value: float) -> Gaussians:
     return g
 
 
-def _not_finite():
+def _not_finite() -> Attempts:
+    """Every parameter, NaN and both infinities, rendered and differentiated."""
     _, cam = _scene()
     for field in ("means", "quats", "log_scales", "logit_opacities", "sh", "features"):
         for value in (math.nan, math.inf, -math.inf):
@@ -57,7 +60,7 @@ def _not_finite():
                     yield lambda g=g, settings=settings: fisher.diagonal(g, cam, settings), told
 
 
-def _zero_quaternion():
+def _zero_quaternion() -> Attempts:
     _, cam = _scene()
     g = _with("quats", 0.0)
     for traversal in ("tiles", "bvh"):
@@ -65,7 +68,8 @@ def _zero_quaternion():
         yield lambda settings=settings: render(g, cam, settings), "quats must not be 0"
 
 
-def _broken_camera():
+def _broken_camera() -> Attempts:
+    """A camera is refused when it is made, and once more when its pose has been moved since."""
     g, cam = _scene()
     for value in (math.nan, math.inf):
         K, w2c = cam.K.copy(), cam.w2c.detach().clone()
@@ -79,7 +83,7 @@ def _broken_camera():
             yield lambda moved=moved, settings=settings: render(g, moved, settings), "pose must be finite"
 
 
-def _far_away():
+def _far_away() -> Attempts:
     means = np.array([[1e6, 0.0, 0.0]], np.float32)
     arrays = means, np.eye(4)[:1], np.full((1, 3), 1e-2), np.full(1, 0.5), np.zeros((1, 3))
     yield lambda: Gaussians.from_arrays(*arrays), "float64 means"
