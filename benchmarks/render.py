@@ -29,6 +29,7 @@ import torch  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
+from drgs.ellipsoids import semi_axes  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 
@@ -153,16 +154,7 @@ def volprim_hits(gaussians, camera) -> int:
         )
         return dr.select(ok, si.p + direction * 1e-4, o), dr.select(ok, mi.UInt32(1), 0)
 
-    inverse = gaussians.quats.double() / gaussians.quats.double().norm(dim=1, keepdim=True)
-    w, x, y, z = inverse.T
-    rotation = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ], 1,
-    ).reshape(-1, 3, 3)  # fmt: skip
-    local = (rotation / gaussians.scales.double()[:, None, :]).mT.reshape(-1).float().numpy()
+    local = semi_axes(gaussians.quats.double(), 1 / gaussians.scales.double()).mT.reshape(-1).float().numpy()
     matrix = mi.Float(np.ascontiguousarray(local))
 
     def _within(dr, mi, index, o, d, active):

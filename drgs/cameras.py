@@ -4,17 +4,15 @@ Conventions, stated once for the whole project:
 
 - Camera axes are OpenCV's: +x right, +y down, +z forward (COLMAP and gsplat agree).
 - ``w2c`` (4,4) maps homogeneous world points to camera points, ``c2w`` is its inverse.
-- ``K`` (3,3) is ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels. The image spans
-  [0, width] x [0, height]; the center of pixel (column i, row j) lies at (i + 0.5, j + 0.5).
-  Resizing an image by s therefore multiplies fx, cx (and fy, cy) by s exactly. OpenCV functions
-  that resample images count pixel centers at integers, so they get ``cx - 0.5, cy - 0.5``;
-  functions on points need no shift.
-- Distortion is OpenCV's: model ``opencv`` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model
-  ``opencv_fisheye`` with (k1, k2, k3, k4) on the angle; ``pinhole`` has none.
-- Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio
-  cameras (+x right, +y up, looking along -z), LLFF ``poses_bounds`` columns (down, right, backward)
-  and Mitsuba cameras (+x left, +y up, looking along +z). World axes never change, only the
-  camera's.
+- ``K`` (3,3) is ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels. The image spans [0, width] x [0, height]; the
+  center of pixel (column i, row j) lies at (i + 0.5, j + 0.5). Resizing an image by s therefore multiplies fx, cx (and
+  fy, cy) by s exactly. OpenCV functions that resample images count pixel centers at integers, so they get
+  ``cx - 0.5, cy - 0.5``; functions on points need no shift.
+- Distortion is OpenCV's: model ``opencv`` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model ``opencv_fisheye`` with
+  (k1, k2, k3, k4) on the angle; ``pinhole`` has none.
+- Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right, +y
+  up, looking along -z), LLFF ``poses_bounds`` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
+  looking along +z). World axes never change, only the camera's.
 """
 
 from __future__ import annotations
@@ -31,7 +29,6 @@ from drgs.guards.arguments import must_be
 from drgs.guards.camera_checks import (
     IMAGE_MAX,
     as_numpy,
-    check_distance,
     check_proportions,
     checked_distortion,
     checked_intrinsics,
@@ -55,15 +52,13 @@ __all__ = [
     "c2w_to_opengl",
     "intrinsics",
     "intrinsics_from_fov",
-    "inverse_pose",
     "look_at",
     "orbit",
     "rigid",
 ]
 
 _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded in a file or an optimizer
-# An undistorted pixel must come back to itself; beyond this many pixels the lens model has no
-# inverse there.
+# An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
 _INVERSE_TOLERANCE = 1e-3
 
 
@@ -73,9 +68,9 @@ class Camera:
 
     Attributes:
         K: (3,3) float64 intrinsics in pixels.
-        w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that
-            gradients reach it. A rotation that rounding has left not quite orthonormal is read as
-            the nearest one, and the camera stays where it is; see `rigid`.
+        w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that gradients reach it. A
+            rotation that rounding has left not quite orthonormal is read as the nearest one, and the camera stays
+            where it is; see `rigid`.
         width, height: image size in pixels.
         model: ``pinhole``, ``opencv`` or ``opencv_fisheye``.
         distortion: coefficients in OpenCV's order; empty for ``pinhole``.
@@ -165,19 +160,17 @@ class Camera:
             points: (P,3) world points.
 
         Returns:
-            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye
-            lenses, which may see behind themselves.
+            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses, which may
+            see behind themselves.
         """
         rotation, translation = self._rigid()
         local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ rotation.T + translation
         return self._project_local(local), local[:, 2]
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
-        """A Mitsuba ``perspective`` sensor as a dictionary for ``mi.load_dict`` (box filter, one
-        sample a pixel).
+        """A Mitsuba ``perspective`` sensor as a dictionary for ``mi.load_dict`` (box filter, one sample a pixel).
 
-        Mitsuba's film has square pixels, so fx and fy may differ by no more than 0.1 pixel at the
-        image border.
+        Mitsuba's film has square pixels, so fx and fy may differ by no more than 0.1 pixel at the image border.
 
         Args:
             near, far: clip distances in scene units. Mitsuba's rays start at the near plane.
@@ -238,8 +231,7 @@ class Camera:
             bad = int(np.count_nonzero(~(error < _INVERSE_TOLERANCE)))
             if bad:
                 warnings.warn(
-                    f"Camera {self.name!r}: the {self.model} lens cannot be inverted at {bad} of "
-                    f"{len(pixels)} pixels; "
+                    f"Camera {self.name!r}: the {self.model} lens cannot be inverted at {bad} of {len(pixels)} pixels; "
                     "their rays are approximate, mask them or check the coefficients",
                     stacklevel=3,
                 )
@@ -306,9 +298,7 @@ def c2w_to_opengl(c2w: np.ndarray) -> np.ndarray:
 
 
 def c2w_from_llff(pose: np.ndarray) -> np.ndarray:
-    """LLFF pose (3,4) or (3,5), camera axes in columns (down, right, backward), to an OpenCV
-    camera-to-world (4,4).
-    """
+    """LLFF pose (3,4) or (3,5), camera axes in columns (down, right, backward), to an OpenCV camera-to-world (4,4)."""
     pose = np.asarray(pose, dtype=np.float64)
     c2w = np.eye(4)
     c2w[:3, 0], c2w[:3, 1], c2w[:3, 2], c2w[:3, 3] = pose[:, 1], pose[:, 0], -pose[:, 2], pose[:, 3]
@@ -346,12 +336,11 @@ def intrinsics_from_fov(fov: float, width: int, height: int, axis: str = "x") ->
 
 
 def look_at(eye: Any, target: Any, up: Any = (0.0, 0.0, 1.0)) -> np.ndarray:
-    """(4,4) float64 w2c of a camera at ``eye`` looking at ``target``, ``up`` (world) pointing up
-    in its image.
-    """
+    """(4,4) float64 w2c of a camera at ``eye`` looking at ``target``, ``up`` (world) pointing up in its image."""
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     forward = target - eye
     right = np.cross(forward, up)
+    # Below this angle between the two, in radians, rounding decides what is right.
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
         raise ValueError(
             f"look_at: eye, target and up must not lie on one line, got {eye}, {target}, {up}; move one of them"
@@ -384,8 +373,7 @@ def orbit(
         elevation: degrees above the plane through ``center`` that is orthogonal to ``up``.
         width, height: image size in pixels.
         fov: horizontal field of view in degrees.
-        up: (3,) world direction that points up; scenes straight out of COLMAP usually have (0, -1,
-            0).
+        up: (3,) world direction that points up; scenes straight out of COLMAP usually have (0, -1, 0).
     """
     if n < 1 or not radius > 0:
         raise ValueError(f"orbit: n must be >= 1 and radius > 0, got {n} and {radius}; correct them")
@@ -404,20 +392,3 @@ def orbit(
         w2c = look_at(center + radius * outward, center, axis)
         cameras.append(Camera(K=K, w2c=w2c, width=width, height=height, name=f"orbit_{index:04d}"))
     return cameras
-
-
-def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
-    """(4,4) w2c of a c2w (3 or 4 rows) that a file states; a rotation's transpose stands for its inverse.
-
-    `Camera` then refuses what is no rotation.
-
-    Raises:
-        ValueError: a number is not finite or beyond reason.
-    """
-    c2w = np.asarray(c2w, np.float64)
-    if not np.isfinite(c2w).all():
-        raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; drop this view")
-    check_distance(where, c2w)
-    w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
-    return w2c

@@ -11,12 +11,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 __all__ = ["Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
 
@@ -80,7 +84,7 @@ class Gaussians:
     features: torch.Tensor | None = None
     origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in _FIELDS:
             x = getattr(self, name)
             if x is None and name == "features":
@@ -109,7 +113,16 @@ class Gaussians:
         return len(self.means)
 
     @classmethod
-    def from_arrays(cls, means, quats, scales, opacities, sh, features=None, origin=None) -> Gaussians:
+    def from_arrays(
+        cls,
+        means: ArrayLike,
+        quats: ArrayLike,
+        scales: ArrayLike,
+        opacities: ArrayLike,
+        sh: ArrayLike,
+        features: ArrayLike | None = None,
+        origin: ArrayLike | None = None,
+    ) -> Gaussians:
         """Gaussians from the usual linear arrays.
 
         Args:
@@ -150,7 +163,7 @@ class Gaussians:
         )
         made.validate("Gaussians.from_arrays")
         if means.dtype == torch.float32 and len(made):
-            with torch.no_grad():
+            with torch.no_grad():  # for a warning
                 ratio = (means.abs().amax(1) / scales.amin(1)).max()
             if ratio > _FAR_RATIO:
                 warnings.warn(
@@ -183,7 +196,7 @@ class Gaussians:
         """The raw parameter tensors by group name; `features` only when there are any."""
         return {name: x for name in _FIELDS if (x := getattr(self, name)) is not None}
 
-    def replace(self, **fields) -> Gaussians:
+    def replace(self, **fields: Any) -> Gaussians:
         """A copy with the given fields replaced."""
         return dataclasses.replace(self, **fields)
 
@@ -196,13 +209,13 @@ class Gaussians:
         """The same values without an autograd graph."""
         return self.replace(**{name: x.detach() for name, x in self.parameters().items()})
 
-    def take(self, index) -> Gaussians:
+    def take(self, index: torch.Tensor | slice | Sequence[int]) -> Gaussians:
         """The Gaussians at `index` (anything that indexes a tensor), in that order."""
         return self.replace(**{name: x[index] for name, x in self.parameters().items()})
 
     def validate(self, where: str) -> None:
         """Raise ValueError, naming the first index, if a parameter is NaN or infinite or a quaternion is 0."""
-        with torch.no_grad():
+        with torch.no_grad():  # a check, which leaves no graph
             for name, x in self.parameters().items():
                 # One reduction decides; the index is looked for only when there is something to report.
                 if x.numel() and not math.isfinite(float(x.abs().sum(dtype=torch.float64))):
@@ -221,7 +234,8 @@ class Gaussians:
                 )
 
 
-def _tensor(name: str, x) -> torch.Tensor:
+def _tensor(name: str, x: ArrayLike) -> torch.Tensor:
+    """An argument of `from_arrays` as a float tensor; of arrays, only means keep float64."""
     if isinstance(x, torch.Tensor):
         return x if x.is_floating_point() else x.to(torch.float32)
     try:
@@ -234,14 +248,14 @@ def _tensor(name: str, x) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype))
 
 
-def _check_shape(name: str, x, shape: tuple, n: int):
+def _check_shape(name: str, x: torch.Tensor, shape: tuple, n: int) -> None:
     if tuple(x.shape) != shape:
         want = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
         raise ValueError(f"Gaussians: {name} must have shape {want} with N = {n} from means, got {tuple(x.shape)}")
 
 
-def _check_range(name: str, x: torch.Tensor, low: float, high: float, hint: str):
-    with torch.no_grad():
+def _check_range(name: str, x: torch.Tensor, low: float, high: float, hint: str) -> None:
+    with torch.no_grad():  # a check, which leaves no graph
         bad = ~((x > low) & (x < high)) if x.numel() else None
         if bad is not None and bool(bad.any()):
             i = int(bad.reshape(len(x), -1).any(1).nonzero()[0, 0])
@@ -268,7 +282,7 @@ def ellipsoids_shape(gaussians: Gaussians, extent: float = 3.0) -> dict:
     from drgs import runtime
 
     mi = runtime.mitsuba()
-    g = gaussians.detach()
+    g = gaussians.detach()  # Mitsuba takes values; gradients of its scene parameters are its own
     quats = torch.nn.functional.normalize(g.quats.double(), dim=1)[:, [1, 2, 3, 0]]
     means = g.means.double() + torch.from_numpy(np.asarray(g.origin, np.float64))
     arrays = {

@@ -139,6 +139,7 @@ def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
     g.validate("save_ply")
     if g.features is not None:
         _log.warning("%s: the 3DGS layout has no columns for features, they are left out", path)
+    # A file holds values.
     fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
     means = fields["means"]
     if np.any(g.origin):
@@ -256,6 +257,7 @@ def save_state(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header
     from safetensors.torch import save
 
     metadata = {"drgs": json.dumps({"schema": SCHEMA, **header}, default=_jsonable)}
+    # A file holds values, in the order of their shapes.
     data = save({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, metadata)
     with atomic_write(path) as file:
         file.write(data)

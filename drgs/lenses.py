@@ -58,6 +58,7 @@ def fisheye_directions(plane: np.ndarray, distortion: tuple[float, ...]) -> np.n
     angle = radius.copy()
     for _ in range(30):
         value, slope = fisheye_polynomial(angle, distortion)
+        # Where the lens turns back the slope is 0: a step that the clip ends stands for an infinite one.
         angle = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi)
     factor = np.sin(angle) / np.where(radius > 0, radius, 1.0)
     return np.concatenate([plane * factor[:, None], np.cos(angle)[:, None]], axis=1)

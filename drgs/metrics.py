@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-import drgs
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
+from drgs.integrator import render
+from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.files import Run
     from drgs.fitting.frames import Frame
-    from drgs.settings import RenderSettings
 
 __all__ = [
     "METRICS",
@@ -66,7 +66,7 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
         mse = float((error * mask).sum() / mask.double().sum())
     else:
         mse = float(error.mean())
-    return -10 * math.log10(max(mse, 1e-10))
+    return -10 * math.log10(max(mse, 1e-10))  # equal images have 100 dB, which averages can take
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
@@ -119,7 +119,7 @@ class Lpips:
         # pnet_rand: build the backbone without downloading it.
         self._model = lpips.LPIPS(net=self.backbone, pnet_rand=True, verbose=False).eval()
         try:
-            with torch.no_grad():
+            with torch.no_grad():  # leaves are overwritten
                 # The slices keep torchvision's numbering: slice2.3.weight is features.3.weight.
                 for name, parameter in self._model.net.named_parameters():
                     parameter.copy_(state["features." + name.split(".", 1)[1]])
@@ -127,7 +127,7 @@ class Lpips:
             text = " ".join(str(error).split())
             raise ValueError(f"{weights}: must hold every convolution of {self.backbone}, got {text}") from None
 
-    @torch.no_grad()
+    @torch.no_grad()  # a measure, not a loss
     def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
         """LPIPS of (H, W, 3) images in [0, 1]."""
         planes = (2 * x.permute(2, 0, 1)[None].float() - 1 for x in (image, target))
@@ -135,6 +135,7 @@ class Lpips:
 
 
 def _read_weights(path: Path) -> dict:
+    """The state dictionary in a file, which must not run code; empty if it holds something else."""
     import pickle
 
     try:
@@ -175,12 +176,13 @@ def evaluate(
 def _evaluated(
     g: Gaussians, frames: list[Frame], settings: RenderSettings, lpips: Lpips | None, pictures: Path | None, bar: Bar
 ) -> dict:
+    """`evaluate`, under a bar that it has begun."""
     views, reasons = [], {}
     if lpips is None:
         reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
-        with torch.no_grad():
-            image = drgs.render(g, frame.camera, settings).rgb.cpu().clamp(0, 1)
+        with torch.no_grad():  # pictures of whatever an optimizer may hold
+            image = render(g, frame.camera, settings).rgb.cpu().clamp(0, 1)
         target = frame.target()
         shown = image if frame.mask is None else image * frame.mask[..., None]
         height, width = target.shape[:2]
@@ -229,7 +231,7 @@ def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings,
         `settings`), `split`, `views` (names), `width` and `height` of the first; None if there is no view, or
         `settings` are the viewers' own.
     """
-    viewers = drgs.RenderSettings.preset(_VIEWERS, background=settings.background)
+    viewers = RenderSettings.preset(_VIEWERS, background=settings.background)
     if settings == viewers or not frames:
         return None
     frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
@@ -238,8 +240,8 @@ def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings,
         for name, model in values.items():
             found = []
             for frame in frames:
-                with torch.no_grad():
-                    image = drgs.render(g, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1)
+                with torch.no_grad():  # as above
+                    image = render(g, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1)
                 found.append(psnr(image, frame.image(), frame.mask))
                 bar.advance()
             values[name] = float(np.mean(found))

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras import Camera, intrinsics, inverse_pose
+from drgs.cameras import Camera, intrinsics
+from drgs.data.checks import inverse_pose
 from drgs.files import atomic_write
 from drgs.guards.json_files import check_json, read_json
 

@@ -113,7 +113,7 @@ class Focus:
         start, span, inside = _covered(azimuths)
         turn = np.radians(start + (0.0 if span >= 360 else span / 2))
         distance = np.linalg.norm(outward, axis=1)
-        sines = outward @ up / np.maximum(distance, 1e-12)
+        sines = outward @ up / np.maximum(distance, 1e-12)  # a camera at the center has 0 / 0: level
         elevation = np.degrees(np.arcsin(np.clip(np.median(sines[inside]), -1, 1)))
         middle = np.cos(turn) * first + np.sin(turn) * second
         return middle, span, float(np.median(distance[inside])), float(elevation)
@@ -128,7 +128,7 @@ def upright(cameras: list[Camera]) -> np.ndarray:
     poses = np.stack([camera.c2w for camera in cameras])
     rights, mean = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
     length = np.linalg.norm(mean)
-    if length > 1e-9:
+    if length > 1e-9:  # below it they point everywhere, and what is left of the mean is rounding
         mean /= length
     lean = np.eye(3) - np.outer(mean, mean)
     up = np.linalg.eigh(rights.T @ rights / len(rights) + _TILT * lean)[1][:, 0]
@@ -148,13 +148,13 @@ def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:
     poses = np.stack([camera.c2w for camera in cameras])
     walked = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turned = np.degrees(np.arccos(np.clip((poses[1:, :3, 2] * poses[:-1, :3, 2]).sum(axis=1), -1, 1)))
-    typical = max(float(np.median(walked)), 1e-12)
+    typical = max(float(np.median(walked)), 1e-12)  # a divisor, and most of them may not have moved at all
     breaks = np.flatnonzero((walked > _JUMP * typical) | (turned > _TURN)) + 1
     stretch = max(np.split(np.arange(len(poses)), breaks), key=len)
     if len(stretch) < 3:
         return []
     poses, walked, turned = poses[stretch], walked[stretch[:-1]], turned[stretch[:-1]]
-    # A turn by 30 degrees takes as long as a step.
+    # A turn by 30 degrees takes as long as a step; times increase even where a camera stays as it is.
     times = np.concatenate([[0.0], np.cumsum(np.maximum(walked / typical + turned / 30, 1e-3))])
     width = max(_SMOOTH * times[-1] / (len(times) - 1), times[-1] / _SMOOTHED)
     made = []
@@ -178,6 +178,7 @@ def _meeting_point(eyes: np.ndarray, across: np.ndarray) -> np.ndarray:
         total = (weights[:, None, None] * across).sum(axis=0)
         point = np.linalg.solve(total, (weights[:, None] * (across @ eyes[:, :, None])[:, :, 0]).sum(axis=0))
         miss = np.linalg.norm((across @ (point - eyes)[:, :, None])[:, :, 0], axis=1)
+        # An axis that is met exactly must not take all the weight.
         weights = 1 / np.maximum(miss, max(1e-3 * float(np.median(miss)), 1e-12))
         weights /= weights.max()
     return point

@@ -1,5 +1,5 @@
-"""Reading files that may lie: sizes are compared with what the file holds before anything is
-allocated.
+"""Reading files that may lie: sizes are compared with what the file holds before anything is allocated, and poses are
+numbers within reason.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from drgs.guards import memory
+from drgs.guards.camera_checks import check_distance
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["IMAGE_SUFFIXES", "image_size", "list_images", "read_image", "read_npy"]
+__all__ = ["IMAGE_SUFFIXES", "image_size", "inverse_pose", "list_images", "read_image", "read_npy"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
@@ -195,3 +196,20 @@ def _jpeg_size(file: Any) -> tuple[int, int] | None:
             height, width = struct.unpack(">HH", body[1:5])
             return (width, height) if width and height else None
         file.seek(struct.unpack(">H", length)[0] - 2, 1)
+
+
+def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
+    """(4,4) w2c of a c2w (3 or 4 rows) that a file states; a rotation's transpose stands for its inverse.
+
+    `Camera` then refuses what is no rotation.
+
+    Raises:
+        ValueError: a number is not finite or beyond reason.
+    """
+    c2w = np.asarray(c2w, np.float64)
+    if not np.isfinite(c2w).all():
+        raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; drop this view")
+    check_distance(where, c2w)
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
+    return w2c

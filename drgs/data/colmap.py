@@ -1,11 +1,10 @@
-"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have
-been checked.
-"""
+"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have been checked."""
 
 from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -129,7 +128,8 @@ def _mask(folder: Path, name: str) -> Path | None:
     return None
 
 
-def _camera(camera: object, w2c: np.ndarray, name: str, where: str) -> Camera:
+def _camera(camera: Any, w2c: np.ndarray, name: str, where: str) -> Camera:
+    """Ours of a pycolmap camera; a lens whose coefficients are all 0 is a pinhole."""
     p = [float(v) for v in camera.params]
     kind = camera.model_name
     if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
@@ -142,15 +142,7 @@ def _camera(camera: object, w2c: np.ndarray, name: str, where: str) -> Camera:
     elif any(rest):
         model, distortion = "opencv", (*rest, *([0.0] * (4 - len(rest))))
     try:
-        return Camera(
-            K=K,
-            w2c=w2c,
-            width=camera.width,
-            height=camera.height,
-            model=model,
-            distortion=distortion,
-            name=name,
-        )
+        return Camera(K, w2c, camera.width, camera.height, model, distortion, name)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
@@ -267,6 +259,7 @@ _LEAST = {"cameras": 48, "images": 73, "points3D": _POINT.size, "rigs": 8, "fram
 
 
 def _check_binary(path: Path, kind: str) -> None:
+    """Refuse a binary file of one `kind` that is shorter than its counts claim, before COLMAP reads it."""
     walk = _Walk(path)
     (count,) = walk.take(_COUNT, "a count")
     walk.need(count * _LEAST[kind], f"the {count} {kind} that it claims")
@@ -321,6 +314,7 @@ def _poses_only(data: bytes) -> bytes:
 
 
 def _parameter_count(path: Path, number: int) -> int:
+    """How many parameters a camera model has by its number in binary files; ValueError for one that is not ours."""
     for model_number, parameters in _MODELS.values():
         if model_number == number:
             return parameters

@@ -76,6 +76,7 @@ def detect(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) ->
     points, descriptors = sift.detectAndCompute(gray, None if mask is None else mask.astype(np.uint8))
     points, descriptors = points[:_MOST], np.zeros((0, 128), np.float32) if descriptors is None else descriptors[:_MOST]
     pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
+    # A descriptor may be all 0.
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
     columns, rows = (np.clip(pixels[:, i].astype(int), 0, image.shape[1 - i] - 1) for i in (0, 1))
     return Features(
@@ -139,6 +140,7 @@ def _match(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray
     rows, columns, likeness = [], [], []
     for start in range(0, len(a.pixels), _ROWS):
         lines = _homogeneous(a.pixels[start : start + _ROWS]) @ F.T
+        # The line of the epipole itself is 0, and near everything.
         lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
         near = np.abs(lines.astype(np.float32) @ homogeneous.T) < _BAND
         i, j = np.nonzero(near)
@@ -185,12 +187,14 @@ def _best(owner: np.ndarray, likeness: np.ndarray, pixels: np.ndarray, count: in
     return is_best & (best > _ALIKE)[owner] & clear[owner]
 
 
-def _meet(eye_a, eye_b, rays_a, rays_b) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _meet(
+    eye_a: np.ndarray, eye_b: np.ndarray, rays_a: np.ndarray, rays_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Where pairs of rays pass nearest to each other (N, 3), the distances along them, the angles in degrees."""
     between = (rays_a * rays_b).sum(axis=1)
     baseline = eye_b - eye_a
     along_a, along_b = rays_a @ baseline, rays_b @ baseline
-    sine = np.maximum(1 - between**2, 1e-12)
+    sine = np.maximum(1 - between**2, 1e-12)  # of parallel rays, which the caller drops by their angle
     depth_a, depth_b = (along_a - between * along_b) / sine, (between * along_a - along_b) / sine
     points = 0.5 * (eye_a + depth_a[:, None] * rays_a + eye_b + depth_b[:, None] * rays_b)
     return points, depth_a, depth_b, np.degrees(np.arccos(np.clip(between, -1, 1)))

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras import Camera, c2w_from_llff, intrinsics, inverse_pose
-from drgs.data.checks import list_images, read_npy
+from drgs.cameras import Camera, c2w_from_llff, intrinsics
+from drgs.data.checks import inverse_pose, list_images, read_npy
 from drgs.data.views import Dataset, View, fit_to_image, make_unique
 
 __all__ = ["load_llff"]

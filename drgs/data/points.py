@@ -49,6 +49,7 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(axis=0)
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    # Below it, cameras that stand in one place differ by rounding alone.
     if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
         return _EXTENT_MARGIN * spread
     if points is not None and len(points):

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from drgs.cameras import Camera, c2w_from_opengl, intrinsics, inverse_pose
-from drgs.data.checks import IMAGE_SUFFIXES, image_size
+from drgs.cameras import Camera, c2w_from_opengl, intrinsics
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose
 from drgs.data.points import read_point_ply
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
 from drgs.guards.json_files import check_json, read_json
@@ -200,6 +200,7 @@ def _view_name(file_path: str) -> str:
 
 
 def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _FirstImage | None) -> Camera:
+    """The camera of a frame whose keys, over those of the file, are `values`; `first` where no image may be opened."""
     if "w" in values and "h" in values:
         width, height = _number(where, values, "w"), _number(where, values, "h")
     elif first is None:

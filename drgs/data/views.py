@@ -260,6 +260,7 @@ def check_parallax(views: list[View]) -> None:
     """
     poses = np.stack([view.camera.c2w for view in views])
     spread = np.abs(poses - poses[0]).max(axis=(1, 2))
+    # Equal poses that a file states in several ways differ by rounding.
     tiny = 1e-9 * max(1.0, float(np.abs(poses).max()))
     if len(views) < 2:
         return

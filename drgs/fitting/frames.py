@@ -60,6 +60,7 @@ def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[
 
 
 def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Frame]:
+    """`load_frames`, under a bar that it has begun."""
     views = [view.checked() for view in views]
     sizes = [reduced_size(view.camera, max_pixels) for view in views]
     is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_CACHE

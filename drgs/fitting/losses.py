@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
 
@@ -148,7 +148,7 @@ class _Ssim(torch.autograd.Function):
     """Mean SSIM of (C, H, W) planes; S = A1 A2 / (B1 B2) with A, B as in the paper."""
 
     @staticmethod
-    def forward(ctx, x, y):
+    def forward(ctx: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         x = x.contiguous()
         parts = _ssim_parts(x, y)
         ctx.save_for_backward(x, y, *parts)
@@ -156,7 +156,7 @@ class _Ssim(torch.autograd.Function):
         return value.mean()
 
     @staticmethod
-    def backward(ctx, grad):
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
         x, y, mean_x, mean_y, a1, a2, b1, b2, bottom, value = ctx.saved_tensors
         # dS with respect to the three blurred maps that hold x; each goes back through the symmetric blur.
         d_xx = -value / b2

@@ -91,7 +91,7 @@ def load_run(run: Run) -> LoadedRun:
     try:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
-        gaussians = GaussianRows.from_state(tensors).gaussians().detach()
+        gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # to be looked at, not to be fitted
         gaussians.validate(str(run.state))
     except (FileNotFoundError, ValueError) as error:
         if not run.point_cloud.is_file():

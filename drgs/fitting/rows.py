@@ -128,9 +128,9 @@ class GaussianRows:
         state = self.optimizer.state.get(self.tensors[name], {})
         return [state[key] for key in ("exp_avg", "exp_avg_sq") if key in state]
 
-    @torch.no_grad()
+    @torch.no_grad()  # the new tensor is a leaf of its own
     def _map(self, name: str, change: _Change, change_moments: _Change | None = None) -> None:
-        """Replace one tensor by `change(tensor)`, and its moments likewise: a new leaf without the old one's graph."""
+        """Replace one tensor by `change(tensor)`, and its moments likewise."""
         old = self.tensors[name]
         new = change(old.detach()).requires_grad_()
         group = next(g for g in self.optimizer.param_groups if g["name"] == name)
