@@ -11,15 +11,14 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-import drgs
-from drgs import metrics
+from drgs import metrics, runtime
 from drgs.data.views import check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
@@ -32,6 +31,7 @@ from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
+from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
@@ -87,13 +87,16 @@ def fit(
         KeyboardInterrupt: On Ctrl-C, SIGTERM and SIGHUP, after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
-    drgs.runtime.backend()  # sets torch's threads too, at first use
+    runtime.backend()  # sets torch's threads too, at first use
     threads = _one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         return _fit(dataset, out_dir, config, active, resume)
 
 
-def _fit(dataset: Dataset, out_dir: str | Path, config: FitConfig, active, resume: bool) -> FitResult:
+def _fit(
+    dataset: Dataset, out_dir: str | Path, config: FitConfig, active: ActiveConfig | None, resume: bool
+) -> FitResult:
+    """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
     train, test = dataset.split(config.test_every)
     if train:
         check_parallax(train)
@@ -212,7 +215,7 @@ class _Loop:
         source: str,
         seconds: float,
         plan: ActiveViews | None,
-    ):
+    ) -> None:
         self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
         self.seconds, self.plan = seconds, plan
         self._recent: list[dict] = []
@@ -220,6 +223,7 @@ class _Loop:
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
 
     def run(self, bar: Bar) -> None:
+        """All steps that are left, or as many as there are until the fit is interrupted."""
         trainer, config = self.trainer, self.trainer.config
         preview_every = _preview_every(config.max_steps)
         if self.plan:
@@ -286,6 +290,7 @@ class _Loop:
         )
 
     def _log(self, row: dict) -> None:
+        """The events of a step (as `Trainer.step` returns it), and every so often the averages of the last ones."""
         done = self.trainer.step_index
         for event in row["events"]:
             self.run_folder.log(event.pop("event"), step=done - 1, **event)
@@ -311,8 +316,8 @@ class _Loop:
         for i, frame in enumerate(frames):
             if is_interrupted():
                 return
-            with torch.no_grad():
-                image = drgs.render(trainer.gaussians(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
+            with torch.no_grad():  # a picture
+                image = render(trainer.gaussians(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
             values.append(metrics.psnr(image, frame.image(), frame.mask))
             if i == 0:
                 pair = torch.cat([frame.image(), image], dim=1)
@@ -325,7 +330,7 @@ class _Loop:
 
 
 @contextlib.contextmanager
-def _one_thread():
+def _one_thread() -> Iterator[None]:
     """One Dr.Jit thread: additions of several come in any order, and float additions do not commute with that."""
     import drjit as dr
 
@@ -338,7 +343,7 @@ def _one_thread():
 
 
 @contextlib.contextmanager
-def _fewer_torch_threads():
+def _fewer_torch_threads() -> Iterator[None]:
     """Half of torch's threads while fitting.
 
     Between its operations OpenMP's threads spin and take cores from Dr.Jit's, and each operation waits for the last of

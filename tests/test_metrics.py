@@ -86,7 +86,7 @@ class Rendered:
 
 
 def evaluate(monkeypatch, image, frames, **options):
-    monkeypatch.setattr("drgs.render", lambda g, camera, settings: Rendered(image), raising=False)
+    monkeypatch.setattr("drgs.metrics.render", lambda g, camera, settings: Rendered(image))
     return metrics.evaluate(None, frames, RenderSettings.preset("fast"), **options)
 
 

@@ -200,7 +200,9 @@ def _meet(
     return points, depth_a, depth_b, np.degrees(np.arccos(np.clip(between, -1, 1)))
 
 
-def _tracks(pictures: list[Features], starts: np.ndarray, edges: np.ndarray, points: np.ndarray):
+def _tracks(
+    pictures: list[Features], starts: np.ndarray, edges: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Matches that share features make one point: that of the match which most of their pictures agree with.
 
     Args:

@@ -54,7 +54,7 @@ class ActiveViews:
         pool_leak: Whether initial points have seen views that were not picked.
     """
 
-    def __init__(self, active: ActiveConfig, views: list[View], config: FitConfig):
+    def __init__(self, active: ActiveConfig, views: list[View], config: FitConfig) -> None:
         if not views:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
         if active.initial + active.add > len(views):
@@ -102,12 +102,12 @@ class ActiveViews:
         Returns:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
-        import drgs
         from drgs.data import added_points, initial_points
+        from drgs.integrator import render
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
-        with torch.no_grad():
-            alpha = drgs.render(gaussians, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
+        with torch.no_grad():  # the Gaussians are fitted elsewhere
+            alpha = render(gaussians, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
         is_open = alpha < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED

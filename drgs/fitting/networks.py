@@ -29,7 +29,7 @@ class Network:
         optimizer: Adam, with torch's defaults.
     """
 
-    def __init__(self, name: str, module: torch.nn.Module, rate: Rate):
+    def __init__(self, name: str, module: torch.nn.Module, rate: Rate) -> None:
         self.name, self.module, self.rate = name, module, rate
         self.optimizer = torch.optim.Adam(module.parameters(), lr=rate_at(rate, 0.0))
 

@@ -29,7 +29,7 @@ class GaussianRows:
         optimizer: One parameter group a tensor, named as in `tensors`.
     """
 
-    def __init__(self, tensors: dict[str, torch.Tensor]):
+    def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
         # Leaves of their own: what the caller has is neither changed nor differentiated.
         self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
         groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
@@ -103,10 +103,12 @@ class GaussianRows:
 
     def take(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """Copies of rows, values without a graph."""
+        # Indexing copies, so that density control may change the tensors afterwards.
         return {name: x.detach()[index] for name, x in self.tensors.items()}
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that a checkpoint needs, by name; values without a graph."""
+        # Detached: a file holds values.
         out = {f"parameter.{name}": x.detach() for name, x in self.tensors.items()}
         for name, x in self.tensors.items():
             out |= {f"adam.{name}.{key}": v for key, v in self.optimizer.state.get(x, {}).items()}
@@ -132,6 +134,7 @@ class GaussianRows:
     def _map(self, name: str, change: _Change, change_moments: _Change | None = None) -> None:
         """Replace one tensor by `change(tensor)`, and its moments likewise."""
         old = self.tensors[name]
+        # From the values alone: gradients of the old leaf are not the new one's.
         new = change(old.detach()).requires_grad_()
         group = next(g for g in self.optimizer.param_groups if g["name"] == name)
         group["params"] = [new]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["FitConfig", "Trainer"]
+__all__ = ["Trainer"]
 
 _MAX_BAD_STEPS = 10
 _RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # what a checkpoint has besides networks
@@ -57,7 +57,7 @@ class Trainer:
         terms: Sequence[LossTerm] | None = None,
         networks: Sequence[Network] = (),
         rates: Mapping[str, Rate] = MappingProxyType({}),
-    ):
+    ) -> None:
         """A fit at its first step.
 
         Args:
@@ -133,8 +133,9 @@ class Trainer:
                 )
         self.step_index += 1
         return {
-            "loss": float(loss.detach()),
+            "loss": float(loss.detach()),  # told, as all of these
             "terms": parts,
+            # Equal images have 100 dB, which averages can take.
             "psnr": -10 * math.log10(max(mse, 1e-10)) if math.isfinite(mse) else None,
             "view": frame.name,
             "events": events,
@@ -208,6 +209,7 @@ class Trainer:
     def _prepare(self, done: int) -> list[dict]:
         """Schedules and density control before step `done`."""
         config, rows, events = self.config, self.rows, []
+        # The degree is a quotient, rounded up; 1e-9 keeps a whole one from being rounded up to the next.
         while rows.sh_degree < min(config.sh_degree, done / max(1, round(config.sh_every * config.max_steps)) - 1e-9):
             rows.raise_sh_degree()
             events.append({"event": "sh_degree", "degree": rows.sh_degree})
@@ -275,5 +277,6 @@ class Trainer:
     def _is_finite(self, loss: torch.Tensor) -> bool:
         """Whether the loss and every gradient are; a sum is not finite where one of its numbers is not."""
         fitted = [*self.rows.tensors.values(), *(x for network in self.networks for x in network.module.parameters())]
+        # Values that are looked at.
         sums = [loss.detach(), *(x.grad.sum() for x in fitted if x.grad is not None)]
         return all(math.isfinite(float(x)) for x in sums)
