@@ -1,9 +1,9 @@
 """The public renderer: torch in, torch out, differentiable in both modes.
 
-`render` projects the Gaussians (projection.py), lists or traces them (tiles.py, bvh.py), composites them in order
-(walk.py, kernels.py) and returns torch tensors; scene.py holds one call together. Compositing is one Dr.Jit operation
-with its own adjoint and forward mode (composite.py); what a Gaussian needs once a view is differentiated by Dr.Jit's
-AD. Two `autograd.Function`s bridge torch: `_Reverse` keeps the graph of a call for its backward pass, `_Bridge` serves
+One call (tracing/call.py) projects the Gaussians (projection.py), lists or traces them (tiles.py, bvh.py), composites
+them in order (walk.py, kernels.py) and returns torch tensors. Compositing is one Dr.Jit operation with its own adjoint
+and forward mode (composite.py); what a Gaussian needs once a view is differentiated by Dr.Jit's AD. Two
+`autograd.Function`s bridge torch: `_Reverse` keeps the graph of a call for its backward pass, `_Bridge` serves
 `torch.func` and forward-mode AD. All may be called from any number of Python threads (runtime.alone).
 """
 
@@ -22,9 +22,10 @@ from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
-from drgs.tracing.call import EPS_ALPHA, Output, Scene, to_drjit
+from drgs.tracing.call import Call, Output, to_drjit
+from drgs.tracing.tangents import push_forward
 
-__all__ = ["EPS_ALPHA", "OUTPUTS", "Output", "render", "render_jvp", "render_rays"]
+__all__ = ["OUTPUTS", "Output", "render", "render_jvp", "render_rays"]
 
 OUTPUTS = ("depth", "median_depth", "count", "visibility")
 _NAMES = {"depth": "depth", "median_depth": "median", "count": "count", "visibility": "visibility"}
@@ -67,9 +68,9 @@ def render(
 def _view(gaussians: Gaussians, camera: Camera, settings: RenderSettings | None, wanted: frozenset) -> Output:
     gaussians = gaussians_at("render", gaussians, camera)
     check_view("render", gaussians, camera, settings)
-    scene = Scene(gaussians, camera, settings or RenderSettings.preset("exact"), wanted)
+    call = Call(gaussians, camera, settings or RenderSettings.preset("exact"), wanted)
     with _own_errors():
-        return scene.output(_differentiable(scene))
+        return call.output(_differentiable(call))
 
 
 def _batch(views: list[Output]) -> Output:
@@ -100,8 +101,8 @@ def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth
     check_view("render_jvp", gaussians, camera, settings)
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
-    scene = Scene(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
-    return scene.jvp(tangents)
+    call = Call(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
+    return push_forward(call, tangents)
 
 
 @runtime.alone
@@ -119,9 +120,9 @@ def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",
     settings = settings or RenderSettings.preset("exact", traversal="bvh")
     if settings.traversal != "bvh":
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
-    scene = Scene(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
+    call = Call(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
     with _own_errors():
-        return scene.output(_differentiable(scene))
+        return call.output(_differentiable(call))
 
 
 def _wanted(outputs) -> frozenset:
@@ -150,19 +151,19 @@ def _own_errors() -> Iterator[None]:
         raise cause from None
 
 
-def _differentiable(scene: Scene) -> dict:
-    """Run `scene.trace` on its torch inputs, through whichever bridge their derivative needs."""
-    values = scene.inputs.values()
-    if scene.count == 0:
-        return scene.nothing()
+def _differentiable(call: Call) -> dict:
+    """Run `call.trace` on its torch inputs, through whichever bridge their derivative needs."""
+    values = call.inputs.values()
+    if call.count == 0:
+        return call.nothing()
     if _forward_ad(values):
-        names = list(scene.inputs)
-        results = _Bridge.apply(scene, names, *values)
-        return dict(zip(scene.result_names, results, strict=True))
+        names = list(call.inputs)
+        results = _Bridge.apply(call, names, *values)
+        return dict(zip(call.result_names, results, strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
-        results = _Reverse.apply(scene, list(scene.inputs), *values)
-        return dict(zip(scene.result_names, results, strict=True))
-    images = scene.trace(**{name: to_drjit(scene.t, x) for name, x in scene.inputs.items()})
+        results = _Reverse.apply(call, list(call.inputs), *values)
+        return dict(zip(call.result_names, results, strict=True))
+    images = call.trace(**{name: to_drjit(call.lib, x) for name, x in call.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
 
 
@@ -182,11 +183,11 @@ class _Reverse(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, scene, names, *values):
+    def forward(ctx, call, names, *values):
         ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
-        ctx.scene, ctx.names, ctx.needed = scene, names, ctx.needs_input_grad[2:]
-        ctx.graph, images = _traced(scene, names, values, ctx.needed)
-        scene.result_names = list(images)
+        ctx.call, ctx.names, ctx.needed = call, names, ctx.needs_input_grad[2:]
+        ctx.graph, images = _traced(call, names, values, ctx.needed)
+        call.result_names = list(images)
         return tuple(x.torch() for x in images.values())
 
     @staticmethod
@@ -196,19 +197,19 @@ class _Reverse(torch.autograd.Function):
         values, graph = ctx.saved_tensors, ctx.graph
         # A traversal takes the edges of the graph with it; through what is left, another would find the old gradients.
         ctx.graph = None
-        inputs, images = graph or _traced(ctx.scene, ctx.names, values, ctx.needed)[0]
+        inputs, images = graph or _traced(ctx.call, ctx.names, values, ctx.needed)[0]
         for image, g in zip(images, cotangents, strict=True):
-            dr.set_grad(image, to_drjit(ctx.scene.t, g).array)
+            dr.set_grad(image, to_drjit(ctx.call.lib, g).array)
         slopes = iter(dr.backward_to([x for x in inputs if x is not None]))
         return None, None, *(None if x is None else next(slopes).torch() for x in inputs)
 
 
-def _traced(scene: Scene, names, values, needed) -> tuple[tuple[list, list], dict]:
+def _traced(call: Call, names, values, needed) -> tuple[tuple[list, list], dict]:
     """The ends of a graph, inputs (None where no gradient is needed) and images, and the images by name."""
-    inputs = {n: to_drjit(scene.t, x) for n, x in zip(names, values, strict=True)}
+    inputs = {n: to_drjit(call.lib, x) for n, x in zip(names, values, strict=True)}
     ends = [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
     dr.enable_grad([x for x in ends if x is not None])
-    images = scene.trace(**inputs)
+    images = call.trace(**inputs)
     return (ends, list(images.values())), images
 
 
@@ -216,26 +217,26 @@ class _Bridge(torch.autograd.Function):
     """Every mode, for `torch.func` and dual numbers: each derivative computes the view again."""
 
     @staticmethod
-    def forward(scene, names, *values):
-        images = scene.trace(**{n: _plain(scene.t, x) for n, x in zip(names, values, strict=True)})
-        scene.result_names = list(images)
+    def forward(call, names, *values):
+        images = call.trace(**{n: _plain(call.lib, x) for n, x in zip(names, values, strict=True)})
+        call.result_names = list(images)
         return tuple(x.torch().clone() for x in images.values())
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.scene, ctx.names, *values = inputs
+        ctx.call, ctx.names, *values = inputs
         ctx.save_for_backward(*values)
         ctx.save_for_forward(*values)
 
     @staticmethod
     @runtime.alone
     def backward(ctx, *cotangents):
-        scene, t = ctx.scene, ctx.scene.t
-        inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
+        call, lib = ctx.call, ctx.call.lib
+        inputs = {n: _plain(lib, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
-        images = scene.trace(**inputs)
-        for name, g in zip(scene.result_names, cotangents, strict=True):
-            dr.set_grad(images[name], _plain(t, g).array)
+        images = call.trace(**inputs)
+        for name, g in zip(call.result_names, cotangents, strict=True):
+            dr.set_grad(images[name], _plain(lib, g).array)
         dr.enqueue(dr.ADMode.Backward, images)
         dr.traverse(dr.ADMode.Backward)
         return None, None, *(dr.grad(x).torch().clone() for x in inputs.values())
@@ -243,18 +244,18 @@ class _Bridge(torch.autograd.Function):
     @staticmethod
     @runtime.alone
     def jvp(ctx, _scene, _names, *tangents):
-        scene, t = ctx.scene, ctx.scene.t
-        inputs = {n: _plain(t, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
+        call, lib = ctx.call, ctx.call.lib
+        inputs = {n: _plain(lib, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
-        images = scene.trace(**inputs)
+        images = call.trace(**inputs)
         for x, v in zip(inputs.values(), tangents, strict=True):
             if v is not None:
-                dr.set_grad(x, _plain(t, v))
+                dr.set_grad(x, _plain(lib, v))
         dr.enqueue(dr.ADMode.Forward, inputs)
         dr.traverse(dr.ADMode.Forward)
-        return tuple(dr.grad(images[name]).torch().clone() for name in scene.result_names)
+        return tuple(dr.grad(images[name]).torch().clone() for name in call.result_names)
 
 
-def _plain(t, x):
+def _plain(lib, x):
     """As a Dr.Jit tensor: the values below any `torch.func` wrapper."""
-    return runtime.unwrapped(x, lambda values: to_drjit(t, values))
+    return runtime.unwrapped(x, lambda values: to_drjit(lib, values))

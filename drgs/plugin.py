@@ -18,9 +18,10 @@ import drjit as dr
 
 from drgs import runtime
 from drgs.settings import RenderSettings
-from drgs.tracing import bvh
-from drgs.tracing.composite import Composite, View
-from drgs.tracing.projection import project_world, sh_basis
+from drgs.tracing.bvh import BvhTraversal
+from drgs.tracing.composite import Composite, Compositor
+from drgs.tracing.harmonics import sh_basis
+from drgs.tracing.projection import project_world
 
 mi = runtime.mitsuba()
 
@@ -71,46 +72,46 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
 
     def _trace(self, scene, ray):
         """(Color3f, alpha) of every ray."""
-        t, s = runtime.dr_types(), self.settings
-        p, coefficients = _parameters(t, scene)
+        lib, s = runtime.dr_types(), self.settings
+        p, coefficients = _parameters(lib, scene)
         o, d = (list(dr.detach(v)) for v in (ray.o, dr.normalize(ray.d)))
         n = dr.width(ray)
-        o, d = ([t.Float(x) + dr.zeros(t.Float, n) for x in v] for v in (o, d))
+        o, d = ([lib.Float(x) + dr.zeros(lib.Float, n) for x in v] for v in (o, d))
         along_ray = s.sh_direction == "ray"
-        w2c = [v for row in _camera_axes(t, self.pose, o) for v in row]
-        pose = dr.zeros(t.Float64, 12)
+        w2c = [v for row in _camera_axes(lib, self.pose, o) for v in row]
+        pose = dr.zeros(lib.Float64, 12)
         for k, v in enumerate(w2c):
-            dr.scatter(pose, v, t.UInt32(k))
-        projected = project_world(t, p, pose, s, 0 if along_ray else coefficients)
-        lanes = []
+            dr.scatter(pose, v, lib.UInt32(k))
+        projected = project_world(lib, p, pose, s, 0 if along_ray else coefficients)
+        carried = []
         if along_ray:
-            lanes = sh_basis(d, coefficients)
-            lanes[0] = lanes[0] + dr.zeros(t.Float, n)
-        basis = len(lanes)
-        view = View(t, s, n, projected, basis, 0, frozenset(), bvh.parts_of, None, True)
+            carried = sh_basis(d, coefficients)
+            carried[0] = carried[0] + dr.zeros(lib.Float, n)
+        compositor = Compositor(lib, s, BvhTraversal(lib, s, projected, n), frozenset(), basis=len(carried))
         sh = p["sh"] if along_ray else None
-        out = dr.custom(Composite, view, projected.record, sh, None, [*lanes, *o, *d], dr.grad_enabled(p))
-        i = dr.arange(t.UInt32, n)
-        return mi.Color3f(*[dr.gather(t.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
+        keep = dr.grad_enabled(p)
+        out = dr.custom(Composite, compositor, projected.record, sh, None, [*carried, *o, *d], keep)
+        i = dr.arange(lib.UInt32, n)
+        return mi.Color3f(*[dr.gather(lib.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
 
     def to_string(self):
         """For Mitsuba's printout of a scene."""
         return f"DrgsIntegrator[{self.settings}]"
 
 
-def _camera_axes(t, pose, origins):
+def _camera_axes(lib, pose, origins):
     """Rows of w2c: of the sensor (whose x and y point the other way), or at the first ray's origin in world axes."""
     if pose is None:
-        axes = [[t.Float64(float(r == c)) for c in range(3)] for r in range(3)]
-        center = [t.Float64(dr.gather(t.Float, x, 0)) for x in origins]
+        axes = [[lib.Float64(float(r == c)) for c in range(3)] for r in range(3)]
+        center = [lib.Float64(dr.gather(lib.Float, x, 0)) for x in origins]
     else:
-        axes = [[t.Float64(pose[c, r]) * (1 if r == 2 else -1) for c in range(3)] for r in range(3)]
+        axes = [[lib.Float64(pose[c, r]) * (1 if r == 2 else -1) for c in range(3)] for r in range(3)]
         axes = [[x * dr.rsqrt(sum(y * y for y in row)) for x in row] for row in axes]
-        center = [t.Float64(pose[c, 3]) for c in range(3)]
+        center = [lib.Float64(pose[c, 3]) for c in range(3)]
     return [[*row, -sum(x * y for x, y in zip(row, center, strict=True))] for row in axes]
 
 
-def _parameters(t, scene):
+def _parameters(lib, scene):
     """Raw parameter arrays of the scene's `ellipsoids` shape, attached to its AD graph."""
     shapes = [s for s in scene.shapes() if s.is_ellipsoids()]
     if len(shapes) != 1:
@@ -126,14 +127,14 @@ def _parameters(t, scene):
     count = dr.width(data) // 10
 
     def columns(width):
-        j = dr.arange(t.UInt32, count * width)
+        j = dr.arange(lib.UInt32, count * width)
         return j // width * 10, j % width
 
     row, k = columns(3)
-    p = {"means": dr.gather(t.Float, data, row + k)}
-    p["log_scales"] = dr.log(dr.gather(t.Float, data, row + k + 3))
+    p = {"means": dr.gather(lib.Float, data, row + k)}
+    p["log_scales"] = dr.log(dr.gather(lib.Float, data, row + k + 3))
     row, k = columns(4)
-    p["quats"] = dr.gather(t.Float, data, row + 6 + (k + 3) % 4)  # xyzw to wxyz
+    p["quats"] = dr.gather(lib.Float, data, row + 6 + (k + 3) % 4)  # xyzw to wxyz
     opacity = dr.clip(opacity, 1e-30, 1 - 6e-8)  # the logit of 0 and 1 is infinite
     p["logit_opacities"] = dr.log(opacity) - dr.log(1 - opacity)
     p["sh"] = sh

@@ -18,8 +18,8 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import semi_axes
-from drgs.integrator import EPS_ALPHA, render
-from drgs.settings import RenderSettings
+from drgs.integrator import render
+from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.splats import Splats, cameras_of, check_shapes, inside, inside_opacities
 
 __all__ = ["rasterization"]

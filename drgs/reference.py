@@ -30,15 +30,13 @@ from drgs.oracle import (
     view_rays,
     within,
 )
+from drgs.settings import EPS_ALPHA
 from drgs.volume import render_volume
 
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["EPS_ALPHA", "Output", "render", "render_volume", "sh_basis"]
-
-EPS_ALPHA = 1e-10
-"""Expected depth is divided by max(alpha, EPS_ALPHA)."""
+__all__ = ["Output", "render", "render_volume", "sh_basis"]
 
 _TILE = 16  # pixels; both rasterizers' tile size
 _PAIRS = 1 << 19  # (ray, Gaussian) pairs held at once: about 0.3 GB of intermediates

@@ -13,10 +13,13 @@ from typing import Literal
 
 from drgs.guards.arguments import check_fields, must_be
 
-__all__ = ["PRESETS", "Preset", "RenderSettings", "legal"]
+__all__ = ["EPS_ALPHA", "PRESETS", "Preset", "RenderSettings", "legal"]
 
 Preset = Literal["exact", "fast", "inria", "gsplat", "mitsuba"]
 PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
+
+# Depth is divided by max(alpha, EPS_ALPHA): what no ray meets has a finite one.
+EPS_ALPHA = 1e-10
 
 _RANGES = {
     "extent": (0.0, 1e3),

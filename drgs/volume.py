@@ -19,14 +19,13 @@ from torch.utils.checkpoint import checkpoint
 
 from drgs.guards.doors import check_oracle
 from drgs.oracle import activate, cull_near, float64, sh_colors, take, view_rays, within
-from drgs.settings import RenderSettings
+from drgs.settings import EPS_ALPHA, RenderSettings
 
 if TYPE_CHECKING:
     from types import SimpleNamespace
 
 __all__ = ["Volume", "render_volume"]
 
-_EPS_ALPHA = 1e-10
 _CUT = 1e-12  # optical depth on a ray below which a Gaussian is left out of it
 _INSIDE = 1e-16  # optical depth inside an interval that is taken for 0
 _FAR = 8.5  # sigma; beyond lies 1e-17 of a Gaussian
@@ -223,7 +222,7 @@ def _chunk(scene: SimpleNamespace, reach, s: RenderSettings, o, d, tolerance: fl
     out = {
         "rgb": total[:, :3] + torch.exp(end)[:, None] * float64(s.background),
         "alpha": alpha,
-        "depth": moment / alpha.clamp(min=_EPS_ALPHA),
+        "depth": moment / alpha.clamp(min=EPS_ALPHA),
         "error": error,
         "nodes": nodes,
     }

@@ -14,7 +14,7 @@ from scenes_random import camera, gaussians
 
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
-from drgs.tracing.call import Scene
+from drgs.tracing.call import Call
 
 HERE = Path(__file__).parent
 SETTINGS = RenderSettings.preset("fast")
@@ -36,7 +36,7 @@ def test_four_threads(monkeypatch):
     To rounding of float32: additions of one worker come in one order. Threads are made to meet where each hands its
     images to torch; now only one of them ever gets there.
     """
-    want, trace = [everything(seed) for seed in range(4)], Scene.trace
+    want, trace = [everything(seed) for seed in range(4)], Call.trace
     failed, pair, together = [], threading.Barrier(2), []
 
     def meet(scene, **inputs):
@@ -55,7 +55,7 @@ def test_four_threads(monkeypatch):
         except Exception as error:
             failed.append(error)
 
-    monkeypatch.setattr(Scene, "trace", meet)
+    monkeypatch.setattr(Call, "trace", meet)
 
     threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
     for thread in threads:
@@ -75,7 +75,7 @@ import os, sys
 import numpy as np
 from drgs.lab.accuracy import random_camera, random_gaussians
 from drgs.integrator import render
-from drgs.tracing.call import Scene
+from drgs.tracing.call import Call
 from drgs.settings import RenderSettings
 
 def draw():

@@ -15,19 +15,20 @@ from drgs import reference, runtime
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 from drgs.tracing import tiles
-from drgs.tracing.call import Scene, to_drjit
-from drgs.tracing.composite import _pack
+from drgs.tracing.call import Call, to_drjit
+from drgs.tracing.records import pack_records
 from drgs.tracing.tiles import TILE, build
 
 
 def _scene(g, cam, settings):
     """The `Projected` and the `Lists` of a view."""
-    scene = Scene(g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings, frozenset())
-    t = runtime.dr_types()
-    view, (_, record, *_) = scene.prepare({n: to_drjit(t, x) for n, x in scene.inputs.items()})
-    lists = build(t, view.projected, settings, cam.width, cam.height, _pack(t, record))
+    call = Call(g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings, frozenset())
+    lib = runtime.dr_types()
+    compositor, (record, *_) = call.prepare({n: to_drjit(lib, x) for n, x in call.inputs.items()})
+    projected = compositor.traversal.projected
+    lists = build(lib, projected, settings, cam.width, cam.height, pack_records(lib, record))
     dr.eval(lists.index, lists.start, lists.end)
-    return view.projected, lists
+    return projected, lists
 
 
 def _listed(lists):
@@ -175,7 +176,7 @@ def test_tiles_left_out_change_nothing(rng, monkeypatch, fields, anisotropy):
         for whole in (False, True):
             with monkeypatch.context() as patch:
                 if whole:
-                    patch.setattr(tiles._Meets, "__call__", lambda self, dx, dy: self.t.Bool(True))
+                    patch.setattr(tiles._Meets, "__call__", lambda self, dx, dy: self.lib.Bool(True))
                 out = render(g.detach(), cam, settings, outputs=("count", "depth"))
                 images.append(
                     torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None], out.count[..., None]], -1)

@@ -9,7 +9,7 @@ import torch
 
 from drgs.gain import Information
 from drgs.information.jacobian import GEOMETRY
-from drgs.tracing.call import quaternion_product
+from drgs.tracing.pose import quaternion_product
 
 __all__ = ["GROUPS", "Group", "Information", "groups_of"]
 

@@ -1,15 +1,9 @@
-"""The derivatives of one hit by the raw parameters of its Gaussian, in closed form, and sums of their squares.
+"""The rows of the Jacobian, hit by hit, and sums of their squares and products.
 
-With the local frame's y = S^-1 R^T x, the ray meets its peak at p (|p|^2 = rho^2, p perpendicular to the direction d'),
-t* |d'| = u, and e = d' / |d'|. As p minimizes the distance, moving along the ray changes nothing, and
-
-    d(-rho^2 / 2) = (p / s) . R^T dmu  +  p_k^2 dlog s_k  +  w . R (S p x S^-1 p)
-    du            = (e / s) . R^T dmu  +  (2 p_k e_k - u e_k^2) dlog s_k
-                    + w . R (S p x S^-1 e + S e x S^-1 p - u S e x S^-1 e)
-
-for a move dmu of the mean and a world-frame rotation R <- exp([w]x) R. The rows of the Jacobian are then, with the
-notation of kernels.py, dC_c = T (c_c - B_c) da + w dc_c: channels are summed over what a parameter does, then squared.
-`ewa` has no p; there the derivatives of the record come from the AD of projection.py.
+With the notation of kernels.py, dC_c = T (c_c - B_c) da + w dc_c, where B_c lies behind the hit: what a parameter does
+to a channel is summed up, then squared. The derivatives da of a hit's opacity by the geometry of its Gaussian are
+closed forms of the responses (`tracing/responses/`, where they are derived); dc by the mean is the same for all hits of
+a Gaussian (replay.py).
 """
 
 from __future__ import annotations
@@ -18,122 +12,33 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
-from drgs.tracing import projection as layout
 from drgs.tracing.derivatives import if_any_hit
-from drgs.tracing.kernels import load_packed, pack, packed_size
-from drgs.tracing.projection import cross, dot
+from drgs.tracing.harmonics import CONSTANT
+from drgs.tracing.protocols import Sink
+from drgs.tracing.records import load_packed, pack, packed_size
+from drgs.tracing.responses import Response
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
 
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
-_OPACITY, _COLOR, _SHAPE = 0, 1, 10  # entries of `extras`: d strength / dlogit, dc/dmu (9), then matrices
-_EWA = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
+_OPACITY, _COLOR, _SHAPE = 0, 1, 10  # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
 
 
-def extras(t, settings, inputs, projected, moved: list | None, color: list | None):
-    """What hits need besides the record, packed (kernels.pack).
+def extras(lib, response: Response, logit, projected, moved: list | None, color: list | None):
+    """What hits need besides the record, packed (records.pack).
 
     Args:
-        inputs: Flat parameter arrays, as `projection` gets them.
+        logit: (N,) raw opacities.
         projected: `Projected` of the view.
-        moved: `ewa` only: per geometric parameter but the opacity, the tangent of the record.
+        moved: Where the response asks for them, per geometric parameter but the opacity the tangent of the record.
         color: (channel, axis) nested lists of dc/dmu, or None where the color does not depend on the mean.
     """
-    F = t.Float
-    logit = t.Float64(inputs["logit_opacities"])
+    F, logit = lib.Float, lib.Float64(logit)
     e = dr.exp(-abs(logit))
     opacity = dr.select(logit >= 0, 1, e) / (1 + e)
-    if settings.response == "integral":  # softplus' / softplus
-        slope = opacity / (dr.maximum(logit, 0) + dr.log(1 + e))
-    else:
-        slope = dr.select(logit >= 0, e, 1) / (1 + e)
-    columns = [F(slope)]
+    columns = [F(response.strength_slope(logit, opacity, e))]
     columns += [F(x) for channel in color for x in channel] if color else [F(0)] * 9
-    if settings.response == "ewa":
-        columns += [F(tangent[k]) for tangent in moved for k in _EWA]
-    else:
-        rotation, scale, plane, axes = projected.frame
-        axes = axes or [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-        columns += [F(dot(f, x)) for x in plane for f in axes] if plane else [F(0)] * 6
-        local = list(zip(*axes, strict=True))  # rows: local axes; columns: f
-        for weight in ([dr.rcp(s) for s in scale], scale):
-            columns += [
-                F(sum(rotation[r][k] * weight[k] * local[k][i] for k in range(3))) for r in range(3) for i in range(3)
-            ]
-        columns += [F(local[k][i]) for k in range(3) for i in range(3)]
-    return pack(t, columns, dr.width(logit))
-
-
-class _Geometry:
-    """d a / d(geometry) of a hit."""
-
-    def __init__(self, model, buffer):
-        self.m, self.t, self.buffer = model, model.t, buffer
-        # `extras` has 10 numbers, then 45 or 33 of the shape.
-        self.size = packed_size(_SHAPE + (45 if model.s.response == "ewa" else 33))
-
-    def load(self, index, active) -> list:
-        """The extras of a Gaussian."""
-        return load_packed(self.t, self.buffer, self.size, index, active)
-
-    def slopes(self, record, extra, ray) -> list:
-        """The GEOMETRY derivatives of the opacity of a hit."""
-        if self.m.s.response == "ewa":
-            return self._screen(record, extra, ray)
-        integral = self.m.s.response == "integral"
-        p, e, u, rho2 = self._peak(record, extra, ray)
-        gauss = dr.exp(-0.5 * rho2)
-        strength = record[layout.W_ALPHA if self.m.world else layout.ALPHA]
-        if integral:
-            passed = 0.5 + 0.5 * dr.erf(u * 0.7071067811865476)
-            left = strength * gauss * dr.exp(-strength * gauss * passed)
-            along, across = left * passed, left * dr.exp(-0.5 * u * u) * 0.3989422804014327
-        else:
-            along = strength * gauss
-        shape = extra[_SHAPE + 6 :]
-
-        def times(first, x):
-            m = shape[first : first + 9]
-            return [m[3 * r] * x[0] + m[3 * r + 1] * x[1] + m[3 * r + 2] * x[2] for r in range(3)]
-
-        n, v, local = times(0, p), times(9, p), times(18, p)
-        means, turn, scales = n, cross(v, n), [x * x for x in local]
-        result = [[along * x for x in part] for part in (means, turn, scales)]
-        if integral:
-            ne, ve, le = times(0, e), times(9, e), times(18, e)
-            turn = [a + b - u * c for a, b, c in zip(cross(v, ne), cross(ve, n), cross(ve, ne), strict=True)]
-            scales = [2 * x * y - u * y * y for x, y in zip(local, le, strict=True)]
-            result = [
-                [dr.fma(across, x, y) for x, y in zip(part, old, strict=True)]
-                for part, old in zip((ne, turn, scales), result, strict=True)
-            ]
-        return [*result[0], *result[1], *result[2], along * extra[_OPACITY]]
-
-    def _peak(self, r, extra, ray):
-        """p, e, u and rho^2; on the screen p and e in the frame of the ray's direction at the anchor."""
-        rho2, _, u = self.m.along(r, ray)
-        if self.m.world:
-            _, a, d, inverse = self.m.local(r, ray)
-            root = dr.sqrt(inverse)
-            # a - (a.d) d / |d|^2 would cancel where a is long: across a sheet it is 1e6 times p.
-            return [x * inverse for x in cross(d, cross(a, d))], [x * root for x in d], u, rho2
-        c1, c2, d, inverse = self.m.screen(r, ray)
-        q = [dr.fma(c1, extra[_SHAPE + i], c2 * extra[_SHAPE + 3 + i]) for i in range(3)]
-        root = dr.sqrt(inverse)
-        return [x * inverse for x in cross(q, d)], [x * root for x in d], u, rho2
-
-    def _screen(self, r, extra, ray):
-        """Of `ewa`: through the triangular form of Sigma' and the projected mean."""
-        L = layout
-        dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
-        c1, c2, _, _ = self.m.screen(r, ray)
-        a = r[L.ALPHA] * dr.exp(-0.5 * dr.fma(c1, c1, c2 * c2))
-        slopes = []
-        for j in range(9):
-            r11, r12, r13, r22, r23 = extra[_SHAPE + 5 * j : _SHAPE + 5 * j + 5]
-            d1, d2 = dr.fma(r11, dx, dr.fma(r12, dy, r13)), dr.fma(r22, dy, r23)
-            slopes.append(-a * dr.fma(c1, d1, c2 * d2))
-        return [*slopes, a * extra[_OPACITY]]
+    return pack(lib, columns + response.extras(lib, projected, moved), dr.width(logit))
 
 
 class Row(NamedTuple):
@@ -144,7 +49,7 @@ class Row(NamedTuple):
         g: Per channel, dC / da, 0 where the ray has no such hit; None without geometry.
         w: Weight of the hit, 0 likewise.
         turned: (channel, axis) w dc/dmu, or None where the color does not depend on the mean.
-        color: RGB of the Gaussian on this ray; None where no sink needs it.
+        color: RGB of the Gaussian on this ray; None where the sink does not need it.
         basis: SH basis along the ray; empty where SH are evaluated towards the mean.
     """
 
@@ -166,32 +71,33 @@ class Rows:
         color: The color depends on the mean, through the direction.
     """
 
-    def __init__(self, model, source, buffer, sink, finals, color: bool):
-        self.m, self.source, self.sink, self.finals = model, source, sink, finals
-        self.geometry, self.color = buffer is not None and _Geometry(model, buffer), color
-        self.colors = buffer is not None or getattr(sink, "bands", 0) > 0
-        self.pending = iter(finals)
+    def __init__(self, model, channels, buffer, sink: Sink, finals, color: bool):
+        self.m, self.channels, self.sink, self.finals = model, channels, sink, finals
+        self.buffer, self.color = buffer, color
+        self.size = packed_size(_SHAPE + model.response.extra)
+        self.colors = buffer is not None or sink.needs_color
 
-    def init(self, alive, place) -> dict:
-        """State of the next shared ray: what is left of each channel behind the last hit."""
-        t, final = self.m.t, next(self.pending)
-        D = t.Float64
+    def init(self, k, alive, nowhere) -> dict:
+        """State of shared ray k: what is left of each channel behind the last hit."""
+        lib, final = self.m.lib, self.finals[k]
+        D = lib.Float64
         rest = [dr.fma(D(b), D(final["T"]), D(x)) for x, b in zip(final["sum"][:3], self.m.background, strict=True)]
-        nothing = final["place"][0] == place[0]
-        state = {"T": t.Float(1), "rest": rest, "alive": dr.select(alive & ~nothing, t.UInt32(1), 0)}
+        nothing = final["place"][0] == nowhere[0]
+        state = {"T": lib.Float(1), "rest": rest, "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0)}
         return {**state, **self.sink.init()}
 
     def shade(self, index, rays, states, places, active):
         """One hit of each of `rays`."""
-        return if_any_hit(self.m, self.source, index, rays, states, places, active, self._take)
+        return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
     def _take(self, index, rays, states, places, active):
-        m, t, rows, out = self.m, self.m.t, [], []
-        D = t.Float64
-        going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
-        loaded = self.source.load(t, index, rays[0], going, only=None if self.colors else "record")
-        record, hits = loaded["record"], t.Bool(False)
-        extra = self.geometry.load(index, going) if self.geometry else None
+        """Replay a hit that some ray of the packet has: B_c as in derivatives.py, exact as the sums are float64."""
+        m, lib, rows, out = self.m, self.m.lib, [], []
+        D = lib.Float64
+        going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+        loaded = self.channels.load(lib, index, rays[0], going, only=None if self.colors else "record")
+        record, hits = loaded["record"], lib.Bool(False)
+        extra = None if self.buffer is None else load_packed(lib, self.buffer, self.size, index, going)
         for ray, st, final, place in zip(rays, states, self.finals, places, strict=True):
             a, _, ok = m.hit(record, ray, active & (st["alive"] != 0))
             T, left, new, at_end = st["T"], 1 - a, dict(st), ok
@@ -201,23 +107,28 @@ class Rows:
                 at_end = at_end & (p == q)
             new["alive"] = dr.select(at_end, 0, st["alive"])
             slopes = g = turned = None
-            color = self.source.values(m, loaded, ray) if self.colors else None
-            if self.geometry:
+            color = self.channels.values(m, loaded, ray) if self.colors else None
+            if extra:
                 rest = [r - D(w) * D(c) for r, c in zip(st["rest"], color, strict=True)]
                 new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
                 share = dr.select(left > 0, dr.rcp(dr.select(left > 0, left, 1)), 0)
-                g = [dr.select(ok, dr.fma(T, c, -t.Float(r) * share), 0) for c, r in zip(color, rest, strict=True)]
+                g = [dr.select(ok, dr.fma(T, c, -lib.Float(r) * share), 0) for c, r in zip(color, rest, strict=True)]
                 moves = ok
                 if m.s.alpha_max < 1 and m.s.alpha_max_gradient != "pass":
                     moves = ok & (a < m.alpha_max)
                 # Far from the ellipsoid 0 times infinity is possible.
-                slopes = [dr.select(moves, x, 0) for x in self.geometry.slopes(record, extra, ray)]
+                slopes = [dr.select(moves, x, 0) for x in self._slopes(record, extra, ray)]
                 if self.color:
                     turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
-            rows.append(Row(slopes, g, w, turned, color, ray.lane[: ray.basis]))
+            rows.append(Row(slopes, g, w, turned, color, ray.carried[: ray.basis]))
             hits |= ok
             out.append(new)
-        return self.sink.take(t, index, hits, rows, out)
+        return self.sink.take(lib, index, hits, rows, out)
+
+    def _slopes(self, record, extra, ray) -> list:
+        """The GEOMETRY derivatives of the opacity of a hit, before the clamp at alpha_max."""
+        *slopes, strength = self.m.response.slopes(record, extra[_SHAPE:], ray, self.m.world)
+        return [*slopes, strength * extra[_OPACITY]]
 
 
 def _entry(slopes, g, turned, j, c):
@@ -237,19 +148,20 @@ class Diagonal:
         summed: Sum the channels before squaring, as FisherRF does.
     """
 
-    def __init__(self, t, count: int, weights, entries, mode, bands: int = 0, summed: bool = False):
+    def __init__(self, lib, count: int, weights, entries, mode, bands: int = 0, summed: bool = False):
         self.width = GEOMETRY + 1 + 3 * bands
-        self.buffer = dr.zeros(t.Float, count * self.width)
+        self.buffer = dr.zeros(lib.Float, count * self.width)
         self.weights, self.entries, self.mode, self.bands, self.summed = weights, entries, mode, bands, summed
+        self.needs_color = bands > 0
 
     def init(self) -> dict:
         """Nothing is kept per ray."""
         return {}
 
-    def take(self, t, index, hits, rows, states):
+    def take(self, lib, index, hits, rows, states):
         """Add a hit's rows."""
         for k in self.entries:
-            total = t.Float(0)
+            total = lib.Float(0)
             for row in rows:
                 if k == GEOMETRY:
                     total = dr.fma(row.w, row.w, total)
@@ -281,27 +193,28 @@ class Blocks:
 
     SIZE = GEOMETRY + 3
     WIDTH = SIZE * (SIZE + 1) // 2
+    needs_color = True
 
-    def __init__(self, t, count: int, weights, mode):
-        self.buffer = dr.zeros(t.Float, count * self.WIDTH)
+    def __init__(self, lib, count: int, weights, mode):
+        self.buffer = dr.zeros(lib.Float, count * self.WIDTH)
         self.weights, self.mode = weights, mode
 
     def init(self) -> dict:
         """Nothing is kept per ray."""
         return {}
 
-    def take(self, t, index, hits, rows, states):
+    def take(self, lib, index, hits, rows, states):
         """Add a hit's rows."""
         full = []
         for row in rows:
             for c in range(3):
                 entries = [_entry(row.slopes, row.g, row.turned, j, c) for j in range(GEOMETRY)]
                 # d color / d sh_0, 0 where the color is clamped.
-                lit = dr.select(row.color[c] > 0, row.w * float(layout._SH[0]), 0)
+                lit = dr.select(row.color[c] > 0, row.w * CONSTANT, 0)
                 full.append((self.weights[c], [*entries, *(lit if k == c else None for k in range(3))]))
         for i in range(self.SIZE):
             for j in range(i + 1):
-                total = t.Float(0)
+                total = lib.Float(0)
                 for weight, entries in full:
                     if entries[i] is not None and entries[j] is not None:
                         total = dr.fma(weight * entries[i], entries[j], total)
@@ -319,6 +232,8 @@ class Variance:
         light: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
     """
 
+    needs_color = False
+
     def __init__(self, buffer, weights, light=None):
         self.buffer, self.weights, self.light = buffer, weights, light
 
@@ -326,14 +241,14 @@ class Variance:
         """The sum along a ray."""
         return {"variance": type(self.buffer)(0)}
 
-    def take(self, t, index, hits, rows, states):
+    def take(self, lib, index, hits, rows, states):
         """Add a hit's rows to their rays."""
-        v = list(dr.gather(t.ArrayXf, self.buffer, index, hits, shape=(16, dr.width(index))))
+        v = list(dr.gather(lib.ArrayXf, self.buffer, index, hits, shape=(16, dr.width(index))))
         out = []
         light = []
         if self.light is not None:
             K = len(rows[0].basis)
-            light = [dr.gather(t.Float, self.light, index * (3 * K) + k, hits) for k in range(3 * K)]
+            light = [dr.gather(lib.Float, self.light, index * (3 * K) + k, hits) for k in range(3 * K)]
         for row, state in zip(rows, states, strict=True):
             total = sum(v[j] * squares(row, j, self.weights) for j in range(GEOMETRY))
             shares = [v[GEOMETRY + c] for c in range(3)]

@@ -14,7 +14,8 @@ evaluated from our own records. What is done about its known faults (Mitsuba 3.9
 - of coincident proxies only one is found, of nested ones not all: Gaussians with the same center, rotation and shape
   share one primitive, the largest, whose members the stream delivers one by one.
 
-Neighboring lanes get neighboring rays (`_coherent`): a packet of them walks through the same part of the structure.
+Rays are taken in an order in which neighbors are alike (`_coherent`): a packet of lanes walks through the same part of
+the structure.
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ import drjit as dr
 import numpy as np
 
 from drgs import runtime
+from drgs.tracing.kernels import HitModel, Ray
+from drgs.tracing.projection import Projected
 from drgs.tracing.tiles import depth_order
 from drgs.tracing.walk import EMPTY, Part
 
-__all__ = ["Proxies", "proxy_scene"]
+__all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 
 _STEP = 1.2e-7  # of the coordinates of where a ray starts: one unit in the last place
 _GRAZE = 1e-7  # of (distance / radius)^2: what rounding takes from the discriminant, with a margin
@@ -36,6 +39,59 @@ _FAR = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
 _THIN = 1e-3  # smallest proxy radius, relative to the distance it is traced over
 _LISTED = 1000  # primitives that every ray is offered before it is traced, where origins differ
 _AROUND = 1.05  # half axes of a proxy within which an origin counts as inside
+
+
+class BvhTraversal:
+    """Any rays, through an acceleration structure of proxies; a `Traversal`.
+
+    Args:
+        rays: Their number; origin and direction are the last six floats that they carry.
+    """
+
+    world = True
+
+    def __init__(self, lib, settings, projected: Projected, rays: int):
+        self.lib, self.settings, self.projected, self.rays, self.certificate = lib, settings, projected, rays, {}
+
+    def start(self, model: HitModel, records, carried: list, basis: int) -> None:
+        """Build the proxies, and find the order of the rays."""
+        self.model, self.records, self.carried, self.basis = model, records, carried, basis
+        lib, s = self.lib, self.settings
+        every = self._ray(dr.arange(lib.UInt32, self.rays))
+        self.proxies = self._proxies(every)
+        self.order = _coherent(lib, every.carried[-6:])
+        self.center_key = self.projected.key if s.order == "center" else None
+        if s.order == "center" and s.depth_key == "z":
+            # Behind the camera plane z is negative, which no order key may be: the rank orders as well.
+            self.center_key = dr.zeros(lib.Float, dr.width(self.projected.key))
+            rank = dr.arange(lib.UInt32, dr.width(self.center_key))
+            dr.scatter(self.center_key, lib.Float(rank), depth_order(lib, self.projected.key, rank))
+
+    def parts(self, share: int) -> list[Part]:
+        """All rays as one part, one a lane."""
+        lib, s = self.lib, self.settings
+        ray, inside = self._ray(self.order), lib.Bool(bool(self.rays))
+        stream = _ProxyStream(lib, self.proxies, ray, s.order == "ray")
+        ordered = s.order != "entry"
+        return [Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, ordered, self.center_key)]
+
+    def _ray(self, i) -> Ray:
+        carried = [dr.gather(self.lib.Float, c, i) for c in self.carried]
+        return Ray(carried=carried, basis=self.basis)
+
+    def _proxies(self, ray: Ray) -> Proxies | None:
+        """Of the view's ellipsoids, for rays with these origins."""
+        if self.rays == 0:
+            return None
+        projected, origins = self.projected, ray.carried[-6:-3]
+        corners = [f(x) for f in (dr.min, dr.max) for x in origins]
+        dr.eval(projected.ellipsoids, projected.alive, corners)
+        ellipsoids = np.array([x.numpy() for x in projected.ellipsoids])
+        alive = projected.alive.numpy() & np.ones(ellipsoids.shape[1], bool)
+        origins = np.array([float(x[0]) for x in corners]).reshape(2, 3).T
+        _warn_of_rounding(ellipsoids, alive, origins)
+        nested, tails = self.settings.order != "entry", not self.model.response.front_only
+        return proxy_scene(self.lib, ellipsoids[:3], ellipsoids[3:7], ellipsoids[7:], alive, origins, nested, tails)
 
 
 class Proxies:
@@ -51,16 +107,16 @@ class Proxies:
         scale: Length of traced directions.
     """
 
-    def __init__(self, t, scene, members, first, box, back, scale):
+    def __init__(self, lib, scene, members, first, box, back, scale):
         self.scene = scene
-        self.listed = [dr.opaque(t.UInt32, int(x)) for x in first[-2:]]
-        self.members, self.first = t.UInt32(members.astype(np.uint32)), t.UInt32(first.astype(np.uint32))
-        self.low, self.high = ([dr.opaque(t.Float, float(x)) for x in corner] for corner in box)
+        self.listed = [dr.opaque(lib.UInt32, int(x)) for x in first[-2:]]
+        self.members, self.first = lib.UInt32(members.astype(np.uint32)), lib.UInt32(first.astype(np.uint32))
+        self.low, self.high = ([dr.opaque(lib.Float, float(x)) for x in corner] for corner in box)
         size = np.linalg.norm(box[1] - box[0])
-        self.size, self.back, self.scale = (dr.opaque(t.Float, float(x)) for x in (size, back, scale))
+        self.size, self.back, self.scale = (dr.opaque(lib.Float, float(x)) for x in (size, back, scale))
 
 
-def proxy_scene(t, means, quats, radii, alive, origins, nested=True, tails=False) -> Proxies | None:
+def proxy_scene(lib, means, quats, radii, alive, origins, nested=True, tails=False) -> Proxies | None:
     """Build the proxies, or None when nothing can be hit.
 
     Args:
@@ -106,7 +162,7 @@ def proxy_scene(t, means, quats, radii, alive, origins, nested=True, tails=False
         means, quats, radii, distance = means[:, kept], quats[:, kept], radii[:, kept], distance[kept]
     first = np.append(first, len(members))
     if means.shape[1] == 0:
-        return Proxies(t, None, members, first, np.zeros((2, 3)), 0, 1)
+        return Proxies(lib, None, members, first, np.zeros((2, 3)), 0, 1)
     proxies = _grown(radii, means, distance + back)
     shape = {
         "type": "ellipsoids",
@@ -120,7 +176,7 @@ def proxy_scene(t, means, quats, radii, alive, origins, nested=True, tails=False
     widest = 1.001 * proxies.max(0)
     box = (means - widest).min(1), (means + widest).max(1)
     # Where the scaled direction is longer than a proxy is thick, thick hits are lost as well as grazing ones.
-    return Proxies(t, scene, members, first, box, back, proxies.min())
+    return Proxies(lib, scene, members, first, box, back, proxies.min())
 
 
 def _groups(columns):
@@ -168,35 +224,35 @@ def _around(to, quats, radii, spread, distance, spheres):
     return near[(local <= _AROUND * radii[:, near] + spread).all(0)]
 
 
-class _Stream:
-    """Listed Gaussians, then the proxies along rays in the order of their entry points."""
+class _ProxyStream:
+    """Listed Gaussians, then the proxies along rays in the order of their entry points; a `Stream`."""
 
-    def __init__(self, t, proxies: Proxies, ray, bounded: bool, active):
-        self.t, self.proxies, self.bounded, self.active = t, proxies, bounded, active
+    def __init__(self, lib, proxies: Proxies | None, ray: Ray, bounded: bool):
+        self.lib, self.proxies, self.ray, self.bounded = lib, proxies, ray, bounded
         self.mi = runtime.mitsuba()
-        self.d = ray.lane[-3:]
+        self.d = ray.carried[-3:]
         if proxies is not None:
             # Parameters along a ray count from where it starts, so that they are small and their rounding is.
-            self.start = self._enter(ray.lane[-6:-3])
-            self.o = [dr.fma(d, self.start, x) for x, d in zip(ray.lane[-6:-3], self.d, strict=True)]
+            self.start = self._enter(ray.carried[-6:-3])
+            self.o = [dr.fma(d, self.start, x) for x, d in zip(ray.carried[-6:-3], self.d, strict=True)]
             size = dr.maximum(dr.maximum(abs(self.o[0]), abs(self.o[1])), abs(self.o[2]))
             self.step = _STEP * dr.maximum(size, proxies.scale)
 
     def begin(self):
-        """(hits so far, parameter, step, primitive, next member, end of members, something left)."""
-        t, p = self.t, self.proxies
+        """(candidates so far, parameter, step, primitive, next member, end of members, something left)."""
+        lib, p = self.lib, self.proxies
         width = dr.width(self.d)
         if p is None:
-            return t.UInt32(0), *([t.Float(0)] * 2), *([t.UInt32(0)] * 3), t.UInt32(0)
-        some = dr.select(self.active, t.UInt32(1), dr.zeros(t.UInt32, width))
-        none = t.UInt32(0xFFFFFFFF)
-        at = dr.zeros(t.Float, width)
-        return t.UInt32(0), at, t.Float(self.step), none, *(t.UInt32(x) for x in p.listed), some
+            return lib.UInt32(0), *([lib.Float(0)] * 2), *([lib.UInt32(0)] * 3), lib.UInt32(0)
+        some = dr.full(lib.UInt32, 1, width)
+        none = lib.UInt32(0xFFFFFFFF)
+        at = dr.zeros(lib.Float, width)
+        return lib.UInt32(0), at, lib.Float(self.step), none, *(lib.UInt32(x) for x in p.listed), some
 
     def _enter(self, origin):
         """Where a ray starts: at the box of all primitives, but not before it was moved back."""
-        t, p = self.t, self.proxies
-        near = t.Float(-p.back)
+        lib, p = self.lib, self.proxies
+        near = lib.Float(-p.back)
         for o, d, low, high in zip(origin, self.d, p.low, p.high, strict=True):
             along = dr.minimum((low - o) / d, (high - o) / d)
             along -= 1e-6 * (abs(along) + p.size)
@@ -208,15 +264,24 @@ class _Stream:
         """Whether the ray goes on."""
         return s[6] != 0
 
+    def place(self, s):
+        """The number of candidates before."""
+        return s[0]
+
+    def of(self, lanes) -> _ProxyStream:
+        """The same for some of the rays."""
+        carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]
+        return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.bounded)
+
     def next(self, s, active):
         """One member of the current primitive, or the next primitive (whose members follow)."""
-        t, p, mi = self.t, self.proxies, self.mi
+        lib, p, mi = self.lib, self.proxies, self.mi
         if p is None:
-            return t.UInt32(0), t.Bool(False), t.Float(EMPTY), s
+            return lib.UInt32(0), lib.Bool(False), lib.Float(EMPTY), s
         count, at, step, last, member, end, some = s
         inside = member < end
         trace = active & ~inside & (some != 0)
-        found, primitive, entry = t.Bool(False), t.UInt32(0), at
+        found, primitive, entry = lib.Bool(False), lib.UInt32(0), at
         if p.scene is not None:
             o = [dr.fma(d, at, x) for x, d in zip(self.o, self.d, strict=True)]
             ray = mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*[d * p.scale for d in self.d]))
@@ -227,8 +292,8 @@ class _Stream:
         again = found & (primitive == last)
         fresh = found & ~again
         first, behind = (
-            dr.gather(t.UInt32, p.first, primitive, fresh),
-            dr.gather(t.UInt32, p.first, primitive + 1, fresh),
+            dr.gather(lib.UInt32, p.first, primitive, fresh),
+            dr.gather(lib.UInt32, p.first, primitive + 1, fresh),
         )
         member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
         step = dr.select(again, 2 * step, dr.select(fresh, self.step, step))
@@ -238,8 +303,8 @@ class _Stream:
         last = dr.select(fresh, primitive, last)
         some = dr.select(trace & ~found, 0, some)
         valid = active & (member < end)
-        index = dr.gather(t.UInt32, p.members, member, valid)
-        bound = t.Float(EMPTY)
+        index = dr.gather(lib.UInt32, p.members, member, valid)
+        bound = lib.Float(EMPTY)
         if self.bounded:
             # Listed ones come first, whatever their keys. The factor is the rounding of entries.
             bound = dr.select(last == 0xFFFFFFFF, EMPTY, dr.maximum(self.start + entry, 0) * (1 - 1e-4))
@@ -247,62 +312,24 @@ class _Stream:
         return index, valid, bound, (count + 1, at, step, last, member, end, some)
 
 
-def parts_of(view, model, buffer, ray_of, share):
-    """All rays of a view as one part."""
-    t, s = view.t, view.settings
-    if view.lanes is None:
-        i = dr.arange(t.UInt32, view.pixels)
-        ray = ray_of(None, None, i, t.Bool(True))
-        view.proxies, view.lanes = _build(view, ray), _coherent(t, ray.lane[-6:])
-    i, inside = view.lanes, t.Bool(bool(view.pixels))
-    ray = ray_of(None, None, i, t.Bool(True))
-
-    def stream_of(lanes):
-        r = ray if lanes is None else type(ray)(lane=[dr.gather(t.Float, v, lanes) for v in ray.lane], basis=ray.basis)
-        return _Stream(t, view.proxies, r, s.order == "ray", t.Bool(True))
-
-    center = view.projected.key if s.order == "center" else None
-    if center is not None and s.depth_key == "z":
-        # Behind the camera plane z is negative, which no order key may be: the rank orders as well.
-        center = dr.zeros(t.Float, dr.width(view.projected.key))
-        rank = dr.arange(t.UInt32, dr.width(center))
-        dr.scatter(center, t.Float(rank), depth_order(t, view.projected.key, rank))
-    return [Part(t, model, buffer, [ray], [i], [inside], stream_of, s.order != "entry", center)]
-
-
-def _coherent(t, lane):
+def _coherent(lib, rays):
     """Order of rays (o, d) in which neighbors are alike: along a Morton curve of directions and origins."""
-    count = dr.width(lane)
+    count = dr.width(rays)
     if count <= 16:
-        return dr.arange(t.UInt32, count)
-    key = t.UInt64(0)
-    for group, triple in ((3, lane[:3]), (0, lane[3:])):
+        return dr.arange(lib.UInt32, count)
+    key = lib.UInt64(0)
+    for group, triple in ((3, rays[:3]), (0, rays[3:])):
         low = [dr.min(x) for x in triple]
         sizes = [dr.max(x) - y for x, y in zip(triple, low, strict=True)]
         size = dr.maximum(dr.maximum(sizes[0], sizes[1]), sizes[2])
         scale = dr.select(size > 0, 1023 / size, 0)
         for k, (x, y) in enumerate(zip(triple, low, strict=True)):
-            bits = t.UInt64((x - y) * scale)
+            bits = lib.UInt64((x - y) * scale)
             for b in range(10):
                 key |= ((bits >> b) & 1) << (6 * b + group + k)
-    order = t.UInt32(dr.argsort(key))
+    order = lib.UInt32(dr.argsort(key))
     dr.eval(order)
     return order
-
-
-def _build(view, ray):
-    """Proxies of the view's ellipsoids, for rays with these origins."""
-    if view.pixels == 0:
-        return None
-    projected, origins = view.projected, ray.lane[-6:-3]
-    corners = [f(x) for f in (dr.min, dr.max) for x in origins]
-    dr.eval(projected.ellipsoids, projected.alive, corners)
-    ellipsoids = np.array([x.numpy() for x in projected.ellipsoids])
-    alive = projected.alive.numpy() & np.ones(ellipsoids.shape[1], bool)
-    origins = np.array([float(x[0]) for x in corners]).reshape(2, 3).T
-    _warn_of_rounding(ellipsoids, alive, origins)
-    nested, tails = view.settings.order != "entry", view.settings.response == "integral"
-    return proxy_scene(view.t, ellipsoids[:3], ellipsoids[3:7], ellipsoids[7:], alive, origins, nested, tails)
 
 
 def _warn_of_rounding(ellipsoids, alive, origins):

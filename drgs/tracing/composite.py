@@ -1,7 +1,8 @@
-"""One view as a single differentiable Dr.Jit operation: records, features and rays in, flat images out.
+"""One view composited: records, features and rays in, flat images and their derivatives out.
 
-Color, depth and coverage come out of a first traversal, feature channels out of further ones, `CHUNK` channels each.
-Its adjoint replays them; its forward mode carries any number of tangents through one traversal each.
+`Compositor` is plain: color, depth and coverage come out of a first traversal, feature channels out of further ones,
+`CHUNK` channels each; its adjoint replays them, its forward mode carries any number of tangents through one traversal
+each. `Composite` makes it one differentiable operation of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -9,113 +10,115 @@ from __future__ import annotations
 import drjit as dr
 
 from drgs.tracing.derivatives import Adjoint, Tangent
-from drgs.tracing.kernels import Model, Primal, Ray, Source, pack
-from drgs.tracing.projection import RECORD
+from drgs.tracing.kernels import Channels, HitModel, Primal
+from drgs.tracing.protocols import Traversal
+from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.walk import Part
 
-__all__ = ["CHUNK", "Composite", "View"]
+__all__ = ["CHUNK", "Composite", "Compositor"]
 
 CHUNK = 32  # feature channels of one traversal
 
 
-class View:
-    """What stays constant while a view is composited and differentiated.
+class Compositor:
+    """The compositing of one view, and its derivatives once it was done.
 
     No dataclass on purpose: Dr.Jit would take it for a tree of arrays and copy it.
 
-    Attributes:
-        t: Dr.Jit types.
+    Args:
+        lib: Dr.Jit types.
         settings: RenderSettings.
-        pixels: Number of rays.
-        projected: `Projected` of the view.
-        basis: Of the arrays that rays carry, how many are SH basis values.
-        width: Feature channels.
+        traversal: Of this view.
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.
-        parts_of: (view, model, record buffer, ray_of, share) -> list of Part.
-        length: (x, y) -> |d| of a pinhole ray; None for world rays.
-        world: Records are world records.
-        certificate: Filled by the primal pass: rays, redone rays, entries listed.
-        extra: Filled by the primal pass: outputs without a derivative.
-        lists: Tile lists, or `proxies` and the order of rays `lanes` on `bvh`: kept from the first call of `parts_of`.
+        width: Feature channels.
+        basis: Of the arrays that rays carry, how many are SH basis values.
+    Attributes:
+        certificate: After `forward`: rays, redone rays, entries listed.
+        extra: After `forward`: outputs without a derivative.
+        finals: After `forward`: per traversal, (part, final states) pairs.
     """
 
-    def __init__(self, t, settings, pixels, projected, basis, width, want, parts_of, length, world):
-        self.t, self.settings, self.pixels, self.projected = t, settings, pixels, projected
-        self.basis, self.width, self.want, self.parts_of = basis, width, want, parts_of
-        self.length, self.world = length, world
+    def __init__(self, lib, settings, traversal: Traversal, want: frozenset, width: int = 0, basis: int = 0):
+        self.lib, self.settings, self.traversal, self.want = lib, settings, traversal, want
+        self.width, self.basis, self.rays = width, basis, traversal.rays
+        self.model = HitModel(lib, settings, traversal.world)
         self.certificate, self.extra = {}, {}
-        self.lists = self.proxies = self.lanes = None
 
+    # -- forward -----------------------------------------------------------------------------------------------------
 
-class Composite(dr.CustomOp):
-    """`dr.custom(Composite, view, record, sh, features, lanes)` -> dict rgb, alpha, depth, features of flat arrays.
+    def forward(self, record: list, sh, features, carried: list, keep: bool) -> dict:
+        """Flat images rgb, alpha, and where there are any depth and features.
 
-    record: list of per-Gaussian floats. sh: flat N K 3 when SH are evaluated along rays, else None. features: flat N D
-    or None. lanes: list of per-pixel floats that rays carry (SH basis values, then o and d of world rays).
-    """
-
-    def eval(self, view, record, sh, features, lanes, keep):
-        """keep: the adjoint or forward mode may follow."""
-        t = view.t
-        self.view, self.entries, self.lanes = view, len(record), lanes
-        buffers = {"record": _pack(t, record)}
+        Args:
+            record: Per-Gaussian floats, laid out as `records` says.
+            sh: Flat (N K 3) when SH are evaluated along rays, else None.
+            features: Flat (N D) or None.
+            carried: Per-ray floats: SH basis values, then o and d of world rays.
+            keep: The adjoint may follow.
+        """
+        lib, view = self.lib, self.traversal
+        self.entries, self.carried = len(record), carried
+        self.buffers = {"record": pack_records(lib, record)}
         if sh is not None:
-            buffers["sh"] = sh
+            self.buffers["sh"] = sh
         if features is not None:
-            buffers["features"] = features
-        dr.eval(buffers, lanes)
-        self.buffers, self.model = buffers, Model(t, view.settings, view.world)
-        want = set(view.want) - {"visibility"} | ({"replay"} if keep else set())
-        visibility = dr.zeros(t.Float, len_of(record)) if "visibility" in view.want else None
-        share = 4 if view.settings.order == "center" and not view.world and not view.basis else 1
-        self.passes = [self._source(color=True)]
-        self.passes += [self._source(first=k, channels=min(CHUNK, view.width - k)) for k in range(0, view.width, CHUNK)]
-        self.parts = {share: view.parts_of(view, self.model, buffers["record"], self._ray, share)}
-        if view.width and share != 1:
-            self.parts[1] = view.parts_of(view, self.model, buffers["record"], self._ray, 1)
-        out = {"rgb": dr.zeros(t.Float, 3 * view.pixels), "alpha": dr.zeros(t.Float, view.pixels)}
-        for name, kind in (("depth", t.Float), ("median", t.Float), ("count", t.UInt32)):
-            if name in view.want:
-                out[name] = dr.zeros(kind, view.pixels)
-        if view.width:
-            out["features"] = dr.zeros(t.Float, view.width * view.pixels)
+            self.buffers["features"] = features
+        dr.eval(self.buffers, carried)
+        view.start(self.model, self.buffers["record"], carried, self.basis)
+        self.certificate.update(view.certificate)
+        self.passes = [self._channels(color=True)]
+        self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in range(0, self.width, CHUNK)]
+        # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
+        share = 4 if self.settings.order == "center" and not view.world and not self.basis else 1
+        self.color_parts = view.parts(share)
+        self.feature_parts = view.parts(1) if self.width and share != 1 else self.color_parts
+        out = self._images()
+        for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
+            if name in self.want:
+                out[name] = dr.zeros(kind, self.rays)
+        want = set(self.want) - {"visibility"} | ({"replay"} if keep else set())
+        visibility = dr.zeros(lib.Float, count_of(record)) if "visibility" in self.want else None
         self.finals = []
-        for number, source in enumerate(self.passes):
+        for number, channels in enumerate(self.passes):
             first = number == 0
             kernel = Primal(
-                self.model, source, frozenset(want if first else want & {"replay"}), visibility if first else None
+                self.model, channels, frozenset(want if first else want & {"replay"}), visibility if first else None
             )
             self.finals.append(self._primal(kernel, first))
             for part, states in self.finals[-1]:
-                self._write(out, source, part, states)
+                self._write(out, channels, part, states)
         if visibility is not None:
-            view.extra["visibility"] = visibility
+            self.extra["visibility"] = visibility
         for name in ("median", "count"):
             if name in out:
-                view.extra[name] = out.pop(name)
-        dr.eval(out, view.extra)
+                self.extra[name] = out.pop(name)
+        dr.eval(out, self.extra)
         return out
 
-    def _source(self, first=0, channels=0, color=False) -> Source:
-        return Source(self.buffers, self.view.width, first, channels, color)
+    def _channels(self, first=0, channels=0, color=False) -> Channels:
+        return Channels(self.buffers, self.width, first, channels, color)
 
-    def _ray(self, x, y, flat, active) -> Ray:
-        t, view = self.view.t, self.view
-        length = view.length(x, y) if view.length else None
-        lane = [dr.gather(t.Float, v, flat, active) for v in self.lanes]
-        return Ray(x, y, length, lane, view.basis)
+    def _images(self) -> dict:
+        """Flat images of zeros."""
+        zeros = lambda channels: dr.zeros(self.lib.Float, channels * self.rays)  # noqa: E731
+        out = {"rgb": zeros(3), "alpha": zeros(1)}
+        if "depth" in self.want:
+            out["depth"] = zeros(1)
+        if self.width:
+            out["features"] = zeros(self.width)
+        return out
 
-    def _parts(self, source) -> list[Part]:
-        return self.parts[min(self.parts)] if source.channels else self.parts[max(self.parts)]
+    def _parts(self, channels: Channels) -> list[Part]:
+        return self.feature_parts if channels.channels else self.color_parts
 
-    def _primal(self, kernel, first):
+    def _primal(self, kernel: Primal, first: bool) -> list[tuple[Part, list[dict]]]:
         """(part, final states) pairs; in exact order the first traversal decides which rays are redone."""
-        parts, done = self._parts(kernel.source), []
+        parts, done = self._parts(kernel.channels), []
         for part in list(parts):
             # Visibility is scattered on the way, so rays that turn out wrong must be known beforehand.
             check = part.ordered and first
             if check and kernel.visibility is not None:
-                probe = Primal(self.model, self._source(), frozenset())
+                probe = Primal(self.model, self._channels(), frozenset())
                 dr.eval(part.run(probe, check=True), part.failed)
                 parts += self._redo(part)
                 check = False
@@ -130,150 +133,139 @@ class Composite(dr.CustomOp):
             done.append((part, states))
         return done
 
-    def _redo(self, part) -> list[Part]:
-        """Take the rays that the certificate rejects out of `part`."""
+    def _redo(self, part: Part) -> list[Part]:
+        """Take the rays that the certificate rejects out of `part`, into parts of their own."""
         failed = part.failed & part.inside[0]
-        lanes = dr.compress(failed)
+        again = dr.compress(failed)
         part.inside = [part.inside[0] & ~failed]
         dr.eval(part.inside)
-        self.view.certificate["rays"] = self.view.pixels
-        self.view.certificate["redone"] = dr.width(lanes)
-        return part.listed(lanes)
+        self.certificate["rays"] = self.rays
+        self.certificate["redone"] = dr.width(again)
+        return part.listed(again)
 
-    def _write(self, out, source, part, states):
+    def _write(self, out, channels, part, states):
         """Scatter the states of a part into the images."""
-        t, view = self.view.t, self.view
+        lib = self.lib
         for st, at, inside in zip(states, part.flat, part.inside, strict=True):
-            sums = [t.Float(s) for s in st["sum"]]
-            if source.color:
+            sums = [lib.Float(s) for s in st["sum"]]
+            if channels.color:
                 for c in range(3):
                     value = dr.fma(st["T"], self.model.background[c], sums[c])
                     dr.scatter(out["rgb"], value, 3 * at + c, inside)
-                dr.scatter(out["alpha"], t.Float(st["alpha"]), at, inside)
-                for name in view.want & {"depth", "median", "count"}:
+                dr.scatter(out["alpha"], lib.Float(st["alpha"]), at, inside)
+                for name in self.want & {"depth", "median", "count"}:
                     dr.scatter(out[name], type(out[name])(st[name]), at, inside)
-            for k in range(source.channels):
-                dr.scatter(out["features"], sums[k], at * view.width + source.first + k, inside)
+            for k in range(channels.channels):
+                dr.scatter(out["features"], sums[k], at * self.width + channels.first + k, inside)
 
-    def _grads(self) -> dict:
-        return {name: dr.zeros(self.view.t.Float, dr.width(x)) for name, x in self.buffers.items()}
-
-    def backward(self):
-        """Dr.Jit reverse mode."""
-        for name, x in self.adjoint(self.grad_out()).items():
-            self.set_grad_in(name, x)
+    # -- reverse -----------------------------------------------------------------------------------------------------
 
     def adjoint(self, g: dict) -> dict:
-        """Replay every traversal with the cotangents `g` of its outputs: gradients of the arguments by name."""
-        t, view = self.view.t, self.view
-        grads = self._grads()
-        lanes = [dr.zeros(t.Float, view.pixels) for _ in self.lanes]
+        """Replay every traversal with the cotangents `g` of its images: gradients of `forward`'s arguments by name."""
+        lib = self.lib
+        grads = {name: dr.zeros(lib.Float, dr.width(x)) for name, x in self.buffers.items()}
+        carried = [dr.zeros(lib.Float, self.rays) for _ in self.carried]
         dr.eval(g)
-        gathered = lambda name, i, active: dr.gather(t.Float, g[name], i, active)  # noqa: E731
-        for source, done in zip(self.passes, self.finals, strict=True):
-            depth = "depth" in view.want and source.color
+        for channels, done in zip(self.passes, self.finals, strict=True):
+            depth = "depth" in self.want and channels.color
             for part, finals in done:
-                cotangents = []
-                for at, inside in zip(part.flat, part.inside, strict=True):
-                    sums = [gathered("rgb", 3 * at + c, inside) for c in range(3)] if source.color else []
-                    base = at * view.width + source.first
-                    sums += [gathered("features", base + k, inside) for k in range(source.channels)]
-                    cotangents.append(
-                        {
-                            "sum": sums,
-                            "alpha": gathered("alpha", at, inside) if source.color else t.Float(0),
-                            "depth": gathered("depth", at, inside) if depth else t.Float(0),
-                            "lanes": len(self.lanes),
-                        }
-                    )
+                cotangents = [
+                    self._cotangent(g, channels, at, inside) for at, inside in zip(part.flat, part.inside, strict=True)
+                ]
                 # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
                 mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
-                with dr.suspend_grad():
-                    kernel = Adjoint(self.model, source, grads, finals, cotangents, depth, mode)
-                    states = part.run(kernel)
+                with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
+                    states = part.run(Adjoint(self.model, channels, grads, finals, cotangents, depth, mode))
                     for st, at, inside in zip(states, part.flat, part.inside, strict=True):
-                        for total, x in zip(lanes, st["lane"], strict=True):
+                        for total, x in zip(carried, st["carried"], strict=True):
                             dr.scatter_add(total, x, at, inside)
-                    dr.eval(grads, lanes)
-        i = dr.arange(t.UInt32, dr.width(grads["record"]) // RECORD)
-        used = set(self.model.slots("depth" in view.want))
+                    dr.eval(grads, carried)
+        i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
+        used = set(self.model.slots("depth" in self.want))
         record = grads.pop("record")
         grads["record"] = [
-            dr.gather(t.Float, record, i * RECORD + k) if k in used else dr.zeros(t.Float, dr.width(i))
+            dr.gather(lib.Float, record, i * RECORD + k) if k in used else dr.zeros(lib.Float, dr.width(i))
             for k in range(self.entries)
         ]
-        return grads | ({"lanes": lanes} if lanes else {})
+        return grads | ({"carried": carried} if carried else {})
 
-    def forward(self):
-        """Dr.Jit forward mode: one tangent."""
-        tangent = {"record": self.grad_in("record")}
-        for name in ("sh", "features"):
-            if name in self.buffers:
-                tangent[name] = self.grad_in(name)
-        lanes = self.grad_in("lanes") if self.lanes else []
-        self.set_grad_out(self.tangents([tangent], [lanes])[0])
+    def _cotangent(self, g: dict, channels: Channels, at, inside) -> dict:
+        """What `Adjoint` needs of the images' cotangents at a ray's pixel."""
+        lib = self.lib
+        gathered = lambda name, i: dr.gather(lib.Float, g[name], i, inside)  # noqa: E731
+        sums = [gathered("rgb", 3 * at + c) for c in range(3)] if channels.color else []
+        base = at * self.width + channels.first
+        sums += [gathered("features", base + k) for k in range(channels.channels)]
+        depth = "depth" in self.want and channels.color
+        return {
+            "sum": sums,
+            "alpha": gathered("alpha", at) if channels.color else lib.Float(0),
+            "depth": gathered("depth", at) if depth else lib.Float(0),
+            "carried": len(self.carried),
+        }
 
-    def tangents(self, buffers: list[dict], lanes: list[list]) -> list[dict]:
-        """Images of K tangents: dicts like the output of `eval`.
+    # -- tangents ----------------------------------------------------------------------------------------------------
+
+    def tangents(self, buffers: list[dict], carried: list[list]) -> list[dict]:
+        """Images of K tangents: dicts like the output of `forward`.
 
         Args:
             buffers: Per tangent, that of the arguments `record` (a list), `sh` and `features`.
-            lanes: Per tangent, that of the argument `lanes`.
+            carried: Per tangent, that of the argument `carried`.
         """
-        t, view, results = self.view.t, self.view, []
-        slots = self.model.slots("depth" in view.want)
+        lib = self.lib
+        slots = self.model.slots("depth" in self.want)
         count = dr.width(self.buffers["record"]) // RECORD
-        records = pack(t, [b["record"][k] for k in slots for b in buffers], count)
+        records = pack(lib, [b["record"][k] for k in slots for b in buffers], count)
         rest = [{name: x for name, x in b.items() if name != "record"} for b in buffers]
         for b in rest:
             for name, x in b.items():
-                b[name] = x + dr.zeros(t.Float, dr.width(self.buffers[name]))
-        dr.eval(records, rest, lanes)
-        for _ in buffers:
-            out = {"rgb": dr.zeros(t.Float, 3 * view.pixels), "alpha": dr.zeros(t.Float, view.pixels)}
-            if "depth" in view.want:
-                out["depth"] = dr.zeros(t.Float, view.pixels)
-            if view.width:
-                out["features"] = dr.zeros(t.Float, view.width * view.pixels)
-            results.append(out)
-        for source in self.passes:
-            depth = view.want & {"depth"} if source.color else frozenset()
-            for part in self._parts(source):
-                carried = [
-                    [[dr.gather(t.Float, v, at, inside) for v in per_tangent] for per_tangent in lanes]
+                b[name] = x + dr.zeros(lib.Float, dr.width(self.buffers[name]))
+        dr.eval(records, rest, carried)
+        results = [self._images() for _ in buffers]
+        for channels in self.passes:
+            depth = self.want & {"depth"} if channels.color else frozenset()
+            for part in self._parts(channels):
+                own = [
+                    [[dr.gather(lib.Float, v, at, inside) for v in per_tangent] for per_tangent in carried]
                     for at, inside in zip(part.flat, part.inside, strict=True)
                 ]
-                states = part.run(Tangent(Primal(self.model, source, depth), records, slots, rest, carried))
+                states = part.run(Tangent(Primal(self.model, channels, depth), records, slots, rest, own))
                 dr.eval(states)
                 for at, inside, state in zip(part.flat, part.inside, states, strict=True):
                     for out, d in zip(results, state["d"], strict=True):
-                        self._write_tangent(out, source, at, inside, d)
+                        self._write_tangent(out, channels, at, inside, d)
         return results
 
-    def _write_tangent(self, out, source, at, inside, d):
-        view = self.view
-        if source.color:
+    def _write_tangent(self, out, channels, at, inside, d):
+        """Scatter one tangent of a part's states into its images."""
+        if channels.color:
             for c in range(3):
                 dr.scatter(out["rgb"], dr.fma(d["T"], self.model.background[c], d["sum"][c]), 3 * at + c, inside)
             dr.scatter(out["alpha"], -d["T"], at, inside)
             if "depth" in d:
                 dr.scatter(out["depth"], d["depth"], at, inside)
-        first = 3 if source.color else 0
-        for k in range(source.channels):
-            dr.scatter(out["features"], d["sum"][first + k], at * view.width + source.first + k, inside)
+        first = 3 if channels.color else 0
+        for k in range(channels.channels):
+            dr.scatter(out["features"], d["sum"][first + k], at * self.width + channels.first + k, inside)
 
 
-def len_of(record) -> int:
-    """Number of Gaussians of a list of records (constants have width 1)."""
-    return max(dr.width(x) for x in record)
+class Composite(dr.CustomOp):
+    """`dr.custom(Composite, compositor, record, sh, features, carried, keep)`: `Compositor.forward`, with AD."""
 
+    def eval(self, compositor, record, sh, features, carried, keep):
+        """Dr.Jit's name for it."""
+        self.compositor = compositor
+        return compositor.forward(record, sh, features, carried, keep)
 
-def _pack(t, record):
-    """Interleave per-Gaussian floats into one buffer of stride RECORD."""
-    count = len_of(record)
-    i = dr.arange(t.UInt32, count)
-    spread = [x if dr.width(x) == count else x + dr.zeros(t.Float, count) for x in record]
-    spread += [dr.zeros(t.Float, count)] * (RECORD - len(record))
-    buffer = dr.zeros(t.Float, count * RECORD)
-    dr.scatter(buffer, t.ArrayXf(spread), i)
-    return buffer
+    def backward(self):
+        """Dr.Jit reverse mode."""
+        for name, x in self.compositor.adjoint(self.grad_out()).items():
+            self.set_grad_in(name, x)
+
+    def forward(self):
+        """Dr.Jit forward mode: one tangent."""
+        c = self.compositor
+        tangent = {name: self.grad_in(name) for name in c.buffers}
+        carried = self.grad_in("carried") if c.carried else []
+        self.set_grad_out(c.tangents([tangent], [carried])[0])

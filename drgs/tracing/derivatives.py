@@ -16,21 +16,22 @@ import dataclasses
 
 import drjit as dr
 
-from drgs.tracing import projection as layout
-from drgs.tracing.kernels import Model, Primal, Source, load_packed, packed_size
+from drgs.tracing.harmonics import sh_color
+from drgs.tracing.kernels import Channels, HitModel, Primal
+from drgs.tracing.records import load_packed, packed_size
 
 __all__ = ["Adjoint", "Tangent", "if_any_hit"]
 
 
-def if_any_hit(model, source, index, rays, states, places, active, take):
+def if_any_hit(model, channels, index, rays, states, places, active, take):
     """`take(index, rays, states, places, active)` where a ray of the packet meets the Gaussian, else the same states.
 
     Most Gaussians of a tile's list miss most packets of its rays, and the branch is cheaper than what it skips.
     """
-    t = model.t
-    going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
-    record = source.load(t, index, rays[0], going, only="record")["record"]
-    hits = t.Bool(False)
+    lib = model.lib
+    going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+    record = channels.load(lib, index, rays[0], going, only="record")["record"]
+    hits = lib.Bool(False)
     for ray, st in zip(rays, states, strict=True):
         hits |= model.hit(record, ray, active & (st["alive"] != 0))[2]
     return dr.if_stmt(
@@ -45,56 +46,57 @@ class Adjoint:
     """Replay of a primal pass that scatters the gradient of what every hit reads.
 
     Args:
-        grads: Buffers like `source.buffers`, added to.
+        grads: Buffers like `channels.buffers`, added to.
         finals: Per shared ray, the final state of the Primal pass.
         cotangents: Per shared ray: `sum` (a float a channel), `alpha` (of sum w), `depth` (of sum w t*).
         depth: There is a depth cotangent.
     """
 
-    def __init__(self, model: Model, source: Source, grads: dict, finals: list, cotangents: list, depth: bool, mode):
-        self.m, self.source, self.grads, self.mode = model, source, grads, mode
+    def __init__(
+        self, model: HitModel, channels: Channels, grads: dict, finals: list, cotangents: list, depth: bool, mode
+    ):
+        self.m, self.channels, self.grads, self.mode = model, channels, grads, mode
         self.finals, self.cotangents, self.slots = finals, cotangents, set(model.slots(depth))
-        self.pending = iter(zip(finals, cotangents, strict=True))
 
-    def init(self, alive, place) -> dict:
-        """State of the next shared ray; `lane` collects the gradient of what the ray itself carries."""
-        t, (final, g) = self.m.t, next(self.pending)
-        D = t.Float64
+    def init(self, k, alive, nowhere) -> dict:
+        """State of shared ray k; `carried` collects the gradient of what the ray itself carries."""
+        lib, final, g = self.m.lib, self.finals[k], self.cotangents[k]
+        D = lib.Float64
         rest = D(final["depth"]) * D(g["depth"]) if "depth" in final else D(0)
         rest = dr.fma(D(g["alpha"]), D(final["alpha"]), rest)
         for x, c in zip(final["sum"], g["sum"], strict=True):
             rest = dr.fma(D(x), D(c), rest)
-        if self.source.color:
+        if self.channels.color:
             for c, background in zip(g["sum"][:3], self.m.background, strict=True):
                 rest = dr.fma(D(c * background), D(final["T"]), rest)
-        nothing = final["place"][0] == place[0]
+        nothing = final["place"][0] == nowhere[0]
         return {
-            "T": t.Float(1),
+            "T": lib.Float(1),
             "rest": rest,
-            "alive": dr.select(alive & ~nothing, t.UInt32(1), 0),
-            "lane": [t.Float(0) for _ in range(g["lanes"])],
+            "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0),
+            "carried": [lib.Float(0) for _ in range(g["carried"])],
         }
 
     def shade(self, index, rays, states, places, active):
         """Back-propagate through Gaussian `index` what the primal pass composited of it."""
-        return if_any_hit(self.m, self.source, index, rays, states, places, active, self._take)
+        return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
     def _take(self, index, rays, states, places, active):
-        m, t, out = self.m, self.m.t, []
-        D = t.Float64
-        going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
+        m, lib, out = self.m, self.m.lib, []
+        D = lib.Float64
+        going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         with dr.resume_grad():
             fixed = {
-                name: [dr.detach(x) for x in xs] for name, xs in self.source.load(t, index, rays[0], going).items()
+                name: [dr.detach(x) for x in xs] for name, xs in self.channels.load(lib, index, rays[0], going).items()
             }
             dr.enable_grad(fixed)
-            total, hits, lanes = t.Float(0), t.Bool(False), []
+            total, hits, carried = lib.Float(0), lib.Bool(False), []
             for ray, st, g, final, place in zip(rays, states, self.cotangents, self.finals, places, strict=True):
-                ray = dataclasses.replace(ray, lane=[dr.detach(x) for x in ray.lane])
-                dr.enable_grad(ray.lane)
-                lanes.append(ray.lane)
+                ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])
+                dr.enable_grad(ray.carried)
+                carried.append(ray.carried)
                 a, depth, ok = m.hit(fixed["record"], ray, active & (st["alive"] != 0))
-                values = self.source.values(m, fixed, ray)
+                values = self.channels.values(m, fixed, ray)
                 a0, depth0, T = dr.detach(a), dr.detach(depth), st["T"]
                 w = dr.select(ok, T * a0, 0)
                 s = dr.fma(D(g["depth"]), D(depth0), D(g["alpha"]))
@@ -103,8 +105,8 @@ class Adjoint:
                 rest = st["rest"] - D(w) * s
                 left = 1 - a0
                 # Behind an a that rounds to 1 nothing was composited: there is no rest to share out.
-                behind = dr.select(left > 0, t.Float(rest) / dr.select(left > 0, left, 1), 0)
-                local = dr.fma(dr.fma(T, t.Float(s), -behind), a, w * g["depth"] * depth)
+                behind = dr.select(left > 0, lib.Float(rest) / dr.select(left > 0, left, 1), 0)
+                local = dr.fma(dr.fma(T, lib.Float(s), -behind), a, w * g["depth"] * depth)
                 for v, c in zip(values, g["sum"], strict=True):
                     local = dr.fma(w * c, v, local)
                 total += dr.select(ok, local, 0)
@@ -119,9 +121,9 @@ class Adjoint:
                 out.append(new)
             dr.backward_from(total)
             grads = {name: [dr.grad(x) for x in xs] for name, xs in fixed.items()}
-            for new, lane in zip(out, lanes, strict=True):
-                new["lane"] = [x + dr.grad(y) for x, y in zip(new["lane"], lane, strict=True)]
-        for name, (stride, offset, count) in self.source.layout(rays[0]).items():
+            for new, own in zip(out, carried, strict=True):
+                new["carried"] = [x + dr.grad(y) for x, y in zip(new["carried"], own, strict=True)]
+        for name, (stride, offset, count) in self.channels.layout(rays[0]).items():
             for k in range(count):
                 if name != "record" or k in self.slots:
                     at = index * stride + offset + k
@@ -135,33 +137,33 @@ class Tangent:
     Args:
         records: Tangents of the records, from `pack`: slot by slot, the K columns of each side by side.
         slots: Entries of a record that they hold.
-        tangents: K dicts of buffers laid out like those of `source.buffers` besides the records.
-        lanes: Per shared ray and tangent, the tangent of the ray's `lane`.
+        tangents: K dicts of buffers laid out like those of `channels.buffers` besides the records.
+        carried: Per shared ray and tangent, the tangent of what the ray carries.
     """
 
-    def __init__(self, primal: Primal, records, slots: list[int], tangents: list[dict], lanes: list[list]):
-        self.primal, self.m, self.source = primal, primal.m, primal.source
-        self.records, self.slots, self.tangents, self.lanes = records, slots, tangents, lanes
+    def __init__(self, primal: Primal, records, slots: list[int], tangents: list[dict], carried: list[list]):
+        self.primal, self.m, self.channels = primal, primal.m, primal.channels
+        self.records, self.slots, self.tangents, self.carried = records, slots, tangents, carried
 
-    def init(self, alive, place) -> dict:
+    def init(self, k, alive, nowhere) -> dict:
         """State of a ray: the primal's, and `d` with a tangent of it for each column."""
-        t, state = self.m.t, self.primal.init(alive, place)
+        lib, state = self.m.lib, self.primal.init(k, alive, nowhere)
         names = ["T", *(["depth"] if "depth" in state else [])]  # sum w is 1 - T
         state["d"] = [
-            {**{n: t.Float(0) for n in names}, "sum": [t.Float(0) for _ in range(self.source.outputs)]}
+            {**{n: lib.Float(0) for n in names}, "sum": [lib.Float(0) for _ in range(self.channels.outputs)]}
             for _ in self.tangents
         ]
         return state
 
     def shade(self, index, rays, states, places, active):
         """As Primal.shade, with the tangents."""
-        m, t = self.m, self.m.t
-        going = active & (sum((s["alive"] for s in states), t.UInt32(0)) != 0)
-        loaded = dr.detach(self.source.load(t, index, rays[0], going))
+        m, lib = self.m, self.m.lib
+        going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+        loaded = dr.detach(self.channels.load(lib, index, rays[0], going))
         speeds = self._load(index, rays[0], going)
         primal = [{k: v for k, v in st.items() if k != "d"} for st in states]
         out = self.primal.shade(index, rays, primal, places, active)
-        for ray, lanes, st, new in zip(rays, self.lanes, states, out, strict=True):
+        for ray, moving, st, new in zip(rays, self.carried, states, out, strict=True):
             live = active & (st["alive"] != 0)
             # The primal wrote what it decided: the weight is what T lost, and 0 where there was no hit.
             a0, depth0, ok = m.hit(loaded["record"], ray, live)
@@ -170,13 +172,13 @@ class Tangent:
             elif m.s.stop != "after":
                 ok &= new["alive"] != 0
             T, w = st["T"], dr.select(ok, st["T"] * a0, 0)
-            values0 = self.source.values(m, loaded, ray)
+            values0 = self.channels.values(m, loaded, ray)
             # One gradient of the hit serves all columns.
             slopes = [self._slopes(loaded["record"], ray, live, k) for k in range(2 if "depth" in new else 1)]
             new["d"] = []
-            for speed, lane, old in zip(speeds, lanes, st["d"], strict=True):
-                da = dr.select(ok, _along(slopes[0], speed["record"], lane), 0)
-                dvalues = self._moved_values(loaded, speed, ray, lane)
+            for speed, moved, old in zip(speeds, moving, st["d"], strict=True):
+                da = dr.select(ok, _along(slopes[0], speed["record"], moved), 0)
+                dvalues = self._moved_values(loaded, speed, ray, moved)
                 dw = dr.fma(old["T"], dr.select(ok, a0, 0), T * da)
                 fresh = dict(old)
                 fresh["T"] = dr.select(ok, old["T"] * (1 - a0), old["T"]) - T * da
@@ -184,16 +186,16 @@ class Tangent:
                     dr.fma(dw, v, dr.fma(w, dv, s)) for v, dv, s in zip(values0, dvalues, old["sum"], strict=True)
                 ]
                 if "depth" in old:
-                    ddepth = dr.select(ok, _along(slopes[1], speed["record"], lane), 0)
+                    ddepth = dr.select(ok, _along(slopes[1], speed["record"], moved), 0)
                     fresh["depth"] = dr.fma(dw, dr.select(ok, depth0, 0), dr.fma(w, ddepth, old["depth"]))
                 new["d"].append(fresh)
         return out
 
     def _load(self, index, ray, active) -> list[dict]:
         """Tangents of what a hit reads, by column."""
-        t, count = self.m.t, len(self.tangents)
-        flat = load_packed(t, self.records, packed_size(len(self.slots) * count), index, active)
-        speeds = [self.source.load(t, index, ray, active, tangent) for tangent in self.tangents]
+        lib, count = self.m.lib, len(self.tangents)
+        flat = load_packed(lib, self.records, packed_size(len(self.slots) * count), index, active)
+        speeds = [self.channels.load(lib, index, ray, active, tangent) for tangent in self.tangents]
         for k, speed in enumerate(speeds):
             speed["record"] = {slot: flat[j * count + k] for j, slot in enumerate(self.slots)}
         return speeds
@@ -202,29 +204,28 @@ class Tangent:
         """Gradient of a hit's opacity (0) or depth (1): {slot: value}, and of what the ray carries."""
         with dr.resume_grad():
             record = [dr.detach(x) for x in record]
-            ray = dataclasses.replace(ray, lane=[dr.detach(x) for x in ray.lane])
-            dr.enable_grad(record, ray.lane)
+            ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])
+            dr.enable_grad(record, ray.carried)
             dr.backward_from(self.m.hit(record, ray, live)[which])
-            return {k: dr.grad(record[k]) for k in self.slots}, [dr.grad(x) for x in ray.lane]
+            return {k: dr.grad(record[k]) for k in self.slots}, [dr.grad(x) for x in ray.carried]
 
-    def _moved_values(self, loaded, speed, ray, lane) -> list:
+    def _moved_values(self, loaded, speed, ray, carried) -> list:
         """Tangents of the channels of a hit."""
-        if not (self.source.color and ray.basis):
-            first = layout.W_RGB if self.m.world else layout.RGB
-            color = [speed["record"][first + c] for c in range(3)] if self.source.color else []
+        if not (self.channels.color and ray.basis):
+            color = [speed["record"][self.m.rgb + c] for c in range(3)] if self.channels.color else []
             return color + speed.get("features", [])
         with dr.resume_grad():
             moved = [dr.detach(x) for x in loaded["sh"]]
-            basis = [dr.detach(x) for x in ray.lane[: ray.basis]]
+            basis = [dr.detach(x) for x in ray.carried[: ray.basis]]
             dr.enable_grad(moved, basis)
-            for x, v in zip(moved + basis, speed["sh"] + lane[: ray.basis], strict=True):
+            for x, v in zip(moved + basis, speed["sh"] + carried[: ray.basis], strict=True):
                 dr.set_grad(x, v)
-            color = layout.sh_color(basis, lambda k, c: moved[3 * k + c])
+            color = sh_color(basis, lambda k, c: moved[3 * k + c])
             dr.forward_to(color)
             return [dr.grad(x) for x in color] + speed.get("features", [])
 
 
-def _along(slopes, record, lane):
+def _along(slopes, record, carried):
     """A gradient times a tangent."""
-    of_record, of_lane = slopes
-    return sum(x * record[k] for k, x in of_record.items()) + sum(x * v for x, v in zip(of_lane, lane, strict=True))
+    of_record, of_ray = slopes
+    return sum(x * record[k] for k, x in of_record.items()) + sum(x * v for x, v in zip(of_ray, carried, strict=True))

@@ -15,10 +15,10 @@ from __future__ import annotations
 import drjit as dr
 
 from drgs.tracing.kernels import Ray
-from drgs.tracing.projection import RECORD
-from drgs.tracing.tiles import TILE, Lists
+from drgs.tracing.protocols import Kernel, Stream
+from drgs.tracing.records import RECORD
 
-__all__ = ["BUFFER", "EMPTY", "NOWHERE", "Part", "TileStream", "tile_part"]
+__all__ = ["BUFFER", "EMPTY", "NOWHERE", "ListStream", "Part"]
 
 BUFFER = 16
 EMPTY = -1.0  # order key of "no hit"; keys of hits are >= 0
@@ -27,137 +27,153 @@ _LAST = 3.3e38  # a key behind all others
 _MAX_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
 
 
-class TileStream:
-    """Entries of a tile's list, one after the other."""
+class ListStream:
+    """Entries of a list, of each lane those from `start` to `end`; a `Stream`.
 
-    def __init__(self, t, lists: Lists, tile, active):
-        self.t, self.lists = t, lists
-        self.start = dr.gather(t.UInt32, lists.start, tile)
-        self.end = dr.select(active, dr.gather(t.UInt32, lists.end, tile), self.start)
+    Args:
+        index: (entries,) Gaussians.
+        start, end: Per lane.
+        ahead: (entries,) lower bound of the order key of this entry and all later ones of its lane; None without.
+    """
+
+    def __init__(self, lib, index, start, end, ahead=None):
+        self.lib, self.index, self.start, self.end, self.ahead = lib, index, start, end, ahead
 
     def begin(self):
-        """State of the stream at its start."""
-        return self.t.UInt32(self.start)
+        """The place of the first entry."""
+        return self.lib.UInt32(self.start)
 
     def more(self, i):
-        """Whether there is a candidate left."""
+        """Whether there is an entry left."""
         return i < self.end
 
+    def place(self, i):
+        """In the list."""
+        return i
+
     def next(self, i, active):
-        """(Gaussian, valid, lower bound of this and all later keys, new state)."""
-        index = dr.gather(self.t.UInt32, self.lists.index, i, active)
-        bound = EMPTY if self.lists.ahead is None else dr.gather(self.t.Float, self.lists.ahead, i, active)
+        """One entry."""
+        index = dr.gather(self.lib.UInt32, self.index, i, active)
+        bound = EMPTY if self.ahead is None else dr.gather(self.lib.Float, self.ahead, i, active)
         return index, active, bound, i + 1
+
+    def of(self, lanes) -> ListStream:
+        """The entries of some lanes."""
+        start, end = (dr.gather(self.lib.UInt32, x, lanes) for x in (self.start, self.end))
+        return ListStream(self.lib, self.index, start, end, self.ahead)
 
 
 class Part:
     """Lanes, their rays and pixels, and the stream of candidates.
 
     Attributes:
-        rays: `share` rays a lane.
+        rays: One or four a lane, all of which walk along the same stream.
         flat: Per shared ray, the pixel (row-major index) it belongs to.
         inside: Per shared ray, whether there is such a pixel and this part decides it.
         failed: After a primal pass in exact order: lanes whose buffer was too short.
     """
 
-    def __init__(self, t, model, records, rays, flat, inside, stream_of, ordered: bool, center_key=None):
-        self.t, self.model, self.records = t, model, records
+    def __init__(self, lib, model, records, rays, flat, inside, stream: Stream, ordered: bool, center_key=None):
+        self.lib, self.model, self.records = lib, model, records
         self.rays, self.flat, self.inside = rays, flat, inside
-        self.stream_of, self.ordered, self.center_key = stream_of, ordered, center_key
+        self.stream, self.ordered, self.center_key = stream, ordered, center_key
         self.failed = None
 
-    def listed(self, lanes) -> list[Part]:
-        """Parts that walk a subset of lanes along sorted lists of all their hits."""
-        t = self.t
-        if dr.width(lanes) == 0:
+    def listed(self, again) -> list[Part]:
+        """Parts that walk some of the rays again, given by their lanes, along sorted lists of all their hits."""
+        lib, count = self.lib, dr.width(again)
+        if count == 0:
             return []
-        pick = lambda x: dr.gather(type(x), x, lanes)  # noqa: E731
+        pick = lambda x: dr.gather(type(x), x, again)  # noqa: E731
         rays = [
-            Ray(*(None if v is None else pick(v) for v in (r.x, r.y, r.length)), [pick(v) for v in r.lane], r.basis)
+            Ray(*(None if v is None else pick(v) for v in (r.x, r.y, r.length)), [pick(v) for v in r.carried], r.basis)
             for r in self.rays
         ]
-        flat, stream = [pick(f) for f in self.flat], self.stream_of(lanes)
+        flat, stream = [pick(f) for f in self.flat], self.stream.of(again)
         dr.eval(rays, flat)
-        with dr.suspend_grad():
-            count = self._each_hit(rays[0], stream, dr.width(lanes), lambda *hit: None)
-            dr.eval(count)
-            total = int(dr.sum(t.UInt64(count))[0])
-            if total > _MAX_HITS and dr.width(lanes) > 1:
-                half = dr.arange(t.UInt32, dr.width(lanes) // 2)
-                rest = dr.arange(t.UInt32, dr.width(lanes) - dr.width(half)) + dr.width(half)
-                return self.listed(dr.gather(t.UInt32, lanes, half)) + self.listed(dr.gather(t.UInt32, lanes, rest))
-            start = dr.cumsum(count) - count
-            keys, index = dr.zeros(t.UInt64, max(total, 1)), dr.zeros(t.UInt32, max(total, 1))
-            lane = t.UInt64(dr.arange(t.UInt32, dr.width(lanes))) << 32
+        with dr.suspend_grad():  # lists say what to look at, and in which order: neither has a derivative
+            hits = self._each_hit(rays[0], stream, count, lambda *hit: None)
+            dr.eval(hits)
+            total = int(dr.sum(lib.UInt64(hits))[0])
+            if total > _MAX_HITS and count > 1:
+                half = dr.arange(lib.UInt32, count // 2)
+                rest = dr.arange(lib.UInt32, count - dr.width(half)) + dr.width(half)
+                return self.listed(dr.gather(lib.UInt32, again, half)) + self.listed(dr.gather(lib.UInt32, again, rest))
+            start = dr.cumsum(hits) - hits
+            index = self._sorted_hits(rays[0], stream, start, total)
+        stream = ListStream(lib, index, start, start + hits)
+        inside = [lib.Bool(True)] * len(rays)
+        return [Part(lib, self.model, self.records, rays, flat, inside, stream, False)]
 
-            def write(k, candidate, key, ok):
-                # Keys are >= 0, where floats order like their bits.
-                dr.scatter(keys, lane | t.UInt64(dr.reinterpret_array(t.UInt32, key)), start + k, ok)
-                dr.scatter(index, candidate, start + k, ok)
+    def _sorted_hits(self, ray, stream, start, total: int):
+        """The hits of each ray, from its `start` on, by (key, index)."""
+        lib, count = self.lib, dr.width(start)
+        keys, index = dr.zeros(lib.UInt64, max(total, 1)), dr.zeros(lib.UInt32, max(total, 1))
+        own = lib.UInt64(dr.arange(lib.UInt32, count)) << 32
 
-            dr.eval(self._each_hit(rays[0], stream, dr.width(lanes), write), keys, index)
-            # Sorts are stable: by index first, so that equal keys of a ray keep that order.
-            by_index = t.UInt32(dr.argsort(index))
-            by_key = t.UInt32(dr.argsort(dr.gather(t.UInt64, keys, by_index)))
-            index = dr.gather(t.UInt32, index, dr.gather(t.UInt32, by_index, by_key))
-            dr.eval(index, start)
-        lists = Lists(index, start, start + count, None, 0, 0, total)
-        here = dr.arange(t.UInt32, dr.width(lanes))
-        stream_of = lambda _: TileStream(t, lists, here, t.Bool(True))  # noqa: E731
-        inside = [t.Bool(True)] * len(rays)
-        return [Part(t, self.model, self.records, rays, flat, inside, stream_of, False)]
+        def write(k, candidate, key, ok):
+            # Keys are >= 0, where floats order like their bits.
+            dr.scatter(keys, own | lib.UInt64(dr.reinterpret_array(lib.UInt32, key)), start + k, ok)
+            dr.scatter(index, candidate, start + k, ok)
+
+        dr.eval(self._each_hit(ray, stream, count, write), keys, index)
+        # Sorts are stable: by index first, so that equal keys of a ray keep that order.
+        by_index = lib.UInt32(dr.argsort(index))
+        by_key = lib.UInt32(dr.argsort(dr.gather(lib.UInt64, keys, by_index)))
+        index = dr.gather(lib.UInt32, index, dr.gather(lib.UInt32, by_index, by_key))
+        dr.eval(index, start)
+        return index
 
     def _each_hit(self, ray, stream, lanes: int, visit):
         """Number of hits of every lane; `visit(number so far, Gaussian, key, is hit)` sees each candidate."""
-        t = self.t
-        start = stream.begin()
-        start = t.UInt32(start) if isinstance(start, t.UInt32) else start
+        lib = self.lib
 
         def body(s, k):
-            candidate, valid, _, s = stream.next(s, t.Bool(True))
+            candidate, valid, _, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, ray, valid)
             visit(k, candidate, key, ok)
-            return s, k + dr.select(ok, t.UInt32(1), 0)
+            return s, k + dr.select(ok, lib.UInt32(1), 0)
 
-        return dr.while_loop((start, dr.zeros(t.UInt32, lanes)), lambda s, k: stream.more(s), body)[1]
+        return dr.while_loop((stream.begin(), dr.zeros(lib.UInt32, lanes)), lambda s, k: stream.more(s), body)[1]
 
-    def run(self, kernel, check: bool = False) -> list[dict]:
-        """Walk all rays with a Primal, Adjoint or Tangent; `check` keeps the certificate in `failed`."""
-        with dr.suspend_grad():
+    def run(self, kernel: Kernel, check: bool = False) -> list[dict]:
+        """Walk all rays with a kernel: final states of each shared ray; `check` keeps the certificate in `failed`."""
+        with dr.suspend_grad():  # kernels differentiate on their own: nothing of the loop is recorded
             if not self.ordered:
                 return self._in_order(kernel)
             return self._sorted(kernel, check)
 
     def _in_order(self, kernel):
-        t, stream = self.t, self.stream_of(None)
-        states = [kernel.init(inside, [t.UInt32(NOWHERE)]) for inside in self.inside]
+        """Composite the candidates as they come."""
+        lib, stream = self.lib, self.stream
+        states = [kernel.init(k, inside, [lib.UInt32(NOWHERE)]) for k, inside in enumerate(self.inside)]
         start = stream.begin()
 
         def body(s, go, states):
-            index, valid, _, after = stream.next(s, t.Bool(True))
-            place = s if isinstance(s, t.UInt32) else after[0]
-            states = kernel.shade(index, self.rays, states, [[place]] * len(self.rays), valid)
-            alive = sum((st["alive"] for st in states), t.UInt32(0))
-            return after, dr.select(stream.more(after) & (alive != 0), t.UInt32(1), 0), states
+            index, valid, _, after = stream.next(s, lib.Bool(True))
+            states = kernel.shade(index, self.rays, states, [[stream.place(s)]] * len(self.rays), valid)
+            alive = sum((st["alive"] for st in states), lib.UInt32(0))
+            return after, dr.select(stream.more(after) & (alive != 0), lib.UInt32(1), 0), states
 
-        go = dr.select(stream.more(start), t.UInt32(1), 0)
+        go = dr.select(stream.more(start), lib.UInt32(1), 0)
         return dr.while_loop((start, go, states), lambda s, go, states: go != 0, body)[2]
 
     def _probe(self, index, ray, active):
         """Order key of a candidate, and whether it is a hit."""
-        t = self.t
-        record = list(dr.gather(t.ArrayXf, self.records, index, active, shape=(RECORD, dr.width(index))))
+        lib = self.lib
+        record = list(dr.gather(lib.ArrayXf, self.records, index, active, shape=(RECORD, dr.width(index))))
         _, key, ok = self.model.hit(record, ray, active)
         # `integral` has hits whose t* lies behind the origin.
         key = dr.maximum(key, 0)
         if self.center_key is not None:
-            key = dr.gather(t.Float, self.center_key, index, ok)
+            key = dr.gather(lib.Float, self.center_key, index, ok)
         return key, ok
 
     def _sorted(self, kernel, check):
-        t, stream = self.t, self.stream_of(None)
-        F, U = t.Float, t.UInt32
-        state = kernel.init(self.inside[0], [F(EMPTY), U(0)])
+        """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
+        lib, stream = self.lib, self.stream
+        F, U = lib.Float, lib.UInt32
+        state = kernel.init(0, self.inside[0], [F(EMPTY), U(0)])
         start = stream.begin()
         keys, index = [F(EMPTY) for _ in range(BUFFER)], [U(0) for _ in range(BUFFER)]
 
@@ -169,7 +185,7 @@ class Part:
             return keys, index, [dr.select(out, key, last[0]), dr.select(out, at, last[1])], state
 
         def body(s, go, keys, index, last, failed, state):
-            candidate, valid, bound, s = stream.next(s, t.Bool(True))
+            candidate, valid, bound, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, self.rays[0], valid)
             if check:
                 failed = dr.select(ok & _less(key, candidate, *last), 1, failed)
@@ -194,20 +210,20 @@ class Part:
 
     def _drain(self, kernel, keys, index, state):
         """Composite what is left in the buffer."""
-        t = self.t
+        lib = self.lib
 
         def body(j, keys, index, state):
             (state,) = kernel.shade(
                 index[0], self.rays, [state], [[keys[0], index[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST)
             )
-            keys = [*keys[1:], t.Float(_LAST)]
-            index = [*index[1:], t.UInt32(0)]
+            keys = [*keys[1:], lib.Float(_LAST)]
+            index = [*index[1:], lib.UInt32(0)]
             return j + 1, keys, index, state
 
         def cond(j, keys, index, state):
             return (j < BUFFER) & (state["alive"] != 0)
 
-        return dr.while_loop((t.UInt32(0), keys, index, state), cond, body)[3]
+        return dr.while_loop((lib.UInt32(0), keys, index, state), cond, body)[3]
 
 
 def _less(key_a, index_a, key_b, index_b):
@@ -227,36 +243,3 @@ def _push(key, index, keys, indices):
         key, index = dr.select(swap, key, keys[j]), dr.select(swap, index, indices[j])
     keys[-1], indices[-1] = key, index
     return out, keys, indices
-
-
-def tile_part(t, model, records, lists: Lists, settings, width: int, height: int, ray_of, share: int) -> Part:
-    """All pixels of an image along their tile lists.
-
-    Args:
-        ray_of: (x, y, pixel index, active) -> Ray.
-        share: Pixels a lane carries, 4 or 1.
-    """
-    per_tile = TILE * TILE // share
-    lane = dr.arange(t.UInt32, lists.columns * lists.rows * per_tile)
-    tile, inner = lane // per_tile, lane % per_tile
-    block, k = inner // 16, inner % 16
-    # 16 consecutive lanes, a packet, are 4x4 pixels.
-    x = (tile % lists.columns) * TILE + (block % 2) * 4 + k % 4
-    y = (tile // lists.columns) * TILE + (block // 2) * 4 + k // 4
-    blocks = [(0, 0), (4, 0), (0, 4), (4, 4)] if share == 4 else [(0, 0)]
-    pixels = [(x + a, y + b) for a, b in blocks]
-    inside = [(px < width) & (py < height) for px, py in pixels]
-    flat = [py * width + px for px, py in pixels]
-    rays = [
-        ray_of(t.Float(px) + 0.5, t.Float(py) + 0.5, f, i) for (px, py), f, i in zip(pixels, flat, inside, strict=True)
-    ]
-    some = inside[0]
-    for other in inside[1:]:
-        some = some | other
-
-    def stream_of(lanes):
-        if lanes is None:
-            return TileStream(t, lists, tile, some)
-        return TileStream(t, lists, dr.gather(t.UInt32, tile, lanes), t.Bool(True))
-
-    return Part(t, model, records, rays, flat, inside, stream_of, settings.order == "ray")

@@ -1,0 +1,66 @@
+"""What hits read of a Gaussian in one view: records, floats side by side in one buffer.
+
+`projection.py` and the responses fill them, the loops over hits read them. A record is of the screen (pinhole cameras,
+traversal `tiles`) or of the world (any ray, `bvh`).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+
+__all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "pack", "pack_records", "packed_size"]
+
+# Layout of a screen record (floats). ALPHA holds the opacity, or what stands for it in the response (its `strength`).
+RECORD = 24
+AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)
+# A world record: mean (3), W by rows (9), opacity, extent^2, rgb (3); padded to the same stride.
+W_MEAN, W_ROWS, W_ALPHA, W_EXT2, W_RGB = 0, 3, 12, 13, 14
+
+
+def dot(a, b):
+    """Of two lists of three."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a, b):
+    """Of two lists of three."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def count_of(record: list) -> int:
+    """Number of Gaussians of a list of records (constants have width 1)."""
+    return max(dr.width(x) for x in record)
+
+
+def pack_records(lib, record: list):
+    """Interleave the entries of records, (N,) each, into one buffer of stride RECORD."""
+    count = count_of(record)
+    i = dr.arange(lib.UInt32, count)
+    spread = [x if dr.width(x) == count else x + dr.zeros(lib.Float, count) for x in record]
+    spread += [dr.zeros(lib.Float, count)] * (RECORD - len(record))
+    buffer = dr.zeros(lib.Float, count * RECORD)
+    dr.scatter(buffer, lib.ArrayXf(spread), i)
+    return buffer
+
+
+def packed_size(count: int) -> int:
+    """Floats a Gaussian in a packed buffer of `count`: whole packets of 16."""
+    return -(-count // 16) * 16
+
+
+def pack(lib, columns: list, count: int):
+    """Interleave per-Gaussian floats: `packed_size(len(columns))` of each of `count` Gaussians together."""
+    size, i, zero = packed_size(len(columns)), dr.arange(lib.UInt32, count), dr.zeros(lib.Float, count)
+    buffer = dr.zeros(lib.Float, count * size)
+    columns = [x + zero for x in columns] + [zero] * (size - len(columns))
+    for k in range(0, size, 16):
+        dr.scatter(buffer, lib.ArrayXf(columns[k : k + 16]), i * (size // 16) + k // 16)
+    return buffer
+
+
+def load_packed(lib, buffer, size: int, index, active) -> list:
+    """The `size` floats of a Gaussian from a buffer of `pack`."""
+    values = []
+    for k in range(size // 16):
+        values += list(dr.gather(lib.ArrayXf, buffer, index * (size // 16) + k, active, shape=(16, dr.width(index))))
+    return values

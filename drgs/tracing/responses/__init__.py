@@ -1,0 +1,75 @@
+"""Responses: what opacity a Gaussian has for a ray. One file each, which says all that the engine asks of it.
+
+A new one is a class here that keeps the `Response` protocol, its name in `RenderSettings`, and its equations in the
+float64 oracle (reference.py), written independently of this.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from drgs.tracing.responses.ewa import Ewa
+from drgs.tracing.responses.integral import Integral
+from drgs.tracing.responses.peak import Peak
+
+__all__ = ["RESPONSES", "Response"]
+
+
+class Response(Protocol):
+    """One formula of the opacity of a hit, with all that follows from it.
+
+    Attributes:
+        name: As in `RenderSettings.response`.
+        front_only: Peaks behind the origin of a ray do not count.
+        at_most_alpha: Where rho^2 is, the opacity of a hit is at most alpha exp(-rho^2 / 2).
+        extra: Floats a Gaussian that `slopes` needs besides the record (`extras`).
+        by_tangents: These floats are tangents of the record, not closed forms.
+    """
+
+    name: str
+    front_only: bool
+    at_most_alpha: bool
+    extra: int
+    by_tangents: bool
+
+    # Once a Gaussian and view, in float64.
+
+    def strength(self, logit, opacity, e):
+        """What stands for alpha in the record; e = exp(-|logit|)."""
+
+    def strength_slope(self, logit, opacity, e):
+        """d log strength / d logit."""
+
+    def project(self, g, screen):
+        """Entries of a screen record behind the anchor, bounds in pixels, mask of what is there, `Projected.frame`."""
+
+    def extras(self, lib, projected, moved) -> list:
+        """(N,) columns for `slopes`; `moved`: tangents of the record by means, rotations and log-scales."""
+
+    # Once a hit, in float32.
+
+    def slots(self, world: bool, depth: bool) -> list[int]:
+        """Entries of a record that carry a derivative; `depth` tells whether t* has a cotangent or tangent."""
+
+    def along(self, r, ray, world: bool) -> tuple:
+        """rho^2, t* (the order key) and u = t* |d'| (None where `opacity` does not need it) of a ray."""
+
+    def opacity(self, x, u):
+        """Of a hit, from x = strength exp(-rho^2 / 2)."""
+
+    def slopes(self, r, extra, ray, world: bool) -> list:
+        """d opacity / d (mean 3, rotation 3, log-scale 3, log strength)."""
+
+    # Once a tile and Gaussian, in float32.
+
+    def least_strength(self, alpha_min: float) -> float:
+        """Least strength exp(-rho^2 / 2) of a hit whose opacity reaches alpha_min."""
+
+    def may_hit(self, r, dx, dy, half: float, limit):
+        """False only where no ray within `half` pixels of (dx, dy), from the anchor, hits with rho^2 <= limit."""
+
+    def depth(self, r, dx, dy):
+        """t* at (dx, dy), at least 0, for the order of lists: it decides nothing else."""
+
+
+RESPONSES: dict[str, Response] = {response.name: response for response in (Peak(), Integral(), Ewa())}

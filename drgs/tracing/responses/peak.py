@@ -1,0 +1,324 @@
+"""Response `peak`: a = alpha exp(-rho^2 / 2) where a ray comes nearest to the Gaussian in its own metric.
+
+Moenne-Loccoz et al. 2024 (3D Gaussian ray tracing). With W = S^-1 R^T, o' = W (o - mu), d' = W d:
+t* = -o'.d' / |d'|^2, rho^2 = |o' x d'|^2 / |d'|^2.
+
+On the screen. A pinhole ray has the direction d(x, y) = d_a + (x - x_a) d_x + (y - y_a) d_y in camera coordinates,
+unnormalized with d_z = 1, around an anchor pixel (x_a, y_a); c is the mean there, o' = -W c. Nothing cancels: o' x d'
+is linear in the pixel, C_a + A dx + B dy, with (W c) x (W d) = cof(W) (c x d), so that rho^2 = |C_a + A dx + B dy|^2 /
+|d'|^2 is formed without subtracting large numbers however far the Gaussian is. A, B and C_a are perpendicular to W c: a
+frame (u, v) of that plane leaves 6 numbers of them, triangular form along (f1, f2, f3) 5 of (d'_a, d'_x, d'_y). The
+anchor is the pixel center nearest to the projected mean, where C_a is small. A mean on or behind the camera plane has
+no projection: there any anchor will do, because such a Gaussian reaches the picture only if it is within a few standard
+deviations of the camera, where nothing is large.
+
+Derivatives. With y = S^-1 R^T x the ray meets its peak at p (|p|^2 = rho^2, p perpendicular to d'), u = t* |d'|, and
+e = d' / |d'|. As p minimizes the distance, moving along the ray changes nothing, and
+
+    d(-rho^2 / 2) = (p / s) . R^T dmu  +  p_k^2 dlog s_k  +  w . R (S p x S^-1 p)
+
+for a move dmu of the mean and a world-frame rotation R <- exp([w]x) R; integral.py has du.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+
+from drgs.tracing import records as layout
+from drgs.tracing.records import cross, dot
+
+__all__ = ["Peak", "approach", "deviation", "times"]
+
+_FAR = 3.0e38
+
+
+class Peak:
+    """a = alpha exp(-rho^2 / 2); peaks behind the origin of the ray do not count."""
+
+    name = "peak"
+    front_only = True
+    at_most_alpha = True
+    # The plane (u, v) of o' x d' in the axes that directions are stored along (6), R S^-1, R S and those axes (27).
+    extra = 33
+    by_tangents = False
+
+    def strength(self, logit, opacity, e):
+        """Alpha itself."""
+        return opacity
+
+    def strength_slope(self, logit, opacity, e):
+        """1 - alpha, without its cancellation."""
+        return dr.select(logit >= 0, e, 1) / (1 + e)
+
+    # -- once a Gaussian and view ------------------------------------------------------------------------------------
+
+    def project(self, g, screen):
+        """The 15 numbers of rho^2, t* and |d'| around the anchor, and the bounds of the extent ellipsoid."""
+        fx, skew, cx, fy, cy = screen.pinhole
+        dx = [dr.rcp(fx), type(fx)(0), type(fx)(0)]
+        dy = [-skew / (fx * fy), dr.rcp(fy), type(fx)(0)]
+        inverse = [dr.rcp(s) for s in g.scale]
+        volume = inverse[0] * inverse[1] * inverse[2]
+        cofactor = [s * volume for s in g.scale]
+        f = g.from_local
+
+        def local(v, weight):  # diag(weight) R^T v, from camera axes
+            return [weight[k] * (f[0][k] * v[0] + f[1][k] * v[1] + f[2][k] * v[2]) for k in range(3)]
+
+        yn = (screen.y - cy) / fy
+        da = [(screen.x - cx - skew * yn) / fx, yn, type(yn)(1)]
+        d = local(da, inverse)
+        norm = dr.sqrt(dot(d, d))
+        unit = dr.rcp(norm)
+        A = _scaled(local(cross(g.center, dx), cofactor), unit)
+        B = _scaled(local(cross(g.center, dy), cofactor), unit)
+        C = _scaled(local(cross(g.center, da), cofactor), unit)
+        # All three are perpendicular to W c: two components each say everything.
+        u, v = _frame(local(g.center, inverse))
+        r = [dot(u, A), dot(u, B), dot(u, C), dot(v, A), dot(v, B), dot(v, C)]
+        # The same for (d'_a, d'_x, d'_y), divided by |d'_a|: Gram-Schmidt from d'_a on.
+        f1 = _scaled(d, unit)
+        Dx, Dy = _scaled(local(dx, inverse), unit), _scaled(local(dy, inverse), unit)
+        e2, e3 = dot(f1, Dx), dot(f1, Dy)
+        rest = _perpendicular(_less(Dx, f1, e2), f1)
+        e4 = dr.sqrt(dot(rest, rest))
+        f2 = _scaled(rest, dr.rcp(e4))
+        f3 = cross(f1, f2)
+        h = _scaled(local(g.center, inverse), unit)
+        numbers = [*r, e2, e3, e4, dot(f2, Dy), dot(f3, Dy), dot(f1, h), dot(f2, h), dot(f3, h), norm]
+        return numbers, *_silhouette(g, screen), (g.rotation, g.scale, (u, v), (f1, f2, f3))
+
+    def extras(self, lib, projected, moved) -> list:
+        """What the closed forms need of the frame, see `extra`."""
+        F = lib.Float
+        rotation, scale, plane, axes = projected.frame
+        axes = axes or [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+        columns = [F(dot(f, x)) for x in plane for f in axes] if plane else [F(0)] * 6
+        local = list(zip(*axes, strict=True))  # rows: local axes; columns: f
+        for weight in ([dr.rcp(s) for s in scale], scale):
+            columns += [
+                F(sum(rotation[r][k] * weight[k] * local[k][i] for k in range(3))) for r in range(3) for i in range(3)
+            ]
+        return columns + [F(local[k][i]) for k in range(3) for i in range(3)]
+
+    # -- once a hit --------------------------------------------------------------------------------------------------
+
+    def slots(self, world: bool, depth: bool) -> list[int]:
+        """All numbers of the shape; those of t* where the depth is asked for."""
+        L = layout
+        if world:
+            return [*range(L.W_MEAN, L.W_ALPHA + 1), *range(L.W_RGB, L.W_RGB + 3)]
+        used = [*range(L.R11, L.R23 + 1), L.ALPHA, *range(L.RGB, L.RGB + 3), *range(L.E2, L.E6 + 1)]
+        return used + ([L.H1, L.H2, L.H3] if depth else [])
+
+    def along(self, r, ray, world: bool) -> tuple:
+        """rho^2, t* and u of a ray."""
+        if world:
+            t0, a, d, inverse = _local(r, ray)
+            c = cross(a, d)
+            key = t0 - dot(a, d) * inverse
+            return dot(c, c) * inverse, key, self._u_in_world(key, d, inverse)
+        c1, c2, d, inverse = _on_screen(r, ray)
+        squared = dr.fma(c1, c1, c2 * c2)
+        along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
+        return squared * inverse, along * inverse * ray.length, self._u_on_screen(r, along, inverse)
+
+    def _u_in_world(self, key, d, inverse):
+        return None
+
+    def _u_on_screen(self, r, along, inverse):
+        return None
+
+    def opacity(self, x, u):
+        """alpha exp(-rho^2 / 2)."""
+        return x
+
+    def slopes(self, r, extra, ray, world: bool) -> list:
+        """a times the derivatives of -rho^2 / 2 (module docstring)."""
+        p, _, _, rho2 = self._peak(r, extra, ray, world)
+        a = r[layout.W_ALPHA if world else layout.ALPHA] * dr.exp(-0.5 * rho2)
+        return [*(a * x for x in approach(extra, p)), a]
+
+    def _peak(self, r, extra, ray, world):
+        """p, e, u and rho^2; on the screen p and e in the frame of the ray's direction at the anchor."""
+        rho2, _, u = self.along(r, ray, world)
+        if world:
+            _, a, d, inverse = _local(r, ray)
+            root = dr.sqrt(inverse)
+            # a - (a.d) d / |d|^2 would cancel where a is long: across a sheet it is 1e6 times p.
+            return [x * inverse for x in cross(d, cross(a, d))], [x * root for x in d], u, rho2
+        c1, c2, d, inverse = _on_screen(r, ray)
+        q = [dr.fma(c1, extra[i], c2 * extra[3 + i]) for i in range(3)]
+        root = dr.sqrt(inverse)
+        return [x * inverse for x in cross(q, d)], [x * root for x in d], u, rho2
+
+    # -- once a tile -------------------------------------------------------------------------------------------------
+
+    def least_strength(self, alpha_min: float) -> float:
+        """The opacity is the strength times exp(-rho^2 / 2)."""
+        return alpha_min
+
+    def may_hit(self, r, dx, dy, half: float, limit):
+        """False only where rho^2 <= limit has no solution, or (if only peaks in front count) all of it is behind."""
+        d = _direction(r, dx, dy)
+        slopes = (r[layout.E2], r[layout.E3]), (r[layout.E4], r[layout.E5]), (0.0, r[layout.E6])
+        most = [abs(v) + half * (abs(a) + abs(b)) for v, (a, b) in zip(d, slopes, strict=True)]
+        length2 = dr.fma(most[0], most[0], dr.fma(most[1], most[1], most[2] * most[2]))
+        # 1.0001 and 1e-6: float32 rounds what is compared by less.
+        met = ~(deviation(r, dx, dy, half) > 1.0001 * limit * length2)
+        if self.front_only:
+            h = r[layout.H1], r[layout.H2], r[layout.H3]
+            along = [a * b for a, b in zip(h, d, strict=True)]
+            rise = [sum(a * b[k] for a, b in zip(h, slopes, strict=True)) for k in range(2)]
+            rounding = 1e-6 * sum(abs(x) for x in along)
+            met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
+        return met
+
+    def depth(self, r, dx, dy):
+        """t* at a point of the image, up to |d|."""
+        d = _direction(r, dx, dy)
+        along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
+        depth = along * dr.rcp(dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2])))
+        return dr.select(depth > 0, dr.minimum(depth, _FAR), 0)
+
+
+def deviation(r, dx, dy, half: float):
+    """Least (c1^2 + c2^2) of the record within `half` pixels of (dx, dy), rounding taken off."""
+    L = layout
+
+    def least(a, b, c):  # of |a x + b y + c|
+        parts = a * dx, b * dy, c
+        rounding = 1e-6 * (abs(parts[0]) + abs(parts[1]) + abs(c))  # a few units in the last place of each part
+        return dr.maximum(abs(parts[0] + parts[1] + parts[2]) - half * (abs(a) + abs(b)) - rounding, 0)
+
+    m1, m2 = least(r[L.R11], r[L.R12], r[L.R13]), least(r[L.R21], r[L.R22], r[L.R23])
+    return dr.fma(m1, m1, m2 * m2)
+
+
+def approach(extra, p) -> list:
+    """d(-rho^2 / 2) by mean, rotation and log-scale: (p / s) R^T, R (S p x S^-1 p), p_k^2."""
+    n, v, local = times(extra, 0, p), times(extra, 1, p), times(extra, 2, p)
+    return [*n, *cross(v, n), *[x * x for x in local]]
+
+
+def times(extra, which: int, x) -> list:
+    """R S^-1 (0), R S (1) or 1 (2) times a vector in the stored axes: in world axes, world axes and local axes."""
+    m = extra[6 + 9 * which : 15 + 9 * which]
+    return [m[3 * r] * x[0] + m[3 * r + 1] * x[1] + m[3 * r + 2] * x[2] for r in range(3)]
+
+
+def _on_screen(r, ray):
+    """Of a pinhole ray: the two parts of o' x d', d' in its own frame, and 1 / |d'|^2."""
+    L = layout
+    dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
+    c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
+    c2 = dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, r[L.R23]))
+    d = _direction(r, dx, dy)
+    return c1, c2, d, dr.rcp(dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2])))
+
+
+def _direction(r, dx, dy) -> list:
+    """The three parts of d' at (dx, dy) from the anchor, along (f1, f2, f3)."""
+    L = layout
+    return [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
+
+
+def _local(r, ray):
+    """Of a ray o + t d in the world: t0, w = (o - mu) + t0 d and d in the local frame, and 1 / |d'|^2.
+
+    t0, where the ray is nearest to the mean, only moves the point about which the local frame is expanded, so that what
+    is rounded is as small as the Gaussian's distance from the ray.
+    """
+    L = layout
+    o, d = ray.carried[-6:-3], ray.carried[-3:]
+    to = [r[L.W_MEAN + k] - o[k] for k in range(3)]
+    t0 = dr.detach(dot(to, d))  # no value depends on it but for rounding, hence no derivative
+    w = [dr.fma(t0, d[k], -to[k]) for k in range(3)]
+    rows = [r[L.W_ROWS + 3 * k : L.W_ROWS + 3 * k + 3] for k in range(3)]
+    a, d = ([dot(row, v) for row in rows] for v in (w, d))
+    squared = dot(d, d)
+    # Lanes without a candidate read zeros: 0 / 0 would spoil their (masked) derivatives.
+    return t0, a, d, dr.rcp(dr.select(squared > 0, squared, 1))
+
+
+def _frame(n):
+    """Orthonormal u, v perpendicular to n, smooth in n; around the z axis where n is 0 (the mean at the camera).
+
+    rho^2 does not depend on which pair it is, so that masks and choices in here need no derivative.
+    """
+    squared = dot(n, n)
+    usable = dr.detach(squared) > 0
+    scale = dr.select(usable, dr.rsqrt(dr.select(usable, squared, 1)), 0)
+    x, y, z = _scaled(n, scale)
+    z = dr.select(usable, z, 1)
+    # The axis that n is least along gives u its direction.
+    ax, ay, az = (abs(dr.detach(v)) for v in (x, y, z))
+    first, second = (ax <= ay) & (ax <= az), ay <= az
+    e = [dr.select(first, 1.0, 0.0), dr.select(~first & second, 1.0, 0.0), dr.select(~first & ~second, 1.0, 0.0)]
+    n = [x, y, z]
+    u = _less(e, n, dot(e, n))
+    u = _scaled(u, dr.rsqrt(dot(u, u)))
+    return u, cross(n, u)
+
+
+def _perpendicular(a, n):
+    """a, perpendicular to n but for rounding, without that: its component along the largest axis of n is put right.
+
+    Of a Gaussian as thin as a sheet n is the thin axis, nearly, and what a has of it is multiplied by 1 / scale.
+    """
+    size = [abs(dr.detach(x)) for x in n]  # only says which axis is the largest
+    largest = dr.maximum(dr.maximum(size[0], size[1]), size[2])
+    result = []
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        here = size[k] == largest
+        result.append(dr.select(here, -(n[i] * a[i] + n[j] * a[j]) / dr.select(here, n[k], 1), a[k]))
+    return result
+
+
+def _silhouette(g, screen):
+    """Screen bounds of the extent ellipsoid, exact where it lies in front of the camera plane, and which are there.
+
+    The rays that touch the ellipsoid {c, extent^2 Sigma} are a cone; a plane through the camera with normal n is
+    tangent to it where n^T (extent^2 Sigma - c c^T) n = 0. Bounds only say where to look, hence no derivative.
+    """
+    fx, skew, cx, fy, cy = screen.pinhole
+    f, extent = g.from_local, g.listed_extent()
+    c = dr.detach(g.center)
+    e2 = extent * extent
+
+    def sigma(a, b):
+        return e2 * sum(dr.detach(f[a][k] * f[b][k] * g.scale[k] * g.scale[k]) for k in range(3))
+
+    szz = sigma(2, 2)
+    q22 = szz - c[2] * c[2]
+    # The ellipsoid meets the camera plane, but for rounding: it is unbounded on the screen.
+    inside = q22 >= -1e-9 * (c[2] * c[2])
+    behind = ~inside & (c[2] < 0)
+    den = dr.select(inside, -1, q22)
+
+    def axis(k):
+        q = sigma(k, 2) - c[k] * c[2]
+        root = dr.sqrt(dr.maximum(q * q - (sigma(k, k) - c[k] * c[k]) * den, 0)) / -den
+        return q / den, root
+
+    mx, rx = axis(0)
+    my, ry = axis(1)
+    grow_x = abs(fx) * rx + abs(skew) * ry
+    x = fx * mx + skew * my + cx
+    y = fy * my + cy
+    pad = 1e-3  # px; rounding of float32 bounds
+    bounds = [x - grow_x - pad, y - abs(fy) * ry - pad, x + grow_x + pad, y + abs(fy) * ry + pad]
+    full = [0.0, 0.0, float(screen.width), float(screen.height)]
+    bounds = [dr.select(inside, edge, b) for edge, b in zip(full, bounds, strict=True)]
+    # Wholly behind the camera plane at this extent: no peak in front, and what integral would add there is below
+    # the tail that the extent leaves out.
+    return bounds, ~behind & (extent > 0)
+
+
+def _scaled(a, s):
+    return [x * s for x in a]
+
+
+def _less(a, b, s):
+    return [x - s * y for x, y in zip(a, b, strict=True)]

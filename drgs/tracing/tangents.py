@@ -1,0 +1,126 @@
+"""Forward mode of one call: tangents of its inputs, pushed forward to tangents of its images."""
+
+from __future__ import annotations
+
+import drjit as dr
+import torch
+
+from drgs.guards import memory
+from drgs.settings import EPS_ALPHA
+from drgs.tracing.call import Call, Output, numbers, to_drjit
+from drgs.tracing.pose import checked_pose, quaternion_product, shifted, turned, twisted
+
+__all__ = ["push_forward"]
+
+_OWN = ("w2c", "ray_origins", "ray_directions")  # inputs that follow from the pose, which `camera` moves
+
+
+def push_forward(call: Call, tangents: dict) -> Output:
+    """`render_jvp`: the images' tangents along those of the parameters."""
+    columns, batched = _columns(call, tangents)
+    what = f"{len(columns)} tangents of {call.pixels} pixels"
+    needed = memory.frame_bytes(call.pixels, call.settings, call.width) + memory.TANGENT * call.pixels * len(columns)
+    memory.require("render_jvp", needed, what, "take fewer at a time", call.home.type == "cuda")
+    if call.count == 0:
+        still = call.output(call.nothing())
+        images = {name: getattr(still, name) for name in ("rgb", "alpha", "depth", "features")}
+        lead = (len(columns),) if batched else ()
+        return Output(**{n: x.new_zeros(*lead, *x.shape) for n, x in images.items() if x is not None})
+    primal, images = _pushed(call, columns)
+    outputs = [_shaped(call, primal, image) for image in images]
+    if batched:
+        return Output(**{name: torch.stack([o[name] for o in outputs]) for name in outputs[0]})
+    return Output(**outputs[0])
+
+
+def _columns(call: Call, tangents: dict) -> tuple[list[dict], bool]:
+    """K dicts of tangents of the inputs, and whether there was a leading axis."""
+    shapes = {name: tuple(x.shape) for name, x in call.inputs.items() if name not in _OWN}
+    shapes |= {"rotations": (call.count, 3), "camera": (6,)}
+    lengths, given = set(), {}
+    for name, x in tangents.items():
+        if name not in shapes:
+            raise ValueError(f"render_jvp: tangents must be named among {', '.join(shapes)}, got {name!r}")
+        x = numbers(f"render_jvp: tangent of {name}", x).detach()  # nothing differentiates a tangent
+        if tuple(x.shape) == shapes[name]:
+            lengths.add(None)
+            x = x[None]
+        elif tuple(x.shape[1:]) == shapes[name]:
+            lengths.add(len(x))
+        else:
+            raise ValueError(
+                f"render_jvp: tangent of {name} must have shape {shapes[name]} or (K, ...), got {tuple(x.shape)}"
+            )
+        given[name] = x
+    if len(lengths) != 1:
+        raise ValueError(f"render_jvp: all tangents must have the same leading axis, got {sorted(map(str, lengths))}")
+    count = len(next(iter(given.values())))
+    return [_column(call, {name: x[k] for name, x in given.items()}) for k in range(count)], lengths != {None}
+
+
+def _column(call: Call, given: dict) -> dict:
+    """Tangents of the inputs of one column: rotations become quaternion, a twist w2c and ray tangents."""
+    column = {name: given[name].to(call.home) for name in call.inputs if name in given}
+    if "rotations" in given:
+        q = call.inputs["quats"].to(torch.float64)
+        column["quats"] = column.get("quats", 0) + 0.5 * quaternion_product(given["rotations"].to(call.home), q)
+    if "camera" in given:
+        twist = given["camera"]
+        w2c = checked_pose(call.camera).detach()  # where the derivative is taken
+        change = twisted(w2c, twist)
+        # The inputs are of a re-centered world: w2c there is that of x + origin.
+        w2c_there = call.inputs["w2c"].cpu().detach().reshape(3, 4)
+        origin = torch.linalg.solve(w2c[:3, :3], w2c_there[:, 3] - w2c[:3, 3])
+        column["w2c"] = shifted(change, origin).to(call.home)
+        if "ray_directions" in call.inputs:
+            column["ray_directions"] = turned(twist[:3], call.inputs["ray_directions"])
+        if "ray_origins" in call.inputs:
+            o = call.inputs["ray_origins"] + origin.to(call.home)
+            column["ray_origins"] = turned(twist[:3], o) + twist[3:].to(call.home)
+    return column
+
+
+def _pushed(call: Call, columns: list[dict]) -> tuple[dict, list[dict]]:
+    """Primal images and K tangent images (flat Dr.Jit arrays)."""
+    lib = call.lib
+    inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
+    buffers, carried = [], []
+    for column in columns:
+        # A fresh graph each time: the old tangents are gone.
+        dr.disable_grad(inputs)
+        dr.enable_grad(inputs)
+        compositor, arguments = call.prepare(inputs)
+        for name, x in inputs.items():
+            if name in column:
+                dr.set_grad(x, to_drjit(lib, column[name].to(call.inputs[name].dtype)))
+        # A ray carries its direction, which is on the way to its SH basis, too: interior tangents are kept.
+        dr.forward_to(*arguments, flags=dr.ADFlag.ClearEdges)
+        buffers.append({"record": [lib.Float(dr.grad(x)) for x in arguments.record]})
+        if arguments.sh is not None:
+            buffers[-1]["sh"] = dr.grad(arguments.sh)
+        if arguments.features is not None:
+            buffers[-1]["features"] = dr.grad(arguments.features)
+        carried.append([dr.grad(x) + dr.zeros(lib.Float, call.pixels) for x in arguments.carried])
+        dr.eval(buffers[-1], carried[-1])
+    # What is composited is the same for all columns; its tangents are carried along, not recorded.
+    with dr.suspend_grad():
+        primal = compositor.forward(*dr.detach(list(arguments)), keep=False)
+        images = compositor.tangents(buffers, carried)
+    dr.eval(images)
+    return primal, images
+
+
+def _shaped(call: Call, primal: dict, image: dict) -> dict:
+    """One tangent of the `Output`."""
+    made = {name: x.torch() for name, x in image.items()}
+    out = {"rgb": made["rgb"].reshape(*call.shape, 3), "alpha": made["alpha"].reshape(call.shape)}
+    if "depth" in made:
+        # d(D / max(alpha, eps)) by the quotient rule; the denominator is constant where it is clamped.
+        alpha = primal["alpha"].torch().to(torch.float64)
+        free, alpha = alpha > EPS_ALPHA, alpha.clamp_min(EPS_ALPHA)
+        depth = primal["depth"].torch().to(torch.float64) / alpha
+        change = (made["depth"] - depth * made["alpha"] * free) / alpha
+        out["depth"] = change.to(torch.float32).reshape(call.shape)
+    if call.width:
+        out["features"] = made["features"].reshape(*call.shape, call.width)
+    return {name: x.to(call.device) for name, x in out.items()}
