@@ -122,7 +122,7 @@ def cull_near(scene: SimpleNamespace, rotation, center, s: RenderSettings, toler
     if s.near > 0:
         keep = z > s.near * (1 - tolerance)
         scene.near_margin = z / s.near - 1
-    elif s.response == "ewa":
+    elif s.planar:
         keep = z > 0
     else:
         return scene

@@ -108,7 +108,7 @@ def render(
     """
     check_oracle("reference.render", g, cam, settings)
     s = settings
-    if s.response == "ewa" and (rays is not None or getattr(cam, "model", "pinhole") != "pinhole"):
+    if s.planar and (rays is not None or getattr(cam, "model", "pinhole") != "pinhole"):
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
@@ -116,7 +116,7 @@ def render(
     rotation, center, directions = view.rotation, view.center, view.directions
     if cam is not None:
         scene = cull_near(scene, rotation, center, s, tolerance)
-    if s.response == "ewa":
+    if s.planar:
         scene.screen = _project(scene, cam, rotation, center, s, tolerance)
     if window is not None:
         scene = _in_window(scene, s, view, window, tolerance)
@@ -177,7 +177,7 @@ def _project(scene: SimpleNamespace, cam, rotation, center, s: RenderSettings, t
 
 def _in_window(scene: SimpleNamespace, s: RenderSettings, view, window, tolerance: float) -> SimpleNamespace:
     """Without the Gaussians that are cut off on every ray of the window, near misses kept."""
-    if s.response != "ewa":
+    if not s.planar:
         return take(scene, within(scene, scene.extent * (1 + 2 * tolerance), view.origins, view.directions))
     mean2d, rows, diagonal, bounds = scene.screen
     low = torch.tensor(window[:2], dtype=torch.float64) + 0.5
@@ -200,31 +200,9 @@ def _responses(scene: SimpleNamespace, s: RenderSettings, rotation, center, o, d
     to the nearest cut-off of existence, negative beyond it), distance from a to alpha_max, distance
     to the mean.
     """
-    alpha, away = torch.sigmoid(scene.logits), scene.means - o[:, None, :]
-    if s.response == "ewa":
-        mean2d, rows, diagonal, bounds = scene.screen
-        dx, dy = (pixels[:, None, :] - mean2d).unbind(-1)
-        b1, b2 = rows.unbind(1)
-        # det(B B^T + eps I) and the adjugate form as sums of squares: no cancellation when thin.
-        det = torch.linalg.cross(b1, b2).square().sum(-1)
-        det = det + s.dilation * (diagonal.sum(-1) - s.dilation)
-        form = (dx[..., None] * b2 - dy[..., None] * b1).square().sum(-1)
-        rho2 = (form + s.dilation * (dx * dx + dy * dy)) / det
-        t = away @ rotation[2] if s.depth_key == "z" else away.norm(dim=-1)
-    else:
-        local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
-        slope = torch.einsum("nij,pj->pni", scene.whiten, d)
-        length2 = slope.square().sum(-1)
-        t = -(local * slope).sum(-1) / length2
-        rho2 = torch.linalg.cross(local, slope).square().sum(-1) / length2
-    if s.response == "integral":
-        softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
-        behind = torch.special.erfc(-t * length2.sqrt() / math.sqrt(2)) / 2
-        tau = softplus * torch.exp(-rho2 / 2) * behind
-        a, rest = -torch.expm1(-tau), torch.exp(-tau)
-    else:
-        a = alpha * torch.exp(-rho2 / 2)
-        rest = torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
+    away, form = scene.means - o[:, None, :], _FORMS[s.response]
+    rho2, t, length = form.meet(scene, s, rotation, away, d, pixels)
+    a, rest = form.opacity(scene, rho2, t, length)
     over, to_max = (a > s.alpha_max).detach(), (a / s.alpha_max - 1).abs().detach()
     top, left = torch.full_like(a, s.alpha_max), torch.full_like(a, 1 - s.alpha_max)
     if s.alpha_max_gradient == "pass":
@@ -243,21 +221,83 @@ def _responses(scene: SimpleNamespace, s: RenderSettings, rotation, center, o, d
             cut(rho <= scene.extent, (scene.extent - rho) / scene.extent.clamp(min=1e-300))
         else:
             tile = torch.floor(pixels / _TILE)[:, None, :]
-            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in bounds)
+            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.screen[-1])
             cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
-        if s.response == "peak":
+        if form.front_only:
             cut(t > 0, t / distance.clamp(min=1e-300))
         if s.alpha_min > 0:
             cut(a >= s.alpha_min, a / s.alpha_min - 1)
         if scene.near_margin is not None:
             cut(scene.near_margin > 0, scene.near_margin)
-        key = t.clamp(min=0) if s.response == "integral" else t
+        key = form.key(t)
         if s.order == "center":
             reach = away if center is None else scene.means - center
             key = reach @ rotation[2] if s.depth_key == "z" else reach.norm(dim=-1)
         elif s.order == "entry":
-            key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length2.sqrt()
+            key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length
     return a, rest, t, key.detach().expand_as(a), exists, margin, to_max, distance
+
+
+class _Peak:
+    """a = alpha exp(-rho^2 / 2) at the peak of the ray; peaks behind its origin do not count."""
+
+    front_only = True
+
+    def meet(self, scene, s, rotation, away, d, pixels) -> tuple:
+        """rho^2, t* and |d'| of (P, N) pairs, from the equations at the top of this page."""
+        local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
+        slope = torch.einsum("nij,pj->pni", scene.whiten, d)
+        length2 = slope.square().sum(-1)
+        t = -(local * slope).sum(-1) / length2
+        return torch.linalg.cross(local, slope).square().sum(-1) / length2, t, length2.sqrt()
+
+    def opacity(self, scene, rho2, t, length) -> tuple:
+        """a and 1 - a, neither by a difference that cancels."""
+        alpha = torch.sigmoid(scene.logits)
+        return alpha * torch.exp(-rho2 / 2), torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
+
+    def key(self, t):
+        """What orders hits along a ray."""
+        return t
+
+
+class _Integral(_Peak):
+    """a = 1 - exp(-tau), tau = softplus(logit) exp(-rho^2 / 2) erfc(-u / sqrt 2) / 2, u = t* |d'|."""
+
+    front_only = False
+
+    def opacity(self, scene, rho2, t, length) -> tuple:
+        """a and 1 - a."""
+        softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
+        behind = torch.special.erfc(-t * length / math.sqrt(2)) / 2
+        tau = softplus * torch.exp(-rho2 / 2) * behind
+        return -torch.expm1(-tau), torch.exp(-tau)
+
+    def key(self, t):
+        """What counts of a peak behind the origin lies in front of it: at the origin, therefore."""
+        return t.clamp(min=0)
+
+
+class _Ewa(_Peak):
+    """a = alpha exp(-rho^2 / 2), rho^2 = d^T Sigma'^-1 d at the pixel's distance d from the projected mean."""
+
+    front_only = False
+
+    def meet(self, scene, s, rotation, away, d, pixels) -> tuple:
+        """rho^2 and the Gaussian's own depth; there is no d'."""
+        mean2d, rows, diagonal, _ = scene.screen
+        dx, dy = (pixels[:, None, :] - mean2d).unbind(-1)
+        b1, b2 = rows.unbind(1)
+        # det(B B^T + eps I) and the adjugate form as sums of squares: no cancellation when thin.
+        det = torch.linalg.cross(b1, b2).square().sum(-1)
+        det = det + s.dilation * (diagonal.sum(-1) - s.dilation)
+        form = (dx[..., None] * b2 - dy[..., None] * b1).square().sum(-1)
+        t = away @ rotation[2] if s.depth_key == "z" else away.norm(dim=-1)
+        return (form + s.dilation * (dx * dx + dy * dy)) / det, t, None
+
+
+# The oracle's own: nothing of it comes from `tracing.responses`, which it checks.
+_FORMS = {"peak": _Peak(), "integral": _Integral(), "ewa": _Ewa()}
 
 
 def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, tolerance, exact_ties, effect) -> dict:

@@ -21,6 +21,10 @@ PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
 # Depth is divided by max(alpha, EPS_ALPHA): what no ray meets has a finite one.
 EPS_ALPHA = 1e-10
 
+# Responses that are models of the image plane, not of rays: pinhole cameras only, one depth a Gaussian. Dilation, the
+# clamp of the field of view and the culling by radius are theirs.
+_PLANAR = ("ewa",)
+
 _RANGES = {
     "extent": (0.0, 1e3),
     "alpha_min": (0.0, 1.0),
@@ -88,6 +92,11 @@ class RenderSettings:
         problem = legal(self)
         if problem:
             raise NotImplementedError(f"RenderSettings: {problem}")
+
+    @property
+    def planar(self) -> bool:
+        """Whether the response is a model of the image plane (`ewa`), not of rays."""
+        return self.response in _PLANAR
 
     @classmethod
     def preset(cls, name: str, **overrides) -> RenderSettings:
@@ -158,16 +167,16 @@ class RenderSettings:
 
 def legal(s: RenderSettings) -> str | None:
     """Why a combination of response, order and traversal does not exist, or None when it does."""
-    if s.response == "ewa" and s.traversal == "bvh":
-        return "response='ewa' is defined on the image plane, use traversal='tiles' (got 'bvh')"
-    if s.response == "ewa" and s.order != "center":
-        return f"response='ewa' has one depth per Gaussian, use order='center' (got {s.order!r})"
+    if s.planar and s.traversal == "bvh":
+        return f"response={s.response!r} is defined on the image plane, use traversal='tiles' (got 'bvh')"
+    if s.planar and s.order != "center":
+        return f"response={s.response!r} has one depth per Gaussian, use order='center' (got {s.order!r})"
     if s.order == "entry" and s.traversal == "tiles":
         return "order='entry' is Mitsuba's order of entry points, use traversal='bvh' (got 'tiles')"
-    if s.culling != "extent" and s.response != "ewa":
+    if s.culling != "extent" and not s.planar:
         return f"culling={s.culling!r} belongs to response='ewa', use culling='extent' (got {s.response!r})"
-    if s.fov_clamp != "none" and s.response != "ewa":
+    if s.fov_clamp != "none" and not s.planar:
         return f"fov_clamp={s.fov_clamp!r} belongs to response='ewa', use fov_clamp='none' (got {s.response!r})"
-    if s.dilation > 0 and s.response != "ewa":
+    if s.dilation > 0 and not s.planar:
         return f"dilation belongs to response='ewa', use dilation=0 (got {s.response!r})"
     return None

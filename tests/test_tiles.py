@@ -176,7 +176,7 @@ def test_tiles_left_out_change_nothing(rng, monkeypatch, fields, anisotropy):
         for whole in (False, True):
             with monkeypatch.context() as patch:
                 if whole:
-                    patch.setattr(tiles._Meets, "__call__", lambda self, dx, dy: self.lib.Bool(True))
+                    patch.setattr(tiles._Tiles, "may_hit", lambda self, dx, dy: self.lib.Bool(True))
                 out = render(g.detach(), cam, settings, outputs=("count", "depth"))
                 images.append(
                     torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None], out.count[..., None]], -1)

@@ -60,7 +60,7 @@ class Case:
     @property
     def traversals(self) -> tuple[str, ...]:
         """Those that it is run on."""
-        return ("tiles",) if self.bvh == "skip" or self.settings.response == "ewa" else ("tiles", "bvh")
+        return ("tiles",) if self.bvh == "skip" or self.settings.planar else ("tiles", "bvh")
 
 
 def _base(
