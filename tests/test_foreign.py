@@ -11,7 +11,7 @@ import pytest
 from test_data import save, write_colmap, write_llff, write_transforms
 
 from drgs import cli
-from drgs.commands.render import load_scene
+from drgs.commands.given import Given
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json
 from drgs.data.checks import read_image
@@ -65,7 +65,7 @@ def test_an_unbundled_sog_is_known_by_its_folder_and_by_its_index(tmp_path):
     (tmp_path / "meta.json").write_bytes(META)
     for path in (tmp_path, tmp_path / "meta.json"):
         with pytest.raises(ValueError, match="is the index of an unbundled SOG scene.*; convert it with"):
-            load_scene(path)
+            Given.at(path)
 
 
 @pytest.mark.parametrize(
@@ -158,4 +158,4 @@ def test_real_files_of_other_formats(data_dir, name):
     if not path.exists():
         pytest.skip(f"no {path}")
     with pytest.raises(ValueError, match="; convert it with `npx @playcanvas/splat-transform"):
-        load_scene(path)
+        Given.at(path)

@@ -1,12 +1,10 @@
 """Options of the command line offer what there is, and default to what a call from Python would do."""
 
-import ast
 import dataclasses
 import inspect
 import subprocess
 import sys
 import typing
-from pathlib import Path
 
 import pytest
 
@@ -72,15 +70,3 @@ def test_options_import_nothing_heavy():
     code = "import sys; import drgs.cli; print([x for x in ('torch', 'numpy', 'drjit', 'cv2') if x in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def test_arrows_point_down_from_commands():
-    """Nothing outside of drgs/commands and the command line imports a command, not even for its types."""
-    root = Path(options.__file__).parents[1]
-    above = {root / "cli.py", *(root / "commands").glob("*.py")}
-    for path in set(root.rglob("*.py")) - above:
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom):
-                names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
-            assert not any(name.startswith("drgs.commands") for name in names), path

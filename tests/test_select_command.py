@@ -11,7 +11,7 @@ from test_active import SIZE, config, lazily, plan, write_still
 import drgs
 from drgs import cli, fisher
 from drgs.cameras import Camera, look_at, orbit
-from drgs.commands.viewpoints import dome
+from drgs.commands.orbits import dome
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import Run, load_ply, save_ply
@@ -155,7 +155,7 @@ def test_dome_is_even(count):
         ("scene.ply --candidates orbit", "a PLY has no record of its views: --train must name"),
         ("run --candidates data --policy best", "--policy"),
         ("run --candidates data --prior -1", "lambda (value) must be in [0, inf), got -1"),
-        ("run --candidates orbit --split test", "--split test must have --candidates DATA, orbit has no split"),
+        ("run --candidates orbit --split test", "--split test must have --candidates DATA, an orbit has no split"),
         ("run --candidates orbit --count 0", "--count must be in [1, 10000], got 0"),
         ("run --candidates orbit --elevation 90", "--elevation must be in [-89, 89] degrees, got 90"),
         ("run --candidates orbit --distance -1", "--distance must be positive and finite, got -1"),

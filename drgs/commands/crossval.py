@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drgs import runtime
-from drgs.commands.viewpoints import seen_views
+from drgs.commands.given import Given
+from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.sizes import at_most
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -25,6 +26,7 @@ def run(args: Crossval) -> int:
     from drgs.lab.crossval import crossval
     from drgs.lab.report import html
 
+    check_counts(args)
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
         claim(args.output, "crossval", ["report.html", "crossval.json"], inputs)
@@ -32,11 +34,12 @@ def run(args: Crossval) -> int:
         raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
     else:
         check_file(args.export, "crossval", inputs, rasterizers.is_export)
-    g, fields, cameras, source = seen_views(args)
+    given = Given.of(args)
+    g, fields = given.gaussians, given.fields
+    cameras, source = seen_views(args, given)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:
-        background = tuple(fields.get("background", (0.0, 0.0, 0.0)))
-        rasterizers.export(args.export, g, cameras, background, args.seed)
+        rasterizers.export(args.export, g, cameras, given.background, args.seed)
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0

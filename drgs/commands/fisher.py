@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.commands.render import described
-from drgs.commands.viewpoints import evenly, known_views, other_views, scene_of
+from drgs.commands.given import Given
+from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views
+from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, save_state, write_json
@@ -26,9 +27,10 @@ from drgs.guards.outputs import claim
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Fisher
-    from drgs.commands.viewpoints import Scene
+    from drgs.ellipsoids import Gaussians
     from drgs.fisher import Information
     from drgs.gain import Prior
+    from drgs.settings import RenderSettings
 
 __all__ = ["map_weights", "run"]
 
@@ -38,48 +40,49 @@ def run(args: Fisher) -> None:
     from drgs import fisher
     from drgs.gain import Prior, check
 
-    if not 1 <= args.limit <= 10_000:
-        raise ValueError(f"fisher: --limit must be in [1, 10000], got {args.limit}; correct it")
+    check_counts(args)
+    args.settings()  # refuses what cannot be, before anything is read
     prior = Prior(value=args.prior, relative=args.relative_prior)
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
-    scene = scene_of(args)
+    given = Given.of(args)
+    settings = given.settings(args.preset)
     text = args.train
-    if text is None and scene.run is None:
+    if text is None and given.run is None:
         if args.cameras in (None, "orbit", "dome"):
             raise ValueError(
                 "a PLY has no record of its views: --train or --cameras must name a data set, a run or a cameras.json"
             )
         text = args.cameras
-    known = known_views(text, scene)
+    known = known_views(text, args, given)
     views, source = known.cameras, known.source
     if args.cameras is not None:
-        views, source = other_views("--cameras", args.cameras, args, scene, known, fresh=False)
+        views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(views, args.limit)
     names = pictures.file_names([camera.name for camera in views])
     output.check(f"{name}.{kind}.png" for name in names for kind in ("variance", "share"))
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
         H: Information = {}
         for camera in known.cameras:
-            part = fisher.diagonal(scene.gaussians, camera, scene.settings, args.method)
+            part = fisher.diagonal(given.gaussians, camera, settings, args.method)
             check(f"fisher: view {camera.name}", part)
             H = {name: x + H[name] if H else x for name, x in part.items()}
             bar.advance()
         rows = []
         for camera, name in zip(views, names, strict=True):
-            rows.append(_view(args, scene, camera, name, H, prior))
+            rows.append(_view(args, given.gaussians, camera, settings, name, H, prior))
             bar.advance()
-    header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": scene.settings}
+    header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
     save_state(args.output / "information.safetensors", H, header)
     report = {
         "schema": SCHEMA,
         "command": "fisher",
         "scene": str(args.scene),
-        "gaussians": len(scene.gaussians),
+        "gaussians": len(given.gaussians),
         "method": args.method,
         "prior": {"value": args.prior, "relative": args.relative_prior},
-        "settings": dataclasses.asdict(scene.settings),
-        "pixels": scene.pixels,
+        "settings": dataclasses.asdict(settings),
+        "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
         "groups": {name: _summary(x) for name, x in H.items()},
         "source": source,
@@ -107,12 +110,13 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     return variance, share
 
 
-def _view(args: Fisher, scene: Scene, camera: Camera, name: str, H: Information, prior: Prior) -> dict:
+def _view(
+    args: Fisher, g: Gaussians, camera: Camera, settings: RenderSettings, name: str, H: Information, prior: Prior
+) -> dict:
     """Maps of one view, and what it says."""
     from drgs import fisher
     from drgs.gain import information_gain
 
-    g, settings = scene.gaussians, scene.settings
     Hc = fisher.diagonal(g, camera, settings, args.method)
     row = {"name": camera.name, "camera": described(camera), "files": []}
     row["gain"] = {c: information_gain(Hc, H, c, prior).total for c in ("logdet", "eig")}

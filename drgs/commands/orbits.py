@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.data.capture import Focus, path, upright
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["UP", "Wish", "capture_orbit", "scene_orbit", "seen_distance"]
+__all__ = ["UP", "Wish", "capture_orbit", "dome", "scene_orbit", "seen_distance"]
 
 UP = {
     "x": (1.0, 0.0, 0.0),
@@ -183,6 +183,29 @@ def capture_orbit(
     kind = "circle" if span >= 360 else f"swing of {span:.0f} degrees"
     place = ", ".join(f"{x:.3g}" for x in focus.center)
     return made, f"{kind} around ({place}) at distance {distance:.3g}, {elevation:.0f} degrees up, like the photographs"
+
+
+def dome(circle: list[Camera], count: int) -> list[Camera]:
+    """Cameras on the upper half of a sphere, evenly: rings of equal steps in elevation.
+
+    Args:
+        circle: Cameras around the sphere's equator, evenly spaced, looking at its center; their lens is taken.
+        count: How many.
+    """
+    centers = np.stack([camera.center for camera in circle])
+    middle, up = centers.mean(axis=0), -circle[0].c2w[:3, 1]
+    radius = float(np.linalg.norm(centers - middle, axis=1).mean())
+    rings = max(1, round(math.sqrt(count * math.pi / 8)))  # as far apart as the cameras of a ring are
+    elevations = 90 * (np.arange(rings) + 0.5) / rings
+    share = np.cumsum(np.cos(np.radians(elevations)))
+    ends = np.round(count * share / share[-1]).astype(int)
+    made = []
+    for elevation, number in zip(elevations, np.diff(ends, prepend=0), strict=True):
+        if number:
+            made += orbit(middle, radius, int(number), float(elevation), up=up)
+    return [
+        dataclasses.replace(circle[0], w2c=camera.w2c, name=f"dome_{index:04d}") for index, camera in enumerate(made)
+    ]
 
 
 def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:

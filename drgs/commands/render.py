@@ -19,54 +19,43 @@ import torch
 import drgs
 from drgs import runtime
 from drgs.commands.forecast import forecast
-from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
-from drgs.data.camera_lists import load_cameras_json, save_cameras_json
+from drgs.commands.given import Given
+from drgs.commands.orbits import Wish
+from drgs.commands.viewpoints import MAX_SIDE, drawn_views
+from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, Run, load_ply, write_json
-from drgs.fitting.records import fit_record, fitted_views, load_run
+from drgs.files import SCHEMA, write_json
 from drgs.guards import memory
-from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.options import Crossval, Render, Tradeoff
-    from drgs.data import Dataset
+    from drgs.commands.options import Render
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
-__all__ = [
-    "cameras_of",
-    "described",
-    "is_camera_list",
-    "load_scene",
-    "render_views",
-    "run",
-]
+__all__ = ["render_views", "run"]
 
 _log = logging.getLogger(__name__)
 
 _MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as doing it
 _LONG = 10.0  # seconds that are worth a word
 _FORMATS = ("png", "exr", "webm")
-_MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
 
 
 def run(args: Render) -> None:
     """`drgs render SCENE`."""
-    settings = args.settings()
+    args.settings()  # refuses what cannot be, before anything is read
     formats = _formats(args.format)
     _check_numbers(args)
     movie = "turntable.webm" if args.cameras == "orbit" else "video.webm"
     fixed = ["render.json", "cameras.json", *([movie] * ("webm" in formats))]
     output = claim(args.output, "render", fixed, inputs=[args.scene, args.cameras])
-    gaussians, folder = load_scene(args.scene)
-    if folder is not None and not any(text.startswith("background=") for text in args.overrides):
-        # A run was fitted over its background; over another one its edges show a halo.
-        settings = settings.replace(background=fit_record(folder).config.settings.background)
+    given = Given.of(args)
+    gaussians, settings = given.gaussians, given.settings(args.preset)
     size = args.width, args.height
-    cameras, source = cameras_of(args, args.cameras, gaussians, folder, args.frames, size, returns=True)
+    cameras, source = drawn_views(args, args.cameras, given, args.frames, size, returns=True)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
@@ -188,8 +177,8 @@ def _formats(text: str) -> tuple[str, ...]:
 
 def _check_numbers(args: Render) -> None:
     for option, value, high in (
-        ("--width", args.width, _MAX_SIDE),
-        ("--height", args.height, _MAX_SIDE),
+        ("--width", args.width, MAX_SIDE),
+        ("--height", args.height, MAX_SIDE),
         ("--frames", args.frames, 100_000),
         ("--limit", args.limit, 10**9),
     ):
@@ -198,100 +187,6 @@ def _check_numbers(args: Render) -> None:
     if not 0 < args.fps <= 240:
         raise ValueError(f"render: --fps must be in (0, 240], got {args.fps}")
     Wish.of(args)
-
-
-def load_scene(path: Path) -> tuple[Gaussians, Run | None]:
-    """The Gaussians, and the run that they belong to if `path` is a run folder."""
-    if not path.is_dir():
-        return load_ply(path), None
-    folder = Run(path)
-    refuse_foreign(path, "a run folder or a 3DGS PLY file")
-    return load_run(folder).gaussians, folder
-
-
-def cameras_of(
-    args: Render | Crossval | Tradeoff,
-    text: str,
-    gaussians: Gaussians,
-    folder: Run | None,
-    frames: int,
-    size: tuple[int | None, int | None],
-    returns: bool = False,
-) -> tuple[list[Camera], str]:
-    """The cameras of a data set, a run, a cameras.json or an orbit, and where they come from in words.
-
-    Args:
-        args: Whose `split` and options of orbits apply.
-        text: What `--cameras` says.
-        gaussians, folder: What an orbit goes around, like the photographs of the run if there is one.
-        frames, size: Number of views of an orbit and their (width, height); where one is None, 640 wide and of the
-            photographs' shape, else 4:3.
-        returns: Whether an orbit that is no full circle goes back and forth.
-    """
-    if text == "orbit":
-        if args.split != "all":
-            raise ValueError(f"--split {args.split} must have --cameras DATA, an orbit has no split")
-        wish = Wish.of(args)
-        captured = _captured(folder) if folder is not None else []
-        shape = captured[0].height / captured[0].width if captured else 0.75
-        how = dict(zip(("width", "height"), _size(*size, shape), strict=True)) | {"wish": wish, "returns": returns}
-        cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(gaussians), **how)
-        if cameras:
-            _say(args, source)
-            return cameras, source
-        up = "minus-y" if args.up == "auto" else args.up
-        if args.up == "auto":
-            _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
-        return scene_orbit(gaussians, frames, **how), f"orbit, up {up}"
-    path = Path(text)
-    if is_camera_list(path):
-        if args.split != "all":
-            raise ValueError(f"{path}: --split {args.split} must have a data set, a cameras.json has no split")
-        return load_cameras_json(path), str(path)
-    dataset, test_every = _dataset(path, args.strict)
-    train, test = dataset.split(test_every)
-    views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
-    if not views:
-        rule = dataset.split_rule(test_every)
-        raise ValueError(f"{path}: split {args.split} must hold a view, holds none ({rule}); use --split all")
-    return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{path} ({args.split})"
-
-
-def is_camera_list(path: Path) -> bool:
-    """Whether a JSON file is a list, as INRIA's cameras.json is, and not a transforms.json."""
-    if path.suffix != ".json" or not path.is_file():
-        return path.name == "cameras.json"
-    with path.open("rb") as file:
-        return file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
-
-
-def _dataset(path: Path, strict: bool) -> tuple[Dataset, int | None]:
-    """A data set, or that of a run; and the run's rule of the split."""
-    from drgs.data import load
-
-    if (path / "config.json").is_file() and (path / "log.jsonl").is_file():
-        record = fit_record(Run(path))
-        return load(record.data, strict=strict), record.config.test_every
-    return load(path, strict=strict), None
-
-
-def _captured(folder: Run) -> list[Camera]:
-    """Cameras of the photographs that a run was fitted to, in their order; none if they are no longer there."""
-    from drgs.data import load
-
-    try:
-        names = set(fitted_views(folder))
-        views = load(fit_record(folder).data, lazy=True, points=False).views
-    except (ValueError, OSError, KeyError):
-        return []
-    return [view.camera.undistorted() for view in views if view.name in names]
-
-
-def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
-    """Width and height of an orbit's frames, the missing ones by their shape (height / width)."""
-    if width is None:
-        width = 640 if height is None else max(1, min(_MAX_SIDE, round(height / shape)))
-    return width, height or max(1, min(_MAX_SIDE, round(width * shape)))
 
 
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
@@ -319,19 +214,6 @@ def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tupl
 
 
 # ----------------------------------------------------------------------------------------- outputs
-
-
-def described(camera: Camera) -> dict:
-    """A camera as JSON."""
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "K": camera.K.tolist(),
-        "c2w": camera.c2w.tolist(),
-        "model": camera.model,
-        "distortion": list(camera.distortion),
-    }
 
 
 def _number(value) -> int | None:
@@ -366,6 +248,6 @@ def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], set
         _say(args, f"{what} will take about {took} on this machine; --preset fast takes a small part of that")
 
 
-def _say(args: Render | Crossval | Tradeoff, text: str) -> None:
+def _say(args: Render, text: str) -> None:
     if not args.quiet:
         print(text, flush=True)

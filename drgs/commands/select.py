@@ -6,8 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.commands.render import described
-from drgs.commands.viewpoints import known_views, other_views, scene_of
+from drgs.commands.given import Given
+from drgs.commands.viewpoints import check_counts, known_views, other_views
+from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
@@ -29,19 +30,22 @@ def run(args: Select) -> None:
     from drgs.gain import Prior
     from drgs.select import Scoring, select
 
+    check_counts(args)
+    args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior(value=args.prior, relative=args.relative_prior)
-    scene = scene_of(args)
-    known = known_views(args.train, scene)
-    candidates, source = other_views("--candidates", args.candidates, args, scene, known, fresh=True)
+    given = Given.of(args)
+    settings = given.settings(args.preset)
+    known = known_views(args.train, args, given)
+    candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
         selection = select(
-            scene.gaussians,
+            given.gaussians,
             candidates,
             known.cameras,
             args.k,
             args.policy,
-            scoring=Scoring(args.criterion, scene.settings, args.method, prior),
+            scoring=Scoring(args.criterion, settings, args.method, prior),
             rng=torch.Generator().manual_seed(args.seed),
             progress=bar.update,
         )
@@ -51,14 +55,14 @@ def run(args: Select) -> None:
         "schema": SCHEMA,
         "command": "select",
         "scene": str(args.scene),
-        "gaussians": len(scene.gaussians),
+        "gaussians": len(given.gaussians),
         "policy": args.policy,
         "criterion": args.criterion if args.policy == "fisher" else None,
         "method": args.method,
         "prior": {"value": args.prior, "relative": args.relative_prior},
         "seed": args.seed,
-        "settings": dataclasses.asdict(scene.settings),
-        "pixels": scene.pixels,
+        "settings": dataclasses.asdict(settings),
+        "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
         "source": source,
         "picks": [

@@ -28,8 +28,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs import runtime
-from drgs.commands.render import described
-from drgs.commands.viewpoints import seen_views
+from drgs.commands.given import Given
+from drgs.commands.viewpoints import check_counts, seen_views
+from drgs.data.camera_lists import described
 from drgs.data.sizes import at_most
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -57,11 +58,14 @@ def run(args: Tradeoff) -> None:
         raise ValueError(f"--seconds must be in [1, 1000000], got {args.seconds:g}; correct it")
     if not 1 <= args.repeats <= 1000:
         raise ValueError(f"--repeats must be in [1, 1000], got {args.repeats}; correct it")
+    check_counts(args)
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     claim(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
-    gaussians, fields, cameras, source = seen_views(args)
+    given = Given.of(args)
+    gaussians, fields = given.gaussians, given.fields
     if not len(gaussians):
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")
+    cameras, source = seen_views(args, given)
     reduced = [at_most(camera, args.max_pixels) for camera in cameras]
     turns = (args.repeats + 1) * (1 + sum(x.by == "view" for x in VARIANTS))
     with Bar("tradeoff", turns, not args.quiet) as bar:

@@ -1,54 +1,204 @@
-"""Which views are known and which could be added, for commands that compare them: poses only, no image is opened.
+"""Which views an option names: --cameras, --candidates and --train, the same for every command.
 
-The size of a view is what its camera file states (that of a known view of a run: of its image file).
+    orbit, dome     cameras made around what there is to see (orbits.py)
+    a cameras.json  its list
+    a run           the views of its data set, split as for its fit; as known views, those that it was fitted to
+    a data set      its views, split as for the fit of the run that is looked at, if it is one
+
+No image is decoded. Where views are compared with known ones none is even opened: their size is what the camera file
+states (that of a known view of a run: of its image file).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-from drgs.cameras import Camera, orbit
-from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
-from drgs.commands.render import cameras_of, is_camera_list, load_scene
-from drgs.data.camera_lists import load_cameras_json
+from drgs import data
+from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_distance
+from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.data.sizes import at_most, resized_alike
 from drgs.files import Run
-from drgs.fitting.records import fit_record, fitted_views
-from drgs.settings import RenderSettings
+from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Crossval, Fisher, Select, Tradeoff
-    from drgs.data import View
-    from drgs.ellipsoids import Gaussians
+    from drgs.cameras import Camera
+    from drgs.commands.given import Given
+    from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
+    from drgs.data import Dataset, View
 
-__all__ = ["Known", "Scene", "dome", "evenly", "known_views", "other_views", "scene_of", "seen_views"]
+__all__ = [
+    "MAX_SIDE",
+    "Known",
+    "Source",
+    "check_counts",
+    "drawn_views",
+    "evenly",
+    "known_views",
+    "other_views",
+    "seen_views",
+]
 
+MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
 _PIXELS = 130_000  # of a view where there is no fit that says
 _MAX_COUNT = 10_000
+_NOUNS = {"orbit": "an orbit", "dome": "a dome", "list": "a cameras.json"}
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
-    """What a command was given.
+class Source:
+    """What an option says about where views come from.
 
     Attributes:
-        gaussians: Of the PLY.
-        run: The run folder, or None.
-        settings: Of the renderer, over the run's background.
-        pixels: Views are reduced to at most so many.
-        strict: Refuse data sets that list images which are not there.
+        option: Its name, for messages.
+        text: Its value.
+        kind: `orbit`, `dome`, `list` (a cameras.json), `run` or `data`.
     """
 
-    gaussians: Gaussians
-    run: Run | None
-    settings: RenderSettings
-    pixels: int
-    strict: bool = False
+    option: str
+    text: str
+    kind: Literal["orbit", "dome", "list", "run", "data"]
+
+    @classmethod
+    def of(cls, option: str, text: str, made: tuple[str, ...] = ()) -> Source:
+        """The meaning of a text.
+
+        Args:
+            option, text: Name and value of the option.
+            made: Which of `orbit` and `dome` it may be.
+        """
+        if text in made:
+            return cls(option, text, text)
+        path = Path(text)
+        return cls(option, text, "list" if is_camera_list(path) else "run" if is_run(path) else "data")
+
+    @functools.cached_property
+    def record(self) -> FitRecord | None:
+        """How it was fitted, if it is a run."""
+        return fit_record(Run(Path(self.text))) if self.kind == "run" else None
+
+    def check_split(self, split: str) -> None:
+        """Raise ValueError if `--split` asks for a part of what has none."""
+        if split != "all" and self.kind in _NOUNS:
+            noun = _NOUNS[self.kind]
+            raise ValueError(f"--split {split} must have {self.option} DATA, {noun} has no split; drop it")
+
+    def listed(self) -> list[Camera]:
+        """The cameras of a cameras.json."""
+        return load_cameras_json(Path(self.text))
+
+    def dataset(self, strict: bool, lazy: bool = True) -> Dataset:
+        """The data set, or that of a run, without points."""
+        record = self.record
+        return data.load(record.data if record else Path(self.text), lazy=lazy, points=False, strict=strict)
+
+    def split(self, dataset: Dataset, part: str, given: Given) -> list[View]:
+        """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of
+        every 8th view.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        record = self.record or given.record
+        every = record.config.test_every if record else None
+        train, test = dataset.split(every)
+        views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[part]
+        if not views:
+            rule = dataset.split_rule(every)
+            raise ValueError(f"{self.text}: split {part} must hold a view, holds none ({rule}); use --split all")
+        return views
+
+
+# ------------------------------------------------------------------------------- views that are drawn
+
+
+def drawn_views(
+    args: Render | Crossval | Tradeoff,
+    text: str,
+    given: Given,
+    frames: int,
+    size: tuple[int | None, int | None] = (None, None),
+    returns: bool = False,
+) -> tuple[list[Camera], str]:
+    """The cameras of `--cameras` as they are, and where they come from in words.
+
+    Args:
+        args: Whose `split` and options of orbits apply.
+        text: What `--cameras` says.
+        given: What an orbit goes around, like the photographs of the run if it is one.
+        frames, size: Number of views of an orbit and their (width, height); where one is None, 640 wide and of the
+            photographs' shape, else 4:3.
+        returns: Whether an orbit that is no full circle goes back and forth.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If an option is out of range or a file damaged, or a split has no view.
+    """
+    source = Source.of("--cameras", text, made=("orbit",))
+    source.check_split(args.split)
+    if source.kind == "orbit":
+        return _drawn_orbit(args, given, frames, size, returns)
+    if source.kind == "list":
+        return source.listed(), str(Path(text))
+    views = source.split(source.dataset(args.strict, lazy=False), args.split, given)
+    return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{Path(text)} ({args.split})"
+
+
+def seen_views(args: Crossval | Tradeoff, given: Given) -> tuple[list[Camera], str]:
+    """At most `--limit` pinhole cameras of `--cameras`, as large as they are drawn; and where they come from in words.
+
+    Raises:
+        FileNotFoundError, ValueError: As `drawn_views`.
+    """
+    text = args.cameras or ("orbit" if given.run is None else str(given.run.path))
+    cameras, source = drawn_views(args, text, given, args.limit)
+    return [camera.undistorted() for camera in evenly(cameras, args.limit)], source
+
+
+def _drawn_orbit(
+    args: Render | Crossval | Tradeoff,
+    given: Given,
+    frames: int,
+    size: tuple[int | None, int | None],
+    returns: bool,
+) -> tuple[list[Camera], str]:
+    """An orbit as the photographs of the run were taken, else around the Gaussians; and what it does in words."""
+    captured = _captured(given)
+    shape = captured[0].height / captured[0].width if captured else 0.75
+    width, height = _size(*size, shape)
+    how = {"width": width, "height": height, "wish": Wish.of(args), "returns": returns}
+    cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
+    if cameras:
+        _say(args, source)
+        return cameras, source
+    up = "minus-y" if args.up == "auto" else args.up
+    if args.up == "auto":
+        _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
+    return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
+
+
+def _captured(given: Given) -> list[Camera]:
+    """Cameras of the photographs that a run was fitted to, in their order; none if they are no longer there."""
+    if given.run is None:
+        return []
+    try:
+        names = set(fitted_views(given.run))
+        views = data.load(given.record.data, lazy=True, points=False).views
+    except (ValueError, OSError, KeyError):
+        return []
+    return [view.camera.undistorted() for view in views if view.name in names]
+
+
+def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
+    """Width and height of an orbit's frames, the missing ones by their shape (height / width)."""
+    if width is None:
+        width = 640 if height is None else max(1, min(MAX_SIDE, round(height / shape)))
+    return width, height or max(1, min(MAX_SIDE, round(width * shape)))
+
+
+# ----------------------------------------------------------------- views that are compared with known ones
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,108 +208,82 @@ class Known:
     Attributes:
         cameras: Pinhole, reduced.
         source: Where they come from, in words.
+        pixels: These views, and those that are compared with them, are reduced to at most so many.
         data: The data set that they are of, or None.
         sizes: Stated size -> size of the image file, as far as known.
     """
 
     cameras: list[Camera]
     source: str
+    pixels: int
     data: Path | None = None
     sizes: dict[tuple[int, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
 
 
-def scene_of(args: Select | Fisher) -> Scene:
-    """The scene that a command names, and how its views are rendered.
-
-    Raises:
-        FileNotFoundError: If there is no such PLY, or the run has no checkpoint yet.
-        ValueError: If an option is out of range or a file damaged.
-    """
-    for option, value, low, high in (
-        ("--count", args.count, 1, _MAX_COUNT),
-        ("--info-pixels", args.info_pixels, 1, 10**9),
-    ):
-        if value is not None and not low <= value <= high:
-            raise ValueError(f"{option} must be in [{low}, {high}], got {value}; correct it")
-    Wish.of(args)
-    settings = args.settings()
-    gaussians, run = load_scene(args.scene)
-    pixels = args.info_pixels or _PIXELS
-    if run is not None:
-        pixels = args.info_pixels or fit_record(run).config.max_pixels
-        if not any(text.startswith("background=") for text in args.overrides):
-            settings = settings.replace(background=fit_record(run).config.settings.background)
-    return Scene(gaussians, run, settings, pixels, args.strict)
-
-
-def known_views(text: str | None, scene: Scene) -> Known:
+def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
     """The views of `--train`, else those that the run was fitted to.
 
     Args:
         text: A data set (all its views), a run (those it was fitted to), a cameras.json, or None.
-        scene: Whose run is taken where `text` is None.
+        args: Whose `info_pixels` and `strict` apply.
+        given: Whose run is taken where `text` is None.
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If a PLY comes without `--train`, or a run's data set no longer has its views.
     """
-    if text is None and scene.run is None:
+    if text is None and given.run is None:
         raise ValueError("a PLY has no record of its views: --train must name a data set, a run or a cameras.json")
-    path = scene.run.path if text is None else Path(text)
-    if is_camera_list(path):
-        return Known([at_most(camera, scene.pixels) for camera in load_cameras_json(path)], str(path))
-    if not _is_run(path):
-        views = _load(path, scene).views
-        return Known([_camera(view, {}, scene.pixels) for view in views], str(path), path.resolve())
-    run = Run(path)
-    data, names = fit_record(run).data, fitted_views(run)
-    views = {view.name: view for view in _load(data, scene).views}
-    if missing := [name for name in names if name not in views]:
+    source = Source.of("--train", str(given.run.path) if text is None else text)
+    pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.max_pixels)
+    where = str(Path(source.text))
+    if source.kind == "list":
+        return Known([at_most(camera, pixels) for camera in source.listed()], where, pixels)
+    views = source.dataset(args.strict).views
+    if source.kind == "data":
+        cameras = [_camera(view, {}, pixels) for view in views]
+        return Known(cameras, where, pixels, Path(source.text).resolve())
+    place, names = source.record.data, fitted_views(Run(Path(source.text)))
+    named = {view.name: view for view in views}
+    if missing := [name for name in names if name not in named]:
         raise ValueError(
-            f"{data}: must still hold the {len(names)} views of {path}, {missing[0]!r} is gone; restore it"
+            f"{place}: must still hold the {len(names)} views of {where}, {missing[0]!r} is gone; restore it"
         )
-    stated = [views[name] for name in names]
+    stated = [named[name] for name in names]
     checked = [view.checked() for view in stated]  # the fit has opened these images too
     size = lambda view: (view.camera.width, view.camera.height)  # noqa: E731
     sizes = {size(a): size(b) for a, b in zip(stated, checked, strict=True)}
-    return Known([_camera(view, {}, scene.pixels) for view in checked], str(path), data.resolve(), sizes)
+    return Known([_camera(view, {}, pixels) for view in checked], where, pixels, place.resolve(), sizes)
 
 
-def other_views(option: str, text: str, args: Select | Fisher, scene: Scene, known: Known, fresh: bool):
-    """Cameras of a data set, a run, a cameras.json, or made on an orbit or a dome; and where they come from.
+def other_views(
+    option: str, text: str, args: Select | Fisher, given: Given, known: Known, fresh: bool
+) -> tuple[list[Camera], str]:
+    """Cameras to be compared with known views, reduced alike, and where they come from in words.
 
     Args:
         option: Name of the option, for messages.
         text: Its value.
         args: Whose `split`, `count` and options of orbits apply.
-        scene: For what is turned around.
+        given: What is turned around.
         known: Views that are left out if `fresh`; the first one's lens serves orbits and domes.
         fresh: Leave out known views of the same data set.
-    Returns:
-        Cameras and a line of text.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If an option is out of range or a file damaged, or no view is left.
     """
-    path = Path(text)
-    is_set = text not in ("orbit", "dome") and not is_camera_list(path)
-    if args.split != "all" and not is_set:
-        raise ValueError(f"--split {args.split} must have {option} DATA, {text} has no split; drop it")
-    if text == "orbit":
-        return _orbit(Wish.of(args), scene, known, args.count), f"orbit of {args.count}"
-    if text == "dome":
+    source = Source.of(option, text, made=("orbit", "dome"))
+    source.check_split(args.split)
+    if source.kind == "orbit":
+        return _compared_orbit(Wish.of(args), given, known, args.count), f"orbit of {args.count}"
+    if source.kind == "dome":
         if args.span is not None:
             raise ValueError(f"--span must have {option} orbit, a dome goes all the way round; drop it")
         circle = dataclasses.replace(Wish.of(args), elevation=0.0, span=360.0)
-        return dome(_orbit(circle, scene, known, 24), args.count), f"dome of {args.count}"
-    if not is_set:
-        return [at_most(camera, scene.pixels) for camera in load_cameras_json(path)], text
-    every = 8
-    if _is_run(path):
-        record = fit_record(Run(path))
-        path, every = record.data, record.config.test_every
-    elif scene.run is not None:
-        every = fit_record(scene.run).config.test_every
-    dataset = _load(path, scene)
-    train, test = dataset.split(every)
-    views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[args.split]
-    same = path.resolve() == known.data
+        return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
+    if source.kind == "list":
+        return [at_most(camera, known.pixels) for camera in source.listed()], text
+    views = source.split(source.dataset(args.strict), args.split, given)
+    same = (source.record.data if source.kind == "run" else Path(text)).resolve() == known.data
     used = {camera.name for camera in known.cameras} if same and fresh else set()
     left = [view for view in views if view.name not in used]
     if not left:
@@ -167,30 +291,31 @@ def other_views(option: str, text: str, args: Select | Fisher, scene: Scene, kno
             f"{text}: must hold a view that is not known yet, all {len(views)} of split {args.split} are; "
             f"use {option} orbit or dome, or another data set"
         )
-    return [_camera(view, known.sizes if same else {}, scene.pixels) for view in left], f"{text} ({args.split})"
+    return [_camera(view, known.sizes if same else {}, known.pixels) for view in left], f"{text} ({args.split})"
 
 
-def dome(circle: list[Camera], count: int) -> list[Camera]:
-    """Cameras on the upper half of a sphere, evenly: rings of equal steps in elevation.
+def _compared_orbit(wish: Wish, given: Given, known: Known, count: int) -> list[Camera]:
+    """Around what the known views look at, else around the Gaussians, with the first known view's lens.
 
-    Args:
-        circle: Cameras around the sphere's equator, evenly spaced, looking at its center; their lens is taken.
-        count: How many.
+    All the way round: what known views do not cover is what candidates are for.
     """
-    centers = np.stack([camera.center for camera in circle])
-    middle, up = centers.mean(axis=0), -circle[0].c2w[:3, 1]
-    radius = float(np.linalg.norm(centers - middle, axis=1).mean())
-    rings = max(1, round(math.sqrt(count * math.pi / 8)))  # as far apart as the cameras of a ring are
-    elevations = 90 * (np.arange(rings) + 0.5) / rings
-    share = np.cumsum(np.cos(np.radians(elevations)))
-    ends = np.round(count * share / share[-1]).astype(int)
-    made = []
-    for elevation, number in zip(elevations, np.diff(ends, prepend=0), strict=True):
-        if number:
-            made += orbit(middle, radius, int(number), float(elevation), up=up)
-    return [
-        dataclasses.replace(circle[0], w2c=camera.w2c, name=f"dome_{index:04d}") for index, camera in enumerate(made)
-    ]
+    lens = known.cameras[0]
+    fov = min(2 * math.degrees(math.atan(0.5 * lens.width / lens.K[0, 0])), 170.0)
+    how = {"width": lens.width, "height": lens.height, "wish": dataclasses.replace(wish, fov=fov)}
+    walked = sorted(known.cameras, key=lambda camera: camera.name)  # an active run has them as they were picked
+    cameras, _ = capture_orbit(walked, count, distance_of=seen_distance(given.gaussians), beyond=True, **how)
+    if not cameras:
+        cameras = scene_orbit(given.gaussians, count, **how)
+    return [dataclasses.replace(camera, K=lens.K) for camera in cameras]
+
+
+def _camera(view: View, sizes: dict[tuple[int, int], tuple[int, int]], pixels: int) -> Camera:
+    """A view's camera: pinhole, of the size that its image probably has, then reduced."""
+    camera = dataclasses.replace(view.camera.undistorted(), name=view.name)
+    return at_most(resized_alike(camera, sizes), pixels)
+
+
+# ------------------------------------------------------------------------------------------ both
 
 
 def evenly(views: list, limit: int) -> list:
@@ -200,57 +325,16 @@ def evenly(views: list, limit: int) -> list:
     return [views[i * len(views) // limit] for i in range(limit)]
 
 
-def seen_views(args: Crossval | Tradeoff) -> tuple[Gaussians, dict, list[Camera], str]:
-    """What a command looks at and from where.
-
-    Returns:
-        The Gaussians; the settings that hold whatever the preset is (what --set says, over the run's background);
-        pinhole cameras, as large as they are drawn; and where they come from in words.
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If an option is out of range or a file damaged.
-    """
-    for option, value, low, high in (
-        ("--limit", args.limit, 1, _MAX_COUNT),
-        ("--max-pixels", args.max_pixels, 1, 10**9),
-    ):
-        if value is not None and not low <= value <= high:
-            raise ValueError(f"{option} must be in [{low}, {high}], got {value}; correct it")
+def check_counts(args: Crossval | Fisher | Select | Tradeoff) -> None:
+    """Raise ValueError unless the options that count views or pixels, and those of orbits, are in their ranges."""
+    for option, high in (("count", _MAX_COUNT), ("limit", _MAX_COUNT), ("max_pixels", 10**9), ("info_pixels", 10**9)):
+        value = getattr(args, option, None)
+        if value is not None and not 1 <= value <= high:
+            name = "--" + option.replace("_", "-")
+            raise ValueError(f"{name} must be in [1, {high}], got {value}; correct it")
     Wish.of(args)
-    gaussians, run = load_scene(args.scene)
-    fields = args.replaced()
-    if run is not None:
-        fields = {"background": fit_record(run).config.settings.background} | fields
-    text = args.cameras or ("orbit" if run is None else str(run.path))
-    cameras, source = cameras_of(args, text, gaussians, run, args.limit, (None, None))
-    return gaussians, fields, [camera.undistorted() for camera in evenly(cameras, args.limit)], source
 
 
-def _orbit(wish: Wish, scene: Scene, known: Known, count: int) -> list[Camera]:
-    """Around what the known views look at, else around the Gaussians, with the first known view's lens.
-
-    All the way round: what known views do not cover is what candidates are for.
-    """
-    lens = known.cameras[0]
-    fov = min(2 * math.degrees(math.atan(0.5 * lens.width / lens.K[0, 0])), 170.0)
-    how = {"width": lens.width, "height": lens.height, "wish": dataclasses.replace(wish, fov=fov)}
-    walked = sorted(known.cameras, key=lambda camera: camera.name)  # an active run has them as they were picked
-    cameras, _ = capture_orbit(walked, count, distance_of=seen_distance(scene.gaussians), beyond=True, **how)
-    if not cameras:
-        cameras = scene_orbit(scene.gaussians, count, **how)
-    return [dataclasses.replace(camera, K=lens.K) for camera in cameras]
-
-
-def _is_run(path: Path) -> bool:
-    return (path / "config.json").is_file() and (path / "log.jsonl").is_file()
-
-
-def _load(path: Path, scene: Scene):
-    from drgs.data import load
-
-    return load(path, lazy=True, points=False, strict=scene.strict)
-
-
-def _camera(view: View, sizes: dict, pixels: int) -> Camera:
-    camera = dataclasses.replace(view.camera.undistorted(), name=view.name)
-    return at_most(resized_alike(camera, sizes), pixels)
+def _say(args: Render | Crossval | Tradeoff, text: str) -> None:
+    if not args.quiet:
+        print(text, flush=True)

@@ -13,7 +13,7 @@ from drgs.data.checks import inverse_pose
 from drgs.files import atomic_write
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["load_cameras_json", "save_cameras_json"]
+__all__ = ["described", "is_camera_list", "load_cameras_json", "save_cameras_json"]
 
 _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position": [float], "rotation": [[float]]}
 
@@ -84,3 +84,25 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
     return cameras
+
+
+def is_camera_list(path: Path) -> bool:
+    """Whether a JSON file is a list, as INRIA's cameras.json is, and not a transforms.json."""
+    if path.suffix != ".json" or not path.is_file():
+        return path.name == "cameras.json"
+    with path.open("rb") as file:
+        return file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
+
+
+def described(camera: Camera) -> dict:
+    """A camera of any kind as JSON, for the files of commands."""
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "c2w": camera.c2w.tolist(),
+        "model": camera.model,
+        "distortion": list(camera.distortion),
+        **({} if camera.time is None else {"time": camera.time}),
+    }

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.files import Run
 
-__all__ = ["FitRecord", "LoadedRun", "check_checkpoint", "fit_record", "fitted_views", "load_run"]
+__all__ = ["FitRecord", "LoadedRun", "check_checkpoint", "fit_record", "fitted_views", "is_run", "load_run"]
 
 _log = logging.getLogger(__name__)
 
@@ -122,6 +122,11 @@ def _shows(path: Path, gaussians: Gaussians) -> bool:
         return False
     held = gaussians.parameters()
     return all(torch.equal(x, held[name]) for name, x in shown.items())
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder has a fit in it, however far that came."""
+    return (path / "config.json").is_file() and (path / "log.jsonl").is_file()
 
 
 def fit_record(run: Run) -> FitRecord:

@@ -1,0 +1,72 @@
+"""What a command was given to look at: a PLY, or a run and what is known of how it was fitted."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drgs.files import Run, load_ply
+from drgs.fitting.records import FitRecord, load_run
+from drgs.guards.foreign import refuse_foreign
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["Given"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """Gaussians, and the run that they are of.
+
+    Attributes:
+        gaussians: Of the PLY, or of the run's last checkpoint.
+        run: The run folder; None for a PLY.
+        record: How the run was fitted; None for a PLY.
+        fields: Render settings that hold whatever the preset is: what --set says, over the background of the fit. A
+            run was fitted over its background; over another one its edges show a halo.
+    """
+
+    gaussians: Gaussians
+    run: Run | None = None
+    record: FitRecord | None = None
+    fields: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, args: Crossval | Fisher | Render | Select | Tradeoff) -> Given:
+        """What the command line names, and says about settings.
+
+        Raises:
+            FileNotFoundError: If there is no such PLY, or the run has no checkpoint yet.
+            ValueError: If --set is wrong or a file damaged.
+        """
+        replaced, given = args.replaced(), cls.at(args.scene)
+        fitted = {} if given.record is None else {"background": given.record.config.settings.background}
+        return dataclasses.replace(given, fields=fitted | replaced)
+
+    @classmethod
+    def at(cls, path: Path) -> Given:
+        """What a PLY or a run folder holds; any folder is taken for a run.
+
+        Raises:
+            FileNotFoundError: If there is no such PLY, or the run has no checkpoint yet.
+            ValueError: If a file is damaged, or of a format of somebody else's.
+        """
+        if not path.is_dir():
+            return cls(load_ply(path))
+        refuse_foreign(path, "a run folder or a 3DGS PLY file")
+        run = Run(path)
+        loaded = load_run(run)
+        return cls(loaded.gaussians, run, loaded.record)
+
+    def settings(self, preset: str) -> RenderSettings:
+        """How a command renders it with a preset."""
+        return RenderSettings.preset(preset, **self.fields)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """What is behind everything, whatever the preset."""
+        return tuple(self.fields.get("background", RenderSettings.background))

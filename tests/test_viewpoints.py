@@ -1,0 +1,130 @@
+"""What a command was given and which views its options name: each rule once, for every command."""
+
+import dataclasses
+
+import pytest
+from test_active import SIZE, write_still
+
+from drgs.cameras import orbit
+from drgs.commands.given import Given
+from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
+from drgs.commands.viewpoints import Source, drawn_views, known_views, other_views, seen_views
+from drgs.data.camera_lists import save_cameras_json
+from drgs.files import Run, save_ply
+from drgs.fitting.records import is_run
+from drgs.settings import RenderSettings
+from drgs.train import FitConfig
+
+SKY = (0.2, 0.4, 0.6)
+NAMES = "012345678"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """`data` (nine views), a run `run` on it over a blue background that held out every third, and a `list.json`."""
+    folder = tmp_path_factory.mktemp("given")
+    gaussians = write_still(folder / "data")
+    run = Run(folder / "run")
+    config = FitConfig(settings=RenderSettings.preset("fast", background=SKY), test_every=3, max_pixels=100)
+    train = [name for i, name in enumerate(NAMES) if i % 3]
+    run.start({"data": str(folder / "data"), "train": train, "test": ["0", "3", "6"], "fit": config.to_json()})
+    run.log("start")
+    save_ply(gaussians, run.point_cloud)
+    save_cameras_json(folder / "list.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=SIZE))
+    return folder
+
+
+def given(place, command=Render, scene="run", **options):
+    """Options of a command, and what it was given."""
+    scene = place / scene if scene == "run" else place / "run/point_cloud.ply"
+    needed = {"candidates": "orbit"} if command is Select else {}
+    args = command(scene=scene, quiet=True, **(needed | options))
+    return args, Given.of(args)
+
+
+@pytest.mark.parametrize("command", [Render, Crossval, Tradeoff, Select, Fisher])
+def test_background_is_the_fits_unless_set(place, command):
+    """A run is shown over the background that it was fitted over, a PLY over the preset's; --set wins over both."""
+    assert given(place, command)[1].background == SKY
+    assert given(place, command, scene="ply")[1].background == (0, 0, 0)
+    for scene in ("run", "ply"):
+        _, shown = given(place, command, scene=scene, overrides=("background=1,0,0", "near=0.5"))
+        assert shown.background == (1, 0, 0)
+        assert shown.settings("fast") == RenderSettings.preset("fast", background=(1.0, 0.0, 0.0), near=0.5)
+
+
+def test_a_run_is_a_folder_with_a_fit_in_it(place, tmp_path):
+    """Not a data set that has a config.json, nor a folder with only a log."""
+    assert is_run(place / "run")
+    assert not is_run(place / "data")
+    assert not is_run(place / "nowhere")
+    for name in ("config.json", "log.jsonl"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / name).write_text("{}")
+        assert not is_run(tmp_path / name)
+
+
+def test_kinds_of_sources(place):
+    """A word is an orbit or a dome only where the option makes them; a list of cameras is told by what is in it."""
+    kinds = {"run": "run", "data": "data", "list.json": "list", "data/transforms.json": "data", "gone": "data"}
+    for text, kind in kinds.items():
+        assert Source.of("--cameras", str(place / text), made=("orbit",)).kind == kind
+    assert [Source.of("--cameras", "dome", made=made).kind for made in ((), ("orbit",), ("dome",))] == [
+        "data",
+        "data",
+        "dome",
+    ]
+
+
+@pytest.mark.parametrize("kind", ["orbit", "dome", "list.json"])
+def test_only_data_sets_have_a_split(place, kind):
+    """One message, whatever the command."""
+    text = str(place / kind) if "." in kind else kind
+    for option in ("--cameras", "--candidates"):
+        source = Source.of(option, text, made=("orbit", "dome"))
+        source.check_split("all")
+        with pytest.raises(ValueError, match=f"^--split test must have {option} DATA, an? .* has no split; drop it$"):
+            source.check_split("test")
+
+
+@pytest.mark.parametrize(
+    ("scene", "text", "expected"), [("ply", "run", "036"), ("ply", "data", "08"), ("run", "data", "036")]
+)
+def test_split_is_the_runs(place, scene, text, expected):
+    """By the rule of the run that is named or looked at, else every 8th view: the same for every command."""
+    text = str(place / text)
+    for command in (Render, Crossval, Tradeoff):
+        args, shown = given(place, command, scene=scene, split="test", cameras=text)
+        cameras, _ = drawn_views(args, text, shown, 9)
+        assert "".join(camera.name for camera in cameras) == expected
+    args, shown = given(place, Fisher, scene=scene, split="test")
+    known = known_views(str(place / "list.json"), args, shown)
+    cameras, source = other_views("--cameras", text, args, shown, known, fresh=True)
+    assert "".join(camera.name for camera in cameras) == expected
+    assert source == f"{text} (test)"
+
+
+def test_cameras_are_a_runs_own_or_an_orbit(place):
+    """Without --cameras, crossval and tradeoff look from a run's photographs, evenly; at a PLY, from an orbit."""
+    args, shown = given(place, Tradeoff, limit=3)
+    assert [camera.name for camera in seen_views(args, shown)[0]] == ["0", "3", "6"]
+    args, shown = given(place, Tradeoff, scene="ply", limit=3)
+    cameras, source = seen_views(args, shown)
+    assert (len(cameras), source) == (3, "orbit, up minus-y")
+
+
+@pytest.mark.parametrize("text", [None, "run", "data", "list.json"])
+def test_known_views(place, text):
+    """--train names all views of a data set or list, and those that a run was fitted to; by default the run's own.
+
+    They are as large as in the fit, or as --info-pixels says.
+    """
+    args, shown = given(place, Select)
+    known = known_views(text and str(place / text), args, shown)
+    names = [camera.name for camera in known.cameras]
+    if text != "list.json":
+        assert names == (list(NAMES) if text == "data" else [name for name in NAMES if int(name) % 3])
+        assert known.data == (place / "data").resolve()
+    assert {(camera.width, camera.height) for camera in known.cameras} == {(10, 10)}
+    other = dataclasses.replace(args, info_pixels=16)
+    assert known_views(text and str(place / text), other, shown).cameras[0].width == 4
