@@ -10,7 +10,7 @@ Importing this package imports none of its heavy dependencies; names load at fir
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drgs import libllvm as _libllvm
 
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
 _libllvm.prepare()
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Load public names and submodules at first access (PEP 562)."""
     if name in _NAMES:
         value = getattr(importlib.import_module(f"drgs.{_NAMES[name]}"), name)

@@ -108,7 +108,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
             out[:, i] = vertex[name]
         return torch.from_numpy(out)
 
-    arrays = {field: read(group) for field, group in columns.items()}
+    arrays: dict[str, Any] = {field: read(group) for field, group in columns.items()}
     sh = arrays.pop("dc")[:, None, :]
     if rest:
         higher = read(rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)
@@ -181,12 +181,9 @@ def _check_ply(path: Path) -> list[str]:
                 text_format = kind
             case ["element", name, count] if count.isdecimal():
                 elements.append((name, int(count), [], 0))
-            case ["property", kind, name] if elements and kind in _SIZES:
-                element, count, names, size = elements[-1]
-                elements[-1] = element, count, [*names, name], size + _SIZES[kind]
-            case ["property", "list", kind, _, name] if elements and kind in _SIZES:
-                element, count, names, size = elements[-1]
-                elements[-1] = element, count, [*names, name], size + _SIZES[kind]
+            case ["property", kind, name] | ["property", "list", kind, _, name] if elements and kind in _SIZES:
+                element, rows, names, size = elements[-1]
+                elements[-1] = element, rows, [*names, name], size + _SIZES[kind]
             case ["ply"] | ["comment", *_] | ["obj_info", *_] | []:
                 pass
             case _:

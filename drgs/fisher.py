@@ -28,7 +28,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_scene, check_view
-from drgs.information.groups import GROUPS, Information, groups_of
+from drgs.information.groups import GROUPS, Group, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.replay import Replay, by_probes
 from drgs.integrator import render_jvp
@@ -234,7 +234,7 @@ def jacobian_columns(
     images = []
     for start in range(0, len(chosen), batch):
         part = chosen[start : start + batch]
-        tangents = {}
+        tangents: dict[str, torch.Tensor] = {}
         for k, (name, at) in enumerate(part):
             shape = _tangent_shape(gaussians, name)
             tangents.setdefault(name, torch.zeros(len(part), *shape, dtype=torch.float64))[(k, *at)] = 1
@@ -257,14 +257,14 @@ def pose_information(gaussians: Gaussians, camera: Camera, settings: RenderSetti
     return flat @ flat.T
 
 
-def _cameras(where: str, cameras) -> list[Camera]:
+def _cameras(where: str, cameras: object) -> list[Camera]:
     cameras = camera_list(where, "cameras", cameras)
     if not cameras:
         raise ValueError("fisher: there must be at least one camera, got none")
     return cameras
 
 
-def _weights(channel_weights) -> list[float]:
+def _weights(channel_weights: Sequence[float]) -> list[float]:
     try:
         weights = [float(x) for x in channel_weights]
     except (TypeError, ValueError):
@@ -284,7 +284,13 @@ def _tangent_shape(gaussians: Gaussians, name: str) -> tuple[int, ...]:
     return known[name].tangent(gaussians)
 
 
-def _by_columns(gaussians, camera, settings, wanted: dict, weights) -> Information:
+def _by_columns(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RenderSettings,
+    wanted: Mapping[str, Group],
+    weights: Sequence[float],
+) -> Information:
     """From every column of the Jacobian."""
     result = {}
     width = 0 if gaussians.features is None else gaussians.features.shape[1]

@@ -75,7 +75,7 @@ class Prior:
     relative: bool = False
     groups: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, value in (("value", self.value), *self.groups.items()):
             if not (isinstance(value, (int, float)) and 0 <= value < math.inf):
                 raise ValueError(f"Prior: lambda ({name}) must be in [0, inf), got {value!r}; try 1e-6")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.util
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -110,7 +110,8 @@ class Lpips:
         state = _read_weights(weights)
         first = state.get("features.0.weight")
         shape = tuple(first.shape) if isinstance(first, torch.Tensor) else None
-        self.backbone = {(64, 3, 11, 11): "alex", (64, 3, 3, 3): "vgg"}.get(shape)
+        backbones: dict[Any, str] = {(64, 3, 11, 11): "alex", (64, 3, 3, 3): "vgg"}
+        self.backbone = backbones.get(shape)
         if self.backbone is None:
             raise ValueError(
                 f"{weights}: must be the state dictionary of torchvision's AlexNet or VGG16, got features.0.weight of "
@@ -186,7 +187,7 @@ def _evaluated(
         target = frame.target()
         shown = image if frame.mask is None else image * frame.mask[..., None]
         height, width = target.shape[:2]
-        row = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
+        row: dict[str, Any] = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
         row["psnr"] = psnr(image, frame.image(), frame.mask)
         row["ssim_padded"] = float(_ssim_map(shown, target).mean())
         row["flip"] = flip(shown, target)
@@ -235,9 +236,9 @@ def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings,
     if settings == viewers or not frames:
         return None
     frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
-    values = {"psnr": viewers, "own_psnr": settings}
-    with Bar("views as viewers of PLY files draw them", len(values) * len(frames)) as bar:
-        for name, model in values.items():
+    models, values = {"psnr": viewers, "own_psnr": settings}, {}
+    with Bar("views as viewers of PLY files draw them", len(models) * len(frames)) as bar:
+        for name, model in models.items():
             found = []
             for frame in frames:
                 with torch.no_grad():  # as above
@@ -249,7 +250,7 @@ def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings,
     return {"preset": _VIEWERS, **values, "split": split, "views": [frame.name for frame in frames], **size}
 
 
-def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields) -> dict:
+def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields: Any) -> dict:
     """Write `metrics.json` of a run from the result of `evaluate`; returns what was written."""
     written = {"schema": SCHEMA, "split": split, "count": len(frames), **fields, **result}
     write_json(run.path / "metrics.json", written)

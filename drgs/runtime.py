@@ -19,11 +19,16 @@ import functools
 import os
 import sys
 import threading
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from drgs.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
+
+if TYPE_CHECKING:
+    import torch
 
 __all__ = [
     "VARIANTS",
@@ -38,6 +43,9 @@ __all__ = [
     "prepare",
     "setup",
 ]
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
@@ -82,14 +90,14 @@ _computing = threading.RLock()
 _owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
 
 
-def alone(function: Callable) -> Callable:
+def alone(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Lets one Python thread at a time compute, as one computation uses all cores, and refuses in a forked child.
 
     Dr.Jit's worker threads do not survive `os.fork`: a kernel would wait for them forever.
     """
 
     @functools.wraps(function)
-    def one_at_a_time(*args, **kwargs):
+    def one_at_a_time(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         global _owner
         _refuse_fork()
         _owner = os.getpid()
@@ -107,7 +115,7 @@ def _refuse_fork() -> None:
         )
 
 
-def unwrapped(x, convert):
+def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], Result]) -> Result:
     """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph."""
     import torch
 
@@ -155,7 +163,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         version = None
     else:
         version = _loaded_llvm(dr)
-        import drjit.llvm.ad as types
+        import drjit.llvm.ad as types  # type: ignore[no-redef]  # the two have the same names
 
     # Left alone, both size their pools by the machine, which oversubscribes a container.
     dr.set_thread_count(count or min(dr.thread_count(), _usable_cores()))
@@ -251,7 +259,7 @@ def info() -> dict:
         except metadata.PackageNotFoundError:
             return None
 
-    report = {
+    report: dict[str, Any] = {
         "drgs": drgs.__version__,
         "commit": _commit(),
         "python": platform.python_version(),
@@ -305,7 +313,8 @@ def _wanted_variant(variant: str | None) -> str | None:
 
 
 def _wanted_threads(threads: int | None) -> int | None:
-    where, text = "setup: threads", threads
+    """The number asked for by argument or by environment; None: as many as there are cores."""
+    where, text = "setup: threads", typing.cast("int | str | None", threads)
     if threads is None:
         where, text = "drgs: DRGS_THREADS", os.environ.get("DRGS_THREADS") or None
     if text is None:
@@ -388,4 +397,4 @@ def _output(*command: str) -> str | None:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    return (done.stdout.splitlines() or [None])[0]
+    return next(iter(done.stdout.splitlines()), None)

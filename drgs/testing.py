@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ def assert_matches(
     background: tuple = (0.2, 0.4, 0.7),
     allow: tuple[str, ...] = ("known deviation",),
     seeds: tuple[int, ...] = (0, 1, 2),
-    **options,
+    **options: Any,
 ) -> list[Result]:
     """Assert that a rasterizer's images and gradients are those of a model.
 
@@ -52,7 +53,7 @@ def assert_matches(
         raise ValueError(f"assert_matches: allow must be among {', '.join(VERDICTS)}, got {unknown[0]!r}")
     if (scene is None) != (cameras is None):
         raise ValueError("assert_matches: scene and cameras must both be given, or none of them")
-    scenes = [(scene, cameras)] if scene is not None else [random_scene(seed) for seed in seeds]
+    scenes = [(scene, cameras)] if scene is not None and cameras is not None else [random_scene(seed) for seed in seeds]
     results = []
     for g, views in scenes:
         if isinstance(rasterizer, str):
@@ -113,4 +114,5 @@ def random_scene(
         "logit_opacities": logits,
         "sh": 0.4 * rng.normal(size=(count, 9, 3)),
     }
-    return Gaussians(**{name: torch.tensor(x, dtype=torch.float32) for name, x in values.items()}), [camera]
+    tensors: dict[str, Any] = {name: torch.tensor(x, dtype=torch.float32) for name, x in values.items()}
+    return Gaussians(**tensors), [camera]

@@ -103,7 +103,7 @@ def _fit(
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
     tensors, header = last_checkpoint(run) if resume else (None, None)
-    if header:
+    if tensors is not None and header is not None:
         was, now = ("active" if x else "all" for x in (header.get("active"), plan))
         if was != now:
             raise ValueError(
@@ -114,7 +114,7 @@ def _fit(
             plan.restore(tensors, header, str(run.path))
     frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
     held_out = load_frames(test, config.max_pixels, config.mask)
-    if header:
+    if tensors is not None and header is not None:
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path))
         seconds, source = header["seconds"], header["point_source"]
     else:
@@ -135,7 +135,11 @@ def _fit(
         "fit": config.to_json(),
     }
     if plan:
-        recorded |= {"active": active.to_json(), "pool": [view.name for view in train], "pool_leak": plan.pool_leak}
+        recorded |= {
+            "active": plan.active.to_json(),
+            "pool": [view.name for view in train],
+            "pool_leak": plan.pool_leak,
+        }
     _check_pictures(out_dir, config.max_steps, held_out)
     run.start(recorded, resume=resume)
     if plan:
@@ -238,7 +242,7 @@ class _Loop:
                 while self.plan and self.plan.is_due(trainer.step_index):
                     self.save()  # choosing may take minutes, and can be interrupted anywhere
                     with interrupts.at_once():
-                        self._pick(bar)
+                        self._pick(self.plan, bar)
                 began = time.perf_counter()
                 row = trainer.step()
                 self.seconds += time.perf_counter() - began
@@ -270,9 +274,9 @@ class _Loop:
         self.run_folder.log("checkpoint", step=self.trainer.step_index)
         self._saved = now
 
-    def _pick(self, bar: Bar) -> None:
+    def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """One more view."""
-        trainer, plan = self.trainer, self.plan
+        trainer = self.trainer
         frame, record = plan.pick(trainer.gaussians(), trainer.frames, trainer.step_index)
         points, colors, dense = plan.points(frame, trainer.gaussians())
         if len(points):

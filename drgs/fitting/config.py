@@ -105,7 +105,7 @@ class FitConfig:
     noise: float = 0.0
     jitter: float = 0.1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields("fit", self, _RANGES)
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
@@ -162,7 +162,7 @@ class ActiveConfig:
     relative_prior: bool = False
     pick_points: PickPoints = "auto"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         from drgs.gain import Prior
 
         if self.add == 0:

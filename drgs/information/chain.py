@@ -36,7 +36,9 @@ class Chain:
     left_out: int
 
 
-def dense(candidate: torch.Tensor, train: torch.Tensor, prior, labels: torch.Tensor | None = None) -> Chain:
+def dense(
+    candidate: torch.Tensor, train: torch.Tensor, prior: float | torch.Tensor, labels: torch.Tensor | None = None
+) -> Chain:
     """The chain of [1], section 3.3, from whole Jacobians: P up to a few thousand.
 
     Args:

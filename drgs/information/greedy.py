@@ -95,8 +95,8 @@ def greedy(pool: Pool, information: ViewInformation) -> Selection:
         if len(selection.picks) == pool.k:
             return selection
         left.remove(best)
-        _add(H, kept[best])
-        kept[best], fresh = None, set()  # its information is in H now, and the other scores are bounds
+        _add(H, kept.pop(best))
+        fresh = set()  # the other scores are bounds now
         selection.evaluations += _refresh(gains, left, fresh, falling, _scorer(pool, H), kept)
 
 
@@ -106,21 +106,23 @@ def _scorer(pool: Pool, H: Information) -> Callable[[Information], Gain]:
 
 def _first_round(
     pool: Pool, information: ViewInformation
-) -> tuple[dict[str, torch.Tensor], list[Gain], list[Information | None]]:
-    """H of the training views, every candidate's gain and, where more than one is picked, its information."""
-    H, score, gains, kept = None, None, [], []
+) -> tuple[dict[str, torch.Tensor], list[Gain], dict[int, Information]]:
+    """H of the training views, every candidate's gain and, where more than one is picked, its information by index."""
+    H: dict[str, torch.Tensor] = {}
+    gains: list[Gain] = []
+    kept: dict[int, Information] = {}
     for i, camera in enumerate(pool.train):
         part = information(f"training view {i} ({camera.name})", camera)
-        H = _nothing(part) if H is None else H
+        H = H or _nothing(part)
         _add(H, part)
     for i, camera in enumerate(pool.candidates):
         part = information(f"candidate {i} ({camera.name})", camera)
-        if score is None:
-            H = _nothing(part) if H is None else H
+        if i == 0:
+            H = H or _nothing(part)
             score = _scorer(pool, H)
         gains.append(score(part))
         if pool.k > 1:
-            kept.append(part)
+            kept[i] = part
         del part  # else two views are alive while the next one is computed
     return H, gains, kept
 
@@ -144,7 +146,14 @@ def _notes(gains: list[Gain]) -> list[str]:
     return notes
 
 
-def _refresh(gains: list[Gain], left: list[int], fresh: set[int], falling: bool, score, kept) -> int:
+def _refresh(
+    gains: list[Gain],
+    left: list[int],
+    fresh: set[int],
+    falling: bool,
+    score: Callable[[Information], Gain],
+    kept: dict[int, Information],
+) -> int:
     """Score again what may be among the two best of `left`; how many that were."""
     count = 0
     while stale := [i for i in left if i not in fresh]:

@@ -37,7 +37,7 @@ class Scoring:
     prior: Prior = dataclasses.field(default_factory=Prior)
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, known in (("criterion", CRITERIA), ("method", METHODS)):
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
