@@ -56,48 +56,28 @@ FACADE_STILL = {
     "commands.forecast",
     "commands.orbits",
     "commands.render",
-    "fitting.active",
     "lab.tradeoff",
     "lab.tradeoff_full",
-    "metrics",
     "runtime",
-    "train",
 }
 
 LINES = 400  # what is read in one go
 TOO_LONG = {
-    "cameras.py",
     "commands/options.py",
     "data/colmap.py",
     "lab/conventions.py",
     "lab/tradeoff.py",
-    "tracing/call.py",
-    "tracing/projection.py",
 }
 
 UNDOCUMENTED = {
     "commands.demo._make_demo",
     "commands.render._check_numbers",
     "commands.stress._write",
-    "data._nothing_found",
-    "data.colmap._camera",
-    "data.colmap._check_binary",
-    "data.transforms._camera",
-    "fitting.frames._frames",
-    "information.jacobian._take",
     "lab.conventions._parameters",
     "lab.rasterizers._dump",
     "lab.tradeoff._compare",
     "lab.tradeoff._take",
-    "metrics._evaluated",
-    "metrics._read_weights",
-    "runtime._wanted_threads",
-    "tracing.call._jvp_output",
     "tracing.derivatives._take",
-    "tracing.walk._in_order",
-    "tracing.walk._sorted",
-    "train._fit",
-    "train._log",
 }
 
 
