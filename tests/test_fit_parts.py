@@ -14,8 +14,9 @@ from test_train import config, dataset, random_rows  # noqa: F401 (a fixture)
 from drgs.files import load_state, save_state
 from drgs.fitting.density import add_gaussians, relocate
 from drgs.fitting.frames import load_frames
-from drgs.fitting.losses import Photometric, terms_of
+from drgs.fitting.losses import Photometric
 from drgs.fitting.networks import Network, saved_networks
+from drgs.fitting.parts import Parts, parts_of
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
@@ -62,16 +63,14 @@ def trainer_of(dataset, state=None) -> Trainer:  # noqa: F811
     """A fit with both terms, features and a network: new, or from a checkpoint."""
     cfg = config(max_steps=20, refine_start=0.1, refine_every=0.1, max_gaussians=50)
     frames, affine = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask), Affine()
-    parts = {
-        "terms": [Corrected(affine), Near(), *terms_of(cfg, 3.0)[1:]],
-        "networks": [Network("affine", affine, lambda part: 1e-2 * (1 - part))],
-        "rates": {"features": 1e-2},
-    }
+    plain, network = parts_of(cfg, 3.0), Network("affine", affine, lambda part: 1e-2 * (1 - part))
+    terms = [Corrected(affine), Near(), *plain.terms[1:]]
+    parts = Parts(terms, {**plain.rates, "features": 1e-2}, [network])
     if state is not None:
-        return Trainer.from_state(cfg, frames, *state, "here", **parts)
+        return Trainer.from_state(cfg, frames, *state, "here", parts)
     points, colors = torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors)
     rows = GaussianRows.from_points(points, colors)
-    return Trainer(cfg, frames, GaussianRows({**rows.tensors, "features": torch.zeros(len(rows), 3)}), 3.0, **parts)
+    return Trainer(cfg, frames, GaussianRows({**rows.tensors, "features": torch.zeros(len(rows), 3)}), 3.0, parts)
 
 
 @pytest.fixture
@@ -110,7 +109,7 @@ def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path, one_thre
     save_state(path, tensors, {**header, "seconds": 1.0, "point_source": "x"})
     saved = load_state(path)
     check_checkpoint(path, *saved)
-    network = first.networks[0].module.state_dict()
+    network = first.parts.networks[0].module.state_dict()
     assert network["calls"] == 9
     assert not torch.equal(network["gain"], Affine().gain)
     assert all(torch.equal(x, network[name]) for name, x in saved_networks(*saved)["affine"].items())
@@ -138,20 +137,23 @@ def test_parts_that_do_not_fit_are_refused(dataset):  # noqa: F811
     trainer = trainer_of(dataset)
     trainer.step()
     tensors, header = trainer.state()
-    whole = {"terms": trainer.terms, "rates": trainer.rates}
-    load = lambda **parts: Trainer.from_state(trainer.config, trainer.frames, tensors, header, "here", **parts)  # noqa: E731
+    whole, plain = trainer.parts, parts_of(trainer.config, 3.0)
+
+    def load(**changes):
+        parts = dataclasses.replace(whole, **changes)
+        return Trainer.from_state(trainer.config, trainer.frames, tensors, header, "here", parts)
+
     with pytest.raises(ValueError, match=r"^here: --resume .*networks were \['affine'\] and are \[\]; repeat"):
-        load(**whole)
+        load(networks=[])
     wide = Network("affine", torch.nn.Linear(2, 2), 1e-2)
     with pytest.raises(ValueError, match=r"^here: affine\.parameter\.weight must have shape \(2, 2\), got none; "):
-        load(**whole, networks=[wide])
+        load(networks=[wide])
     with pytest.raises(ValueError, match="every tensor must have a learning rate, features has none"):
-        load(terms=trainer.terms, networks=trainer.networks)
+        load(rates=plain.rates)
     for names in (("rng",), ("a", "a")):
-        networks = [Network(name, Affine(), 1e-2) for name in names]
         with pytest.raises(ValueError, match="networks must have names of their own"):
-            Trainer(trainer.config, trainer.frames, trainer.rows, 3.0, rates={"features": 0.0}, networks=networks)
-    trainer.terms = [Near()]
+            load(networks=[Network(name, Affine(), 1e-2) for name in names])
+    trainer.parts = dataclasses.replace(whole, terms=[Near()])
     trainer._queue = torch.tensor([[frame.name for frame in trainer.frames].index("1")])
     with pytest.raises(ValueError, match="a view must have a term of the loss, 1 has none"):
         trainer.step()
@@ -161,10 +163,10 @@ def test_a_step_that_is_not_finite_leaves_networks_alone(dataset):  # noqa: F811
     """A NaN that only a network's gradient has skips the step of all."""
     trainer = trainer_of(dataset)
     steps(trainer, 2)
-    trainer.networks[0].module.gain.register_hook(lambda gradient: gradient * torch.nan)
-    before = {name: x.clone() for name, x in trainer.networks[0].state().items() if not name.endswith("calls")}
+    trainer.parts.networks[0].module.gain.register_hook(lambda gradient: gradient * torch.nan)
+    before = {name: x.clone() for name, x in trainer.parts.networks[0].state().items() if not name.endswith("calls")}
     assert trainer.step()["events"][-1]["event"] == "skipped"
-    after = trainer.networks[0].state()
+    after = trainer.parts.networks[0].state()
     assert [name for name, x in before.items() if not torch.equal(x, after[name])] == []
 
 

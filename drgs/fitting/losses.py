@@ -26,15 +26,15 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 class LossTerm(Protocol):
-    """A part of what a step minimizes. `terms_of` lists those of a fit; another one is a class like those below.
+    """A part of what a step minimizes. `terms_of` lists those of a fit; another one is a class like those below."""
 
-    Attributes:
-        name: Of its own among the terms of a fit.
-        outputs: What it needs of `drgs.render` besides rgb, alpha and features.
-    """
+    @property
+    def name(self) -> str:
+        """Of its own among the terms of a fit; a plain attribute does."""
 
-    name: str
-    outputs: tuple[str, ...]
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What it needs of `drgs.render` besides rgb, alpha and features; a plain attribute does."""
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
         """The term for one view.
@@ -65,8 +65,8 @@ class Photometric:
     """(1 - w) L1 + w (1 - SSIM), a mean over all pixels; both images are black outside the mask, if there is one."""
 
     ssim_weight: float
-    name: ClassVar = "photometric"
-    outputs: ClassVar = ()
+    name: ClassVar[str] = "photometric"
+    outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
@@ -82,8 +82,8 @@ class Outside:
     """Opacity outside the mask of an object, where nothing is; a mask of valid pixels leaves what is outside free."""
 
     weight: float
-    name: ClassVar = "outside"
-    outputs: ClassVar = ()
+    name: ClassVar[str] = "outside"
+    outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
         """See `LossTerm`."""
@@ -97,8 +97,8 @@ class Opacity:
     """Opacity of all Gaussians: those that no photograph needs become transparent, and density control moves them."""
 
     weight: float
-    name: ClassVar = "opacity"
-    outputs: ClassVar = ()
+    name: ClassVar[str] = "opacity"
+    outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
@@ -111,8 +111,8 @@ class Scale:
 
     weight: float
     extent: float
-    name: ClassVar = "scale"
-    outputs: ClassVar = ()
+    name: ClassVar[str] = "scale"
+    outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""

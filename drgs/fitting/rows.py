@@ -7,15 +7,12 @@ Gaussian is fitted beside them (networks.py).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 
 from drgs.ellipsoids import Gaussians
 
 __all__ = ["GaussianRows"]
-
-_Change = Callable[[torch.Tensor], torch.Tensor]
 
 
 class GaussianRows:
@@ -83,15 +80,15 @@ class GaussianRows:
 
     def raise_sh_degree(self) -> None:
         """Add the coefficients of the next degree, 0 and with no moments."""
-        missing = 2 * self.sh_degree + 3
-        self._map("sh_rest", lambda x: torch.cat([x, x.new_zeros(len(x), missing, 3)], dim=1))
+        old = self.tensors["sh_rest"]
+        self._extend("sh_rest", old.new_zeros(len(old), 2 * self.sh_degree + 3, 3), 1)
 
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Add Gaussians with zero moments; their rows of tensors that `rows` lacks are 0."""
         count = len(rows["means"])
         for name, old in list(self.tensors.items()):
             new = rows[name] if name in rows else old.new_zeros(count, *old.shape[1:])
-            self._map(name, lambda x, new=new: torch.cat([x, new]), lambda m, new=new: torch.cat([m, 0 * new]))
+            self._extend(name, new, 0)
 
     def overwrite(self, index: torch.Tensor, rows: dict[str, torch.Tensor]) -> None:
         """Replace Gaussians at `index` (unique) and forget the moments of the given tensors there."""
@@ -131,17 +128,16 @@ class GaussianRows:
         return [state[key] for key in ("exp_avg", "exp_avg_sq") if key in state]
 
     @torch.no_grad()  # the new tensor is a leaf of its own
-    def _map(self, name: str, change: _Change, change_moments: _Change | None = None) -> None:
-        """Replace one tensor by `change(tensor)`, and its moments likewise."""
+    def _extend(self, name: str, more: torch.Tensor, dim: int) -> None:
+        """Concatenate a tensor with `more` along `dim`, and its moments with 0."""
         old = self.tensors[name]
-        # From the values alone: gradients of the old leaf are not the new one's.
-        new = change(old.detach()).requires_grad_()
+        new = torch.cat([old, more], dim).requires_grad_()
         group = next(g for g in self.optimizer.param_groups if g["name"] == name)
         group["params"] = [new]
         state = self.optimizer.state.pop(old, {})
         for key in ("exp_avg", "exp_avg_sq"):
             if key in state:
-                state[key] = (change_moments or change)(state[key])
+                state[key] = torch.cat([state[key], torch.zeros_like(more)], dim)
         if state:
             self.optimizer.state[new] = state
         self.tensors[name] = new

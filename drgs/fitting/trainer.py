@@ -7,16 +7,14 @@ of random order. `drgs.train` adds files, progress and the command.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
-from drgs.fitting.losses import LossTerm, terms_of
-from drgs.fitting.networks import Network, Rate, rate_at
+from drgs.fitting.networks import rate_at
+from drgs.fitting.parts import Parts, means_rate, parts_of
 from drgs.fitting.rows import GaussianRows
 from drgs.integrator import render
 
@@ -39,9 +37,7 @@ class Trainer:
         frames: Training photographs.
         rows: The Gaussians and their optimizer.
         extent: Of the scene, its unit of length.
-        terms: Of the loss, in the order in which they are added up.
-        networks: What else is fitted.
-        rates: Learning rates by the name of the tensor in `rows`.
+        parts: Terms of the loss, learning rates and networks.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
@@ -53,17 +49,12 @@ class Trainer:
         frames: list[Frame],
         rows: GaussianRows,
         extent: float,
-        *,
-        terms: Sequence[LossTerm] | None = None,
-        networks: Sequence[Network] = (),
-        rates: Mapping[str, Rate] = MappingProxyType({}),
+        parts: Parts | None = None,
     ) -> None:
         """A fit at its first step.
 
         Args:
-            terms: Default those of `config` (`losses.terms_of`).
-            networks: What terms call that is to be fitted, too.
-            rates: Of tensors in `rows` that `config` has no learning rate for.
+            parts: Default those of `config`.
         Raises:
             ValueError: If there is no photograph or no Gaussian, a tensor has no rate, or two networks have one name.
         """
@@ -72,11 +63,10 @@ class Trainer:
         if not len(rows):
             raise ValueError("fit: there must be at least one initial point, got none; check the data set")
         self.config, self.frames, self.rows, self.extent = config, frames, rows, extent
-        self.terms = list(terms_of(config, extent) if terms is None else terms)
-        self.networks, self.rates = list(networks), {**self._own_rates(), **rates}
-        if missing := sorted(set(rows.tensors) - set(self.rates)):
-            raise ValueError(f"fit: every tensor must have a learning rate, {missing[0]} has none; add it to rates")
-        names = [network.name for network in self.networks]
+        self.parts = parts_of(config, extent) if parts is None else parts
+        if missing := sorted(set(rows.tensors) - set(self.parts.rates)):
+            raise ValueError(f"fit: every tensor must have a learning rate, {missing[0]} has none; add it to the parts")
+        names = [network.name for network in self.parts.networks]
         if len(set(names)) < len(names) or set(names) & _RESERVED:
             raise ValueError(f"fit: networks must have names of their own, got {', '.join(names)}; rename one")
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
@@ -107,10 +97,10 @@ class Trainer:
         config, rows, done = self.config, self.rows, self.step_index
         events = self._prepare(done)
         frame, gaussians = self.frames[self._next_view()], rows.gaussians()
-        outputs = {name: None for term in self.terms for name in term.outputs}  # each once, in their order
+        outputs = {name: None for term in self.parts.terms for name in term.outputs}  # each once, in their order
         out = render(gaussians, frame.camera, config.settings, outputs=tuple(outputs))
-        loss, parts = self._loss(out, frame, gaussians)
-        optimizers = [rows.optimizer, *(network.optimizer for network in self.networks)]
+        loss, terms = self._loss(out, frame, gaussians)
+        optimizers = [rows.optimizer, *(network.optimizer for network in self.parts.networks)]
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -121,7 +111,7 @@ class Trainer:
             for optimizer in optimizers:
                 optimizer.step()
             if config.noise and done < config.refine_stop * config.max_steps:
-                explore(rows, self._means_rate(self._part()), self.extent, config.noise, self._generator)
+                explore(rows, means_rate(config, self._part()), self.extent, config.noise, self._generator)
         else:
             self.bad_steps += 1
             self._bad_in_a_row += 1
@@ -134,7 +124,7 @@ class Trainer:
         self.step_index += 1
         return {
             "loss": float(loss.detach()),  # told, as all of these
-            "terms": parts,
+            "terms": terms,
             # Equal images have 100 dB, which averages can take.
             "psnr": -10 * math.log10(max(mse, 1e-10)) if math.isfinite(mse) else None,
             "view": frame.name,
@@ -148,7 +138,7 @@ class Trainer:
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header of a checkpoint."""
         tensors = {**self.rows.state(), "rng": self._generator.get_state(), "queue": self._queue}
-        for network in self.networks:
+        for network in self.parts.networks:
             tensors |= network.state()
         header = {
             "step": self.step_index,
@@ -157,13 +147,19 @@ class Trainer:
             "extent": self.extent,
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
-            **({"networks": [network.name for network in self.networks]} if self.networks else {}),
+            **({"networks": [network.name for network in self.parts.networks]} if self.parts.networks else {}),
         }
         return tensors, header
 
     @classmethod
     def from_state(
-        cls, config: FitConfig, frames: list[Frame], tensors: dict, header: dict, where: str, **others: Any
+        cls,
+        config: FitConfig,
+        frames: list[Frame],
+        tensors: dict[str, torch.Tensor],
+        header: dict,
+        where: str,
+        parts: Parts | None = None,
     ) -> Trainer:
         """Continue from a checkpoint.
 
@@ -171,7 +167,7 @@ class Trainer:
             config, frames: As they were; `save_every` may change.
             tensors, header: Of the checkpoint.
             where: It, for messages.
-            others: `terms`, `networks` (which are overwritten) and `rates`, as they were.
+            parts: As they were; networks are overwritten by those of the checkpoint.
         Raises:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
@@ -187,14 +183,14 @@ class Trainer:
             raise ValueError(
                 f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
-        trainer = cls(config, frames, GaussianRows.from_state(tensors), header["extent"], **others)
-        was, now = header.get("networks", []), [network.name for network in trainer.networks]
+        trainer = cls(config, frames, GaussianRows.from_state(tensors), header["extent"], parts)
+        was, now = header.get("networks", []), [network.name for network in trainer.parts.networks]
         if was != now:
             raise ValueError(
                 f"{where}: --resume must continue the same fit, networks were {was} and are {now}; "
                 "repeat the options or choose another run folder"
             )
-        for network in trainer.networks:
+        for network in trainer.parts.networks:
             network.restore(tensors, where)
         trainer.step_index, trainer.bad_steps = header["step"], header["bad_steps"]
         trainer._start_count = header["start_count"]
@@ -217,8 +213,8 @@ class Trainer:
         start, stop = config.refine_start * config.max_steps, config.refine_stop * config.max_steps
         if done % every == 0 and max(start, 1) <= done < stop:
             events.append(self._refine(done, start))
-        rows.set_rates({name: rate_at(self.rates[name], self._part()) for name in rows.tensors})
-        for network in self.networks:
+        rows.set_rates({name: rate_at(self.parts.rates[name], self._part()) for name in rows.tensors})
+        for network in self.parts.networks:
             network.set_rate(self._part())
         return events
 
@@ -234,22 +230,6 @@ class Trainer:
         added = add_gaussians(rows, min(wanted, budget) - len(rows), config.min_opacity, config.jitter, self._generator)
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
 
-    def _own_rates(self) -> dict[str, Rate]:
-        """Learning rates of the tensors that every fit has."""
-        config = self.config
-        return {
-            "means": lambda part: self._means_rate(part) * self.extent,
-            "quats": config.rotation_rate,
-            "log_scales": config.scale_rate,
-            "logit_opacities": config.opacity_rate,
-            "sh_dc": config.dc_rate,
-            "sh_rest": config.rest_rate,
-        }
-
-    def _means_rate(self, part: float) -> float:
-        first, last = self.config.means_rate
-        return first * (last / first) ** part
-
     def _next_view(self) -> int:
         if not len(self._queue):
             self._queue = torch.randperm(len(self.frames), generator=self._generator)
@@ -258,15 +238,15 @@ class Trainer:
 
     def _loss(self, out: Output, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, dict[str, float]]:
         """The sum of the terms that a view has, and each of them by name."""
-        total, parts = None, {}
-        for term in self.terms:
+        total, told = None, {}
+        for term in self.parts.terms:
             value = term(out, frame, gaussians)
             if value is not None:
                 total = value if total is None else total + value
-                parts[term.name] = float(value.detach())  # told, not optimized
+                told[term.name] = float(value.detach())  # to be looked at
         if total is None:
             raise ValueError(f"fit: a view must have a term of the loss, {frame.name} has none; add one")
-        return total, parts
+        return total, told
 
     def _mse(self, frame: Frame, rgb: torch.Tensor) -> float:
         error = (rgb.clamp(0, 1) - frame.image()).square().mean(2)
@@ -276,7 +256,10 @@ class Trainer:
 
     def _is_finite(self, loss: torch.Tensor) -> bool:
         """Whether the loss and every gradient are; a sum is not finite where one of its numbers is not."""
-        fitted = [*self.rows.tensors.values(), *(x for network in self.networks for x in network.module.parameters())]
+        fitted = [
+            *self.rows.tensors.values(),
+            *(x for network in self.parts.networks for x in network.module.parameters()),
+        ]
         # Values that are looked at.
         sums = [loss.detach(), *(x.grad.sum() for x in fitted if x.grad is not None)]
         return all(math.isfinite(float(x)) for x in sums)
