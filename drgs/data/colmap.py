@@ -60,8 +60,7 @@ def load_colmap(
     if model is None:
         raise FileNotFoundError(
             f"{path}: must hold a COLMAP model, found no cameras.bin or cameras.txt in . or "
-            f"{', '.join(MODEL_FOLDERS)}; "
-            "run `drgs sfm`"
+            f"{', '.join(MODEL_FOLDERS)}; run `drgs sfm`"
         )
     reconstruction = _read(model, points)
     folder = _image_folder(path, model)
@@ -114,8 +113,7 @@ def _image_folder(path: Path, model: Path) -> Path:
         tried.append(str(folder))
     raise FileNotFoundError(
         f"{path}: the photos must lie in a folder named images, found none (looked at "
-        f"{', '.join(dict.fromkeys(tried))}); "
-        "move or link them there"
+        f"{', '.join(dict.fromkeys(tried))}); move or link them there"
     )
 
 
@@ -220,8 +218,7 @@ class _Walk:
     def need(self, size: int, what: str) -> None:
         if self.at + size > len(self.data):
             raise ValueError(
-                f"{self.path}: must hold {what} ({size} bytes from byte {self.at}), the file ends "
-                "at byte "
+                f"{self.path}: must hold {what} ({size} bytes from byte {self.at}), the file ends at byte "
                 f"{len(self.data)}; it is truncated or damaged, copy it again"
             )
 
@@ -329,8 +326,7 @@ def _parameter_count(path: Path, number: int) -> int:
 
 def _unsupported(path: Path, name: str) -> ValueError:
     return ValueError(
-        f"{path}: the camera model must be one of {', '.join(_MODELS)}, got {name}; undistort the "
-        "images with "
+        f"{path}: the camera model must be one of {', '.join(_MODELS)}, got {name}; undistort the images with "
         "`colmap image_undistorter`, or run `drgs sfm` again"
     )
 
@@ -357,14 +353,8 @@ def _check_text(path: Path, kind: str) -> None:
         elif kind == "points3D":
             _numbers(path, number, words, 8)
             if len(words) % 2:
-                raise _bad_line(
-                    path,
-                    number,
-                    "a track of pairs IMAGE_ID, POINT2D_IDX",
-                    f"{len(words) - 8} numbers",
-                )
-        # Rigs and frames mix words and numbers; they are small, and pycolmap reports what it cannot
-        # parse.
+                raise _bad_line(path, number, "a track of pairs IMAGE_ID, POINT2D_IDX", f"{len(words) - 8} numbers")
+        # Rigs and frames mix words and numbers; they are small, and pycolmap reports what it cannot parse.
 
 
 def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
@@ -382,12 +372,7 @@ def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
         if index + 1 < len(lines):
             observations = lines[index + 1][1].split()
             if len(observations) % 3:
-                raise _bad_line(
-                    path,
-                    lines[index + 1][0],
-                    "triples X, Y, POINT3D_ID",
-                    f"{len(observations)} numbers",
-                )
+                raise _bad_line(path, lines[index + 1][0], "triples X, Y, POINT3D_ID", f"{len(observations)} numbers")
             _numbers(path, lines[index + 1][0], observations, 0)
         index += 2
 
