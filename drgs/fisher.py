@@ -110,6 +110,7 @@ def diagonal(
         backgrounds, channels = scene.backgrounds, scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
     check_scene("fisher.diagonal", gaussians, settings)
+    assert gaussians is not None, "for type checkers: the line above has refused it"
     settings = settings or RenderSettings.preset("exact")
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")

@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from types import ModuleType
+from typing import Any
 
 import drjit as dr
+import numpy as np
 import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
@@ -33,10 +36,10 @@ _NAMES = {"depth": "depth", "median_depth": "median", "count": "count", "visibil
 
 @runtime.alone
 def render(
-    gaussians: Gaussians,
-    camera: Camera | Sequence[Camera],
+    gaussians: Scene,
+    camera: Camera | list[Camera] | tuple[Camera, ...],
     settings: RenderSettings | None = None,
-    outputs: tuple[str, ...] = ("depth",),
+    outputs: tuple[str, ...] | str = ("depth",),
 ) -> Output:
     """Render a view, or several of one size.
 
@@ -65,7 +68,7 @@ def render(
     return _view(gaussians, camera, settings, _wanted(outputs))
 
 
-def _view(gaussians: Gaussians, camera: Camera, settings: RenderSettings | None, wanted: frozenset) -> Output:
+def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wanted: frozenset) -> Output:
     gaussians = gaussians_at("render", gaussians, camera)
     check_view("render", gaussians, camera, settings)
     call = Call(gaussians, camera, settings or RenderSettings.preset("exact"), wanted)
@@ -77,12 +80,18 @@ def _batch(views: list[Output]) -> Output:
     """Views of one size with a leading axis."""
     parts = {field.name: [getattr(view, field.name) for view in views] for field in dataclasses.fields(Output)}
     certificates = parts.pop("certificate")
-    stacked = {name: None if x[0] is None else torch.stack(x) for name, x in parts.items()}
+    stacked: dict[str, Any] = {name: None if x[0] is None else torch.stack(x) for name, x in parts.items()}
     return Output(**stacked, certificate=certificates)
 
 
 @runtime.alone
-def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth",)) -> Output:
+def render_jvp(
+    gaussians: Scene,
+    camera: Camera,
+    tangents: Mapping[str, torch.Tensor],
+    settings: RenderSettings | None = None,
+    outputs: tuple[str, ...] | str = ("depth",),
+) -> Output:
     """Forward mode: how a view changes along tangents of its parameters.
 
     Args:
@@ -102,11 +111,17 @@ def render_jvp(gaussians, camera, tangents: dict, settings=None, outputs=("depth
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
     call = Call(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
-    return push_forward(call, tangents)
+    return push_forward(call, dict(tangents))
 
 
 @runtime.alone
-def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",)) -> Output:
+def render_rays(
+    gaussians: Gaussians,
+    origins: torch.Tensor | np.ndarray,
+    directions: torch.Tensor | np.ndarray,
+    settings: RenderSettings | None = None,
+    outputs: tuple[str, ...] | str = ("depth",),
+) -> Output:
     """Render arbitrary rays on the `bvh` traversal: fisheye, panoramas, lidar, thin lenses.
 
     Args:
@@ -125,7 +140,7 @@ def render_rays(gaussians, origins, directions, settings=None, outputs=("depth",
         return call.output(_differentiable(call))
 
 
-def _wanted(outputs) -> frozenset:
+def _wanted(outputs: Iterable[str]) -> frozenset[str]:
     if outputs == "all":
         outputs = OUTPUTS
     if isinstance(outputs, str):
@@ -167,7 +182,7 @@ def _differentiable(call: Call) -> dict:
     return {name: x.torch() for name, x in images.items()}
 
 
-def _forward_ad(values) -> bool:
+def _forward_ad(values: Iterable[torch.Tensor]) -> bool:
     """Whether a tensor is a dual number or belongs to a `torch.func` transform."""
     return any(
         torch._C._functorch.is_functorch_wrapped_tensor(x)
@@ -183,7 +198,7 @@ class _Reverse(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, call, names, *values):
+    def forward(ctx: Any, call: Call, names: list[str], *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
         ctx.call, ctx.names, ctx.needed = call, names, ctx.needs_input_grad[2:]
         ctx.graph, images = _traced(call, names, values, ctx.needed)
@@ -193,18 +208,20 @@ class _Reverse(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     @runtime.alone
-    def backward(ctx, *cotangents):
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         values, graph = ctx.saved_tensors, ctx.graph
         # A traversal takes the edges of the graph with it; through what is left, another would find the old gradients.
         ctx.graph = None
         inputs, images = graph or _traced(ctx.call, ctx.names, values, ctx.needed)[0]
         for image, g in zip(images, cotangents, strict=True):
             dr.set_grad(image, to_drjit(ctx.call.lib, g).array)
-        slopes = iter(dr.backward_to([x for x in inputs if x is not None]))
+        slopes: Iterator[Any] = iter(dr.backward_to([x for x in inputs if x is not None]))
         return None, None, *(None if x is None else next(slopes).torch() for x in inputs)
 
 
-def _traced(call: Call, names, values, needed) -> tuple[tuple[list, list], dict]:
+def _traced(
+    call: Call, names: list[str], values: Iterable[torch.Tensor], needed: Iterable[bool]
+) -> tuple[tuple[list, list], dict[str, Any]]:
     """The ends of a graph, inputs (None where no gradient is needed) and images, and the images by name."""
     inputs = {n: to_drjit(call.lib, x) for n, x in zip(names, values, strict=True)}
     ends = [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
@@ -217,20 +234,20 @@ class _Bridge(torch.autograd.Function):
     """Every mode, for `torch.func` and dual numbers: each derivative computes the view again."""
 
     @staticmethod
-    def forward(call, names, *values):
+    def forward(call: Call, names: list[str], *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         images = call.trace(**{n: _plain(call.lib, x) for n, x in zip(names, values, strict=True)})
         call.result_names = list(images)
         return tuple(x.torch().clone() for x in images.values())
 
     @staticmethod
-    def setup_context(ctx, inputs, output):
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
         ctx.call, ctx.names, *values = inputs
         ctx.save_for_backward(*values)
         ctx.save_for_forward(*values)
 
     @staticmethod
     @runtime.alone
-    def backward(ctx, *cotangents):
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         call, lib = ctx.call, ctx.call.lib
         inputs = {n: _plain(lib, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
@@ -243,7 +260,7 @@ class _Bridge(torch.autograd.Function):
 
     @staticmethod
     @runtime.alone
-    def jvp(ctx, _scene, _names, *tangents):
+    def jvp(ctx: Any, _scene: None, _names: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
         call, lib = ctx.call, ctx.call.lib
         inputs = {n: _plain(lib, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
@@ -256,6 +273,6 @@ class _Bridge(torch.autograd.Function):
         return tuple(dr.grad(images[name]).torch().clone() for name in call.result_names)
 
 
-def _plain(lib, x):
+def _plain(lib: ModuleType, x: torch.Tensor) -> Any:
     """As a Dr.Jit tensor: the values below any `torch.func` wrapper."""
     return runtime.unwrapped(x, lambda values: to_drjit(lib, values))

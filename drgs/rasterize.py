@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -162,20 +163,30 @@ def rasterization(
                     None if behind_b is None else behind_b[b, c],
                 )
             )
-    stacked = [torch.stack(x).reshape(*lead, count, *x[0].shape) for x in zip(*(v[:2] for v in made), strict=True)]
-    meta = {
+    images, alphas = (
+        torch.stack(x).reshape(*lead, count, *x[0].shape) for x in zip(*(v[:2] for v in made), strict=True)
+    )
+    meta: dict[str, Any] = {
         name: torch.stack([v[2][name] for v in made]).reshape(*lead, count, *made[0][2][name].shape)
         for name in made[0][2]
     }
     meta |= {"width": width, "height": height, "n_batches": math.prod(lead), "n_cameras": count}
-    return *stacked, meta
+    return images, alphas, meta
 
 
-def _view(splats: Splats, camera: Camera, settings, mode: str, antialiased: bool, limits, background):
+def _view(
+    splats: Splats,
+    camera: Camera,
+    settings: RenderSettings,
+    mode: str,
+    antialiased: bool,
+    limits: tuple[float, float],
+    background: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
     """One image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
     far, clip = limits
     meta, compensation = _projected(splats, camera, settings, antialiased)
-    if antialiased:
+    if compensation is not None:
         splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
     meta["opacities"] = splats.opacities.detach().to(splats.means.dtype)
     # A Gaussian that is left out must not be drawn: the renderer itself knows no far plane and no smallest radius.
@@ -194,7 +205,7 @@ def _view(splats: Splats, camera: Camera, settings, mode: str, antialiased: bool
         if out.features is not None:
             color = torch.cat([color, out.features], -1)
         channels.append(color if background is None else color + (1 - alpha) * background)
-    if "D" in mode:
+    if out.depth is not None:
         depth = out.depth[..., None]
         if settings.response != "ewa":
             depth = depth * _z_of_rays(camera).to(depth)  # along the ray -> along the axis
@@ -203,14 +214,16 @@ def _view(splats: Splats, camera: Camera, settings, mode: str, antialiased: bool
     return torch.cat(channels, -1).to(kind), alpha.to(kind), meta
 
 
-def _projected(splats: Splats, camera: Camera, settings: RenderSettings, antialiased: bool):
+def _projected(
+    splats: Splats, camera: Camera, settings: RenderSettings, antialiased: bool
+) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
     """gsplat's `meta` of a view, without a graph, and the compensation of opacities, (N,), with one.
 
     Sigma' = J W Sigma W^T J^T, J the derivative of the projection at the mean, its slopes clamped where the settings
     clamp them.
     """
     with torch.set_grad_enabled(antialiased and torch.is_grad_enabled()):
-        like = {"dtype": torch.float64, "device": splats.means.device}
+        like: dict[str, Any] = {"dtype": torch.float64, "device": splats.means.device}
         w2c = torch.as_tensor(camera.w2c).to(**like)
         fx, skew, cx, fy, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
         x, y, z = (splats.means.to(**like) @ w2c[:3, :3].T + w2c[:3, 3]).unbind(1)
@@ -288,6 +301,6 @@ def _refuse(**asked: bool) -> None:
             raise NotImplementedError(f"rasterization: {name} is not supported; {_INSTEAD.get(name, _RAYS)}")
 
 
-def _one_of(name: str, value, allowed: Sequence[str]) -> None:
+def _one_of(name: str, value: str, allowed: Sequence[str]) -> None:
     if value not in allowed:
         raise ValueError(f"rasterization: {name} must be one of {', '.join(allowed)}, got {value!r}")

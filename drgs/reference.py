@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.utils.checkpoint import checkpoint
@@ -68,8 +68,8 @@ class Output:
 
 
 def render(
-    g,
-    cam,
+    g: Any,
+    cam: Any,
     settings: RenderSettings,
     rays: tuple[torch.Tensor, torch.Tensor] | None = None,
     tolerance: float = 1e-5,
@@ -134,7 +134,7 @@ def render(
         else:
             parts.append(_composite(*args))
     seen = sum(part.pop("visibility") for part in parts)
-    fields = dict.fromkeys(parts[0])
+    fields: dict[str, Any] = dict.fromkeys(parts[0])
     for name in (name for name in fields if parts[0][name] is not None):
         joined = torch.cat([part[name] for part in parts])
         fields[name] = joined.reshape(*view.shape, *joined.shape[1:])
@@ -142,7 +142,14 @@ def render(
     return Output(visibility=seen, **fields)
 
 
-def _project(scene: SimpleNamespace, cam, rotation, center, s: RenderSettings, tolerance: float) -> tuple:
+def _project(
+    scene: SimpleNamespace,
+    cam: Any,
+    rotation: torch.Tensor,
+    center: torch.Tensor,
+    s: RenderSettings,
+    tolerance: float,
+) -> tuple:
     """Projected means (N, 2), rows of J W R S (N, 2, 3), diagonal of Sigma' (N, 2), tile bounds.
 
     Tile bounds: three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by
@@ -175,7 +182,13 @@ def _project(scene: SimpleNamespace, cam, rotation, center, s: RenderSettings, t
     return mean2d, rows, diagonal, bounds
 
 
-def _in_window(scene: SimpleNamespace, s: RenderSettings, view, window, tolerance: float) -> SimpleNamespace:
+def _in_window(
+    scene: SimpleNamespace,
+    s: RenderSettings,
+    view: SimpleNamespace,
+    window: tuple[int, int, int, int],
+    tolerance: float,
+) -> SimpleNamespace:
     """Without the Gaussians that are cut off on every ray of the window, near misses kept."""
     if not s.planar:
         return take(scene, within(scene, scene.extent * (1 + 2 * tolerance), view.origins, view.directions))
@@ -193,7 +206,15 @@ def _in_window(scene: SimpleNamespace, s: RenderSettings, view, window, toleranc
     return SimpleNamespace(**{**vars(take(scene, keep)), "screen": screen})
 
 
-def _responses(scene: SimpleNamespace, s: RenderSettings, rotation, center, o, d, pixels) -> tuple:
+def _responses(
+    scene: SimpleNamespace,
+    s: RenderSettings,
+    rotation: torch.Tensor,
+    center: torch.Tensor | None,
+    o: torch.Tensor,
+    d: torch.Tensor,
+    pixels: torch.Tensor,
+) -> tuple:
     """What is known of (P, N) pairs before ordering.
 
     Returns: a, 1 - a, t; and without gradient: order key, exists (bool), margin (relative distance
@@ -212,7 +233,7 @@ def _responses(scene: SimpleNamespace, s: RenderSettings, rotation, center, o, d
         distance = away.norm(dim=-1)
         exists, margin = torch.ones_like(over), torch.full_like(a, math.inf)
 
-        def cut(inside, relative):
+        def cut(inside: torch.Tensor, relative: torch.Tensor) -> None:
             exists.logical_and_(inside)
             margin.copy_(torch.minimum(margin, relative))
 
@@ -243,7 +264,15 @@ class _Peak:
 
     front_only = True
 
-    def meet(self, scene, s, rotation, away, d, pixels) -> tuple:
+    def meet(
+        self,
+        scene: SimpleNamespace,
+        s: RenderSettings,
+        rotation: torch.Tensor,
+        away: torch.Tensor,
+        d: torch.Tensor,
+        pixels: torch.Tensor,
+    ) -> tuple:
         """rho^2, t* and |d'| of (P, N) pairs, from the equations at the top of this page."""
         local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
         slope = torch.einsum("nij,pj->pni", scene.whiten, d)
@@ -251,12 +280,12 @@ class _Peak:
         t = -(local * slope).sum(-1) / length2
         return torch.linalg.cross(local, slope).square().sum(-1) / length2, t, length2.sqrt()
 
-    def opacity(self, scene, rho2, t, length) -> tuple:
+    def opacity(self, scene: SimpleNamespace, rho2: torch.Tensor, t: torch.Tensor, length: torch.Tensor) -> tuple:
         """a and 1 - a, neither by a difference that cancels."""
         alpha = torch.sigmoid(scene.logits)
         return alpha * torch.exp(-rho2 / 2), torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
 
-    def key(self, t):
+    def key(self, t: torch.Tensor) -> torch.Tensor:
         """What orders hits along a ray."""
         return t
 
@@ -266,14 +295,14 @@ class _Integral(_Peak):
 
     front_only = False
 
-    def opacity(self, scene, rho2, t, length) -> tuple:
+    def opacity(self, scene: SimpleNamespace, rho2: torch.Tensor, t: torch.Tensor, length: torch.Tensor) -> tuple:
         """a and 1 - a."""
         softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
         behind = torch.special.erfc(-t * length / math.sqrt(2)) / 2
         tau = softplus * torch.exp(-rho2 / 2) * behind
         return -torch.expm1(-tau), torch.exp(-tau)
 
-    def key(self, t):
+    def key(self, t: torch.Tensor) -> torch.Tensor:
         """What counts of a peak behind the origin lies in front of it: at the origin, therefore."""
         return t.clamp(min=0)
 
@@ -283,7 +312,15 @@ class _Ewa(_Peak):
 
     front_only = False
 
-    def meet(self, scene, s, rotation, away, d, pixels) -> tuple:
+    def meet(
+        self,
+        scene: SimpleNamespace,
+        s: RenderSettings,
+        rotation: torch.Tensor,
+        away: torch.Tensor,
+        d: torch.Tensor,
+        pixels: torch.Tensor,
+    ) -> tuple:
         """rho^2 and the Gaussian's own depth; there is no d'."""
         mean2d, rows, diagonal, _ = scene.screen
         dx, dy = (pixels[:, None, :] - mean2d).unbind(-1)
@@ -300,7 +337,18 @@ class _Ewa(_Peak):
 _FORMS = {"peak": _Peak(), "integral": _Integral(), "ewa": _Ewa()}
 
 
-def _composite(scene, s: RenderSettings, rotation, center, o, d, pixels, tolerance, exact_ties, effect) -> dict:
+def _composite(
+    scene: SimpleNamespace,
+    s: RenderSettings,
+    rotation: torch.Tensor,
+    center: torch.Tensor | None,
+    o: torch.Tensor,
+    d: torch.Tensor,
+    pixels: torch.Tensor,
+    tolerance: float,
+    exact_ties: bool,
+    effect: float,
+) -> dict:
     """The fields of `Output` for one chunk of rays."""
     a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels)
     # Near misses are sorted in, without effect, to see what they would have done.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from typing import Literal
+from typing import Any, Literal
 
 from drgs.guards.arguments import check_fields, must_be
 
@@ -84,7 +84,7 @@ class RenderSettings:
     sh_direction: Literal["gaussian", "ray"] = "gaussian"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields("RenderSettings", self, _RANGES)
         for name in ("extent", "alpha_max"):
             if getattr(self, name) == 0:
@@ -99,7 +99,7 @@ class RenderSettings:
         return self.response in _PLANAR
 
     @classmethod
-    def preset(cls, name: str, **overrides) -> RenderSettings:
+    def preset(cls, name: str, **overrides: Any) -> RenderSettings:
         """Settings of a named system.
 
         `exact` is the claim of this package: within 1e-5 of the float64 oracle. `fast` has the cut-offs of Mitsuba's
@@ -113,7 +113,7 @@ class RenderSettings:
         Raises:
             ValueError: If the name or a field is unknown.
         """
-        table = {
+        table: dict[str, dict[str, Any]] = {
             "exact": {"order": "ray"},
             "fast": {"extent": 3.0, "transmittance_min": 0.01, "alpha_max": 0.9999},
             "mitsuba": {
@@ -156,7 +156,7 @@ class RenderSettings:
             raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
         return cls().replace(**{**table[name], **overrides})
 
-    def replace(self, **fields) -> RenderSettings:
+    def replace(self, **fields: Any) -> RenderSettings:
         """A copy with the given fields replaced; unknown names raise ValueError."""
         known = {f.name for f in dataclasses.fields(self)}
         unknown = sorted(set(fields) - known)

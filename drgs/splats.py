@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import torch
 
@@ -66,8 +66,8 @@ class Splats:
 
     def take(self, index: torch.Tensor) -> Splats:
         """Those at `index`."""
-        parts = (getattr(self, f.name)[index] for f in dataclasses.fields(self) if f.name != "degree")
-        return Splats(*parts, self.degree)
+        parts: dict[str, Any] = {name: x[index] for name, x in vars(self).items() if name != "degree"}
+        return Splats(**parts, degree=self.degree)
 
     def gaussians(self, with_color: bool = True) -> tuple[Gaussians, float]:
         """Raw parameters, and what was added to the first three channels to keep them above the clamp."""
@@ -112,10 +112,10 @@ def scene_of(where: str, splats: SplatTensors) -> SplatScene:
         raise ArgumentError(f"{where}: tensors must be among {', '.join(known)}, got {unknown[0]}; drop it")
     if missing := [name for name in known if name not in splats and name not in optional]:
         raise ArgumentError(f"{where}: tensors must include {missing[0]}, as drgs.rasterization takes it; pass it")
-    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
     degree, backgrounds = splats.get("sh_degree"), splats.get("backgrounds")
-    lead, count = check_shapes(where, *(splats[name] for name in names), degree, backgrounds)
-    colors = splats["colors"]
+    colors, viewmats, Ks = splats["colors"], splats["viewmats"], splats["Ks"]
+    parts = (splats["means"], splats["quats"], splats["scales"], splats["opacities"], colors)
+    lead, count = check_shapes(where, *parts, viewmats, Ks, degree, backgrounds)
     if lead or colors.ndim != (2 if degree is None else 3):
         raise ArgumentError(
             f"{where}: tensors must be of one scene whose colors are the same in every view, got means of shape "
@@ -123,7 +123,7 @@ def scene_of(where: str, splats: SplatTensors) -> SplatScene:
         )
     scales, opacities = inside(where, splats["scales"], splats["opacities"])
     gaussians, shift = Splats(splats["means"], splats["quats"], scales, opacities, colors, degree).gaussians()
-    cameras = cameras_of(splats["viewmats"], splats["Ks"], splats["width"], splats["height"])
+    cameras = cameras_of(viewmats, Ks, splats["width"], splats["height"])
     behind = torch.zeros(count, 3) if backgrounds is None else backgrounds[:, :3].detach()  # settings are no parameters
     behind = torch.nn.functional.pad(behind, (0, 3 - behind.shape[1])) + shift
     channels = min(3, colors.shape[-1])
@@ -204,12 +204,12 @@ def check_shapes(
         )
     lead, n, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
     if degree is None:
-        shown = [(n, "D"), (cameras, n, "D")]
+        shown: list[tuple] = [(n, "D"), (cameras, n, "D")]
     else:
         if degree not in (0, 1, 2, 3):
             raise ValueError(f"{where}: sh_degree must be None or 0 to 3, got {degree!r}")
         shown = [(n, "K", 3), (cameras, n, "K", 3)]
-    wanted = {"quats": [(n, 4)], "scales": [(n, 3)], "opacities": [(n,)], "colors": shown}
+    wanted: dict[str, list[tuple]] = {"quats": [(n, 4)], "scales": [(n, 3)], "opacities": [(n,)], "colors": shown}
     wanted |= {"viewmats": [(cameras, 4, 4)], "Ks": [(cameras, 3, 3)]}
     if backgrounds is not None:
         wanted["backgrounds"] = [(cameras, 3 if degree is not None else colors.shape[-1])]

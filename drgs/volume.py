@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.utils.checkpoint import checkpoint
@@ -111,8 +112,8 @@ class _Line:
 
 
 def render_volume(
-    g,
-    cam,
+    g: Any,
+    cam: Any,
     settings: RenderSettings | None = None,
     rays: tuple[torch.Tensor, torch.Tensor] | None = None,
     *,
@@ -164,14 +165,22 @@ def render_volume(
         _chunk(scene, reach, s, view.origins[i : i + _RAYS], view.directions[i : i + _RAYS], tolerance, split)
         for i in range(0, max(len(view.directions), 1), _RAYS)
     ]
-    fields = {}
+    fields: dict[str, Any] = {}
     for name in parts[0]:
         joined = torch.cat([part[name] for part in parts])
         fields[name] = joined.reshape(*view.shape, *joined.shape[1:])
     return Volume(**{"features": None, **fields})
 
 
-def _chunk(scene: SimpleNamespace, reach, s: RenderSettings, o, d, tolerance: float, split: int) -> dict:
+def _chunk(
+    scene: SimpleNamespace,
+    reach: torch.Tensor,
+    s: RenderSettings,
+    o: torch.Tensor,
+    d: torch.Tensor,
+    tolerance: float,
+    split: int,
+) -> dict[str, torch.Tensor]:
     """The fields of `Volume` for a few rays."""
     keep = within(scene, reach, o, d)
     index = torch.nonzero(keep)[:, 0]
@@ -186,7 +195,7 @@ def _chunk(scene: SimpleNamespace, reach, s: RenderSettings, o, d, tolerance: fl
         index, used = index[order], used.gather(1, order)
     differentiate = torch.is_grad_enabled()
 
-    def line(o, d):
+    def line(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, ...]:
         tau, t, slope = _meet(scene, index, o, d)
         colors = scene.colors[index] if scene.colors is not None else None
         if colors is None:
@@ -234,7 +243,9 @@ def _phi(u: torch.Tensor) -> torch.Tensor:
     return torch.special.erfc(-u / math.sqrt(2)) / 2
 
 
-def _meet(scene: SimpleNamespace, index, o, d) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _meet(
+    scene: SimpleNamespace, index: torch.Tensor, o: torch.Tensor, d: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """tau, t*, |d'| of (P, M) pairs of ray and Gaussian."""
     whiten = scene.whiten[index]
     local = torch.einsum("pnij,pnj->pni", whiten, o[:, None, :] - scene.means[index])
@@ -291,7 +302,7 @@ def _plan(line: _Line, tolerance: float) -> tuple:
     return ray, a, h, error, nodes
 
 
-def _depths(line: _Line, ray, a, h) -> tuple[torch.Tensor, torch.Tensor]:
+def _depths(line: _Line, ray: torch.Tensor, a: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Optical depth (Q, M) of each Gaussian from the camera to a, and from a to a + h."""
     tau, slope = line.tau[ray], line.slope[ray]
     offset = a[:, None] - line.t[ray]
@@ -299,7 +310,9 @@ def _depths(line: _Line, ray, a, h) -> tuple[torch.Tensor, torch.Tensor]:
     return tau * (at - line.start[ray]), tau * (_phi((offset + h[:, None]) * slope) - at)
 
 
-def _batches(line: _Line, ray, a, h, inside=None):
+def _batches(
+    line: _Line, ray: torch.Tensor, a: torch.Tensor, h: torch.Tensor, inside: torch.Tensor | None = None
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yields (index into the intervals, (Q, A) the Gaussians that change T within them, -1 where fewer)."""
     step = max(1, _PAIRS // max(line.tau.shape[1], 1))
     for i in range(0, len(ray), step):
@@ -317,12 +330,19 @@ def _batches(line: _Line, ray, a, h, inside=None):
             first += len(chosen)
 
 
-def _size(count) -> int:
+def _size(count: int | torch.Tensor) -> int:
     """Intervals at once where each has so many Gaussians."""
     return max(1, _PAIRS // (4 * len(_NODES) * max(int(count), 8)))
 
 
-def _integrate(line: _Line, ray, a, h, active, before=None) -> tuple[torch.Tensor, torch.Tensor]:
+def _integrate(
+    line: _Line,
+    ray: torch.Tensor,
+    a: torch.Tensor,
+    h: torch.Tensor,
+    active: torch.Tensor,
+    before: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """int T s v dt of Q intervals by both rules, (2, Q, C), and int T s t dt (Q,).
 
     Args:
