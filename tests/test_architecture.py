@@ -52,12 +52,6 @@ UPWARD: dict[tuple[str, str], str] = {}
 # Modules that may `import drgs`: the program itself.
 FACADE = {"cli"}
 FACADE_STILL = {
-    "commands.demo",
-    "commands.forecast",
-    "commands.orbits",
-    "commands.render",
-    "lab.tradeoff",
-    "lab.tradeoff_full",
     "runtime",
 }
 
@@ -69,9 +63,6 @@ TOO_LONG = {
 }
 
 UNDOCUMENTED = {
-    "commands.demo._make_demo",
-    "commands.render._check_numbers",
-    "commands.stress._write",
     "lab.conventions._parameters",
     "lab.rasterizers._dump",
     "lab.tradeoff._compare",

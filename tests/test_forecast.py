@@ -23,7 +23,7 @@ def test_forecast_is_right_where_time_is_linear(monkeypatch):
         clock[0] += 2 + 1e-3 * camera.width * camera.height
         return types.SimpleNamespace(rgb=torch.zeros(1))
 
-    monkeypatch.setattr("drgs.render", render, raising=False)
+    monkeypatch.setattr(forecast, "render", render)
     monkeypatch.setattr(forecast, "time", types.SimpleNamespace(perf_counter=lambda: clock[0]))
     cameras = [*orbit((0, 0, 0), 3.0, 3, width=64, height=48), *orbit((0, 0, 0), 3.0, 1, width=7, height=1)]
     expected = 4 * 2 + 1e-3 * (3 * 64 * 48 + 7)

@@ -328,7 +328,7 @@ def test_a_step_that_raises_is_skipped(place, monkeypatch):
             raise RuntimeError("no\nluck")
         return real(g, camera, settings, outputs)
 
-    monkeypatch.setattr("drgs.render", fails)
+    monkeypatch.setattr("drgs.lab.tradeoff.render", fails)
     assert command(place, place / "fails", "--repeats", 1) == 0
     found = rows(json.loads((place / "fails" / "tradeoff.json").read_text()))
     assert found["fast"]["skipped"] == "no luck"

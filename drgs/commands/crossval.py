@@ -12,20 +12,18 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import check_file, claim
-from drgs.lab import rasterizers
+from drgs.lab import ladder, rasterizers
+from drgs.lab.crossval import Result, crossval
+from drgs.lab.report import html
 
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval
-    from drgs.lab.crossval import Result
 
 __all__ = ["run"]
 
 
 def run(args: Crossval) -> int:
     """`drgs crossval SCENE`: 1 if a gradient is wrong, or, with --strict, if anything is not as the preset has it."""
-    from drgs.lab.crossval import crossval
-    from drgs.lab.report import html
-
     check_counts(args)
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
@@ -53,8 +51,6 @@ def run(args: Crossval) -> int:
         report = {"schema": SCHEMA, "command": "crossval", "scene": str(args.scene), "source": source} | result.report
         table = ""
         if args.ladder:
-            from drgs.lab import ladder
-
             advance("ladder")
             report["ladder"] = ladder.ladder(result.gaussians, result.cameras, result.model.settings, seed=args.seed)
             table = ladder.table(report["ladder"])

@@ -16,19 +16,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-import drgs
-from drgs import metrics, runtime
+from drgs import metrics, reference, runtime
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.data import load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
+from drgs.fitting.frames import Frame, load_frames
 from drgs.guards.outputs import Claim, claim
+from drgs.integrator import render
 from drgs.settings import RenderSettings
+from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
     from drgs.commands.options import Demo
     from drgs.ellipsoids import Gaussians
-    from drgs.fitting.frames import Frame
 
 __all__ = ["Plan", "make_demo", "run"]
 
@@ -100,9 +102,7 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
 
 
 def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> dict:
-    from drgs.fitting.frames import load_frames
-    from drgs.train import FitConfig, fit
-
+    """The tour, in folders that belong to it: six stages, each timed, and demo.json at the end."""
     run_folder.check_all(_OWN)
     began, seconds = time.perf_counter(), {}
 
@@ -123,7 +123,7 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
     say(f"1. Still life: {plan.views} views of {plan.width}x{plan.height}, path traced from meshes ({took:.0f} s)")
 
     start = time.perf_counter()
-    dataset = drgs.data.load(data)
+    dataset = load(data)
     config = FitConfig(
         max_steps=plan.steps, max_gaussians=plan.gaussians, max_pixels=plan.width * plan.height, save_every=plan.steps
     )
@@ -229,7 +229,7 @@ def _draw(g: Gaussians, camera: Camera, settings: RenderSettings) -> torch.Tenso
     import drjit as dr
 
     with torch.no_grad():
-        image = drgs.render(g, camera, settings, outputs=()).rgb.cpu()
+        image = render(g, camera, settings, outputs=()).rgb.cpu()
     dr.sync_thread()
     return image
 
@@ -248,7 +248,7 @@ def _check(g: Gaussians, frame: Frame, image: torch.Tensor, crop: tuple[int, int
     K[:2, 2] -= x, y
     part = dataclasses.replace(camera, K=K, width=width, height=height)
     with torch.no_grad():
-        truth = drgs.reference.render(g, part, RenderSettings.preset("exact"))
+        truth = reference.render(g, part, RenderSettings.preset("exact"))
     error = (image[y : y + height, x : x + width].double() - truth.rgb).abs()
     # Where two peaks are nearer than float32 can tell, either order is right: the oracle marks such pixels.
     error = error[~truth.ambiguous]

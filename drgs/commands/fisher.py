@@ -15,21 +15,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs import fisher
 from drgs.commands.given import Given
 from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, save_state, write_json
-from drgs.gain import variances
+from drgs.fisher import Information
+from drgs.gain import Prior, check, information_gain, variances
 from drgs.guards.outputs import claim
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Fisher
     from drgs.ellipsoids import Gaussians
-    from drgs.fisher import Information
-    from drgs.gain import Prior
     from drgs.settings import RenderSettings
 
 __all__ = ["map_weights", "run"]
@@ -37,9 +37,6 @@ __all__ = ["map_weights", "run"]
 
 def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
-    from drgs import fisher
-    from drgs.gain import Prior, check
-
     check_counts(args)
     args.settings()  # refuses what cannot be, before anything is read
     prior = Prior(value=args.prior, relative=args.relative_prior)
@@ -114,9 +111,6 @@ def _view(
     args: Fisher, g: Gaussians, camera: Camera, settings: RenderSettings, name: str, H: Information, prior: Prior
 ) -> dict:
     """Maps of one view, and what it says."""
-    from drgs import fisher
-    from drgs.gain import information_gain
-
     Hc = fisher.diagonal(g, camera, settings, args.method)
     row = {"name": camera.name, "camera": described(camera), "files": []}
     row["gain"] = {c: information_gain(Hc, H, c, prior).total for c in ("logdet", "eig")}

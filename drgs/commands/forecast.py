@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-import drgs
 from drgs.display.progress import Bar
+from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -36,7 +36,7 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
         K[1, 2] -= int(place * max(first.height - height, 0))
         began = time.perf_counter()
         with torch.no_grad():
-            drgs.render(gaussians, dataclasses.replace(first, K=K, height=height), settings, ()).rgb.cpu().numpy()
+            render(gaussians, dataclasses.replace(first, K=K, height=height), settings, ()).rgb.cpu().numpy()
         return time.perf_counter() - began
 
     with Bar("how long it will take", len(_BANDS)) as bar:

@@ -15,9 +15,13 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.data.capture import Focus, path, upright
+from drgs.data.sizes import at_most
+from drgs.integrator import render
+from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -212,16 +216,11 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
     """A function that tells how far away what a camera looks at is: the nearer quarter of the distances in the middle
     of its picture, in scene units, or None where it sees nothing.
     """
-    import torch
-
-    import drgs
-    from drgs.data.sizes import at_most
-    from drgs.settings import RenderSettings
 
     def distance(camera: Camera) -> float | None:
         small = at_most(camera.undistorted(), _PROBE_PIXELS)
         with torch.no_grad():
-            out = drgs.render(gaussians, small, RenderSettings.preset("fast"), ("depth",))
+            out = render(gaussians, small, RenderSettings.preset("fast"), ("depth",))
         rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
         depth, alpha = out.depth[rows, columns].cpu().numpy(), out.alpha[rows, columns].cpu().numpy()
         solid = alpha > _OPAQUE

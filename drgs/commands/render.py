@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-import drgs
 from drgs import runtime
 from drgs.commands.forecast import forecast
 from drgs.commands.given import Given
@@ -28,6 +27,7 @@ from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
 from drgs.guards import memory
 from drgs.guards.outputs import claim
+from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -121,7 +121,7 @@ def render_views(
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
             began = time.perf_counter()
             with torch.no_grad():
-                out = drgs.render(gaussians, camera, settings, outputs)
+                out = render(gaussians, camera, settings, outputs)
             rgb, alpha = out.rgb.cpu().numpy(), out.alpha.cpu().numpy()
             seconds = time.perf_counter() - began
             files = []
@@ -176,6 +176,7 @@ def _formats(text: str) -> tuple[str, ...]:
 
 
 def _check_numbers(args: Render) -> None:
+    """Raise ValueError unless the numbers among the options, and those of orbits, are in their ranges."""
     for option, value, high in (
         ("--width", args.width, MAX_SIDE),
         ("--height", args.height, MAX_SIDE),

@@ -6,17 +6,20 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
 from drgs.commands.given import Given
 from drgs.commands.viewpoints import check_counts, known_views, other_views
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
+from drgs.gain import Prior
 from drgs.guards.outputs import check_file
+from drgs.select import Scoring, Selection, select
 
 if TYPE_CHECKING:
     from drgs.commands.options import Select
-    from drgs.select import Selection
 
 __all__ = ["print_table", "run"]
 
@@ -25,11 +28,6 @@ _SHORT = {"rotations": "rot.", "log_scales": "scales", "logit_opacities": "opac.
 
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
-    import torch
-
-    from drgs.gain import Prior
-    from drgs.select import Scoring, select
-
     check_counts(args)
     args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])

@@ -103,6 +103,7 @@ def markdown(found: list[Row]) -> list[str]:
 
 
 def _write(args: Stress, found: list[Row], seconds: float) -> None:
+    """stress.json, and stress.md with the table."""
     env = runtime.info()
     report = {
         "schema": SCHEMA,

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-import drgs
-from drgs import runtime
+from drgs import fisher, reference, runtime
+from drgs.integrator import render
 from drgs.lab.tradeoff_advice import interval
 from drgs.lab.tradeoff_rows import one_line, rows_of
 from drgs.settings import RenderSettings
@@ -128,7 +128,7 @@ class _Stage:
 
     def image(self, g, camera, settings, share):
         """(H, W, 3), whatever the share of its resolution that is rendered."""
-        out = drgs.render(g, _reduced(camera, share), settings, outputs=())
+        out = render(g, _reduced(camera, share), settings, outputs=())
         self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)
         if share == 1:
             return out.rgb
@@ -159,7 +159,7 @@ class _Stage:
 
     def information(self, camera, settings, share) -> dict:
         small = _reduced(camera, share)
-        found = drgs.fisher.diagonal(self.gaussians, small, settings)
+        found = fisher.diagonal(self.gaussians, small, settings)
         scale = camera.width * camera.height / (small.width * small.height)
         return {name: x * scale for name, x in found.items()} if share != 1 else found
 
@@ -324,7 +324,7 @@ def _tracer(stage: _Stage, settings, chosen, oracle: bool):
 
     def trace(g):
         if oracle:
-            return drgs.reference.render(g, camera, settings, rays=(origins, directions))
+            return reference.render(g, camera, settings, rays=(origins, directions))
         return render_rays(g, origins, directions, settings, outputs=())
 
     def forward():

@@ -14,8 +14,9 @@ from collections.abc import Callable
 
 import torch
 
-import drgs
+from drgs import fisher
 from drgs.data.sizes import at_most
+from drgs.integrator import render
 from drgs.lab.tradeoff import clocked, placed
 from drgs.lab.tradeoff_advice import interval, leaders
 from drgs.settings import RenderSettings
@@ -102,16 +103,16 @@ class _Work:
 
     def _forward(self, camera, settings):
         with torch.no_grad():
-            out = drgs.render(self.gaussians, camera, settings, outputs=())
+            out = render(self.gaussians, camera, settings, outputs=())
         return out.rgb.cpu(), out.alpha.cpu()  # as `drgs render` takes them
 
     def _forward_backward(self, camera, settings):
-        image = drgs.render(self.moving, camera, settings, outputs=()).rgb
+        image = render(self.moving, camera, settings, outputs=()).rgb
         signs = torch.randint(0, 2, image.shape, generator=torch.Generator().manual_seed(self.seed)) * 2 - 1
         return torch.autograd.grad((image * signs.to(image)).sum(), list(self.leaves.values()), allow_unused=True)
 
     def _fisher(self, camera, settings):
-        return drgs.fisher.diagonal(self.gaussians, camera, settings)
+        return fisher.diagonal(self.gaussians, camera, settings)
 
 
 def _sized(work: _Work, cameras: list, exact: dict, pixels: float, seconds: float, units: float, say) -> tuple:
