@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from drgs.guards.doors import check_oracle
@@ -143,12 +144,7 @@ def render(
 
 
 def _project(
-    scene: SimpleNamespace,
-    cam: Any,
-    rotation: torch.Tensor,
-    center: torch.Tensor,
-    s: RenderSettings,
-    tolerance: float,
+    scene: SimpleNamespace, cam: Any, rotation: Tensor, center: Tensor, s: RenderSettings, tolerance: float
 ) -> tuple:
     """Projected means (N, 2), rows of J W R S (N, 2, 3), diagonal of Sigma' (N, 2), tile bounds.
 
@@ -209,11 +205,11 @@ def _in_window(
 def _responses(
     scene: SimpleNamespace,
     s: RenderSettings,
-    rotation: torch.Tensor,
-    center: torch.Tensor | None,
-    o: torch.Tensor,
-    d: torch.Tensor,
-    pixels: torch.Tensor,
+    rotation: Tensor,
+    center: Tensor | None,
+    o: Tensor,
+    d: Tensor,
+    pixels: Tensor,
 ) -> tuple:
     """What is known of (P, N) pairs before ordering.
 
@@ -233,7 +229,7 @@ def _responses(
         distance = away.norm(dim=-1)
         exists, margin = torch.ones_like(over), torch.full_like(a, math.inf)
 
-        def cut(inside: torch.Tensor, relative: torch.Tensor) -> None:
+        def cut(inside: Tensor, relative: Tensor) -> None:
             exists.logical_and_(inside)
             margin.copy_(torch.minimum(margin, relative))
 
@@ -265,13 +261,7 @@ class _Peak:
     front_only = True
 
     def meet(
-        self,
-        scene: SimpleNamespace,
-        s: RenderSettings,
-        rotation: torch.Tensor,
-        away: torch.Tensor,
-        d: torch.Tensor,
-        pixels: torch.Tensor,
+        self, scene: SimpleNamespace, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
     ) -> tuple:
         """rho^2, t* and |d'| of (P, N) pairs, from the equations at the top of this page."""
         local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
@@ -280,12 +270,12 @@ class _Peak:
         t = -(local * slope).sum(-1) / length2
         return torch.linalg.cross(local, slope).square().sum(-1) / length2, t, length2.sqrt()
 
-    def opacity(self, scene: SimpleNamespace, rho2: torch.Tensor, t: torch.Tensor, length: torch.Tensor) -> tuple:
+    def opacity(self, scene: SimpleNamespace, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a, neither by a difference that cancels."""
         alpha = torch.sigmoid(scene.logits)
         return alpha * torch.exp(-rho2 / 2), torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
 
-    def key(self, t: torch.Tensor) -> torch.Tensor:
+    def key(self, t: Tensor) -> Tensor:
         """What orders hits along a ray."""
         return t
 
@@ -295,14 +285,14 @@ class _Integral(_Peak):
 
     front_only = False
 
-    def opacity(self, scene: SimpleNamespace, rho2: torch.Tensor, t: torch.Tensor, length: torch.Tensor) -> tuple:
+    def opacity(self, scene: SimpleNamespace, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a."""
         softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
         behind = torch.special.erfc(-t * length / math.sqrt(2)) / 2
         tau = softplus * torch.exp(-rho2 / 2) * behind
         return -torch.expm1(-tau), torch.exp(-tau)
 
-    def key(self, t: torch.Tensor) -> torch.Tensor:
+    def key(self, t: Tensor) -> Tensor:
         """What counts of a peak behind the origin lies in front of it: at the origin, therefore."""
         return t.clamp(min=0)
 
@@ -313,13 +303,7 @@ class _Ewa(_Peak):
     front_only = False
 
     def meet(
-        self,
-        scene: SimpleNamespace,
-        s: RenderSettings,
-        rotation: torch.Tensor,
-        away: torch.Tensor,
-        d: torch.Tensor,
-        pixels: torch.Tensor,
+        self, scene: SimpleNamespace, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
     ) -> tuple:
         """rho^2 and the Gaussian's own depth; there is no d'."""
         mean2d, rows, diagonal, _ = scene.screen
@@ -340,11 +324,11 @@ _FORMS = {"peak": _Peak(), "integral": _Integral(), "ewa": _Ewa()}
 def _composite(
     scene: SimpleNamespace,
     s: RenderSettings,
-    rotation: torch.Tensor,
-    center: torch.Tensor | None,
-    o: torch.Tensor,
-    d: torch.Tensor,
-    pixels: torch.Tensor,
+    rotation: Tensor,
+    center: Tensor | None,
+    o: Tensor,
+    d: Tensor,
+    pixels: Tensor,
     tolerance: float,
     exact_ties: bool,
     effect: float,
@@ -406,6 +390,6 @@ def _composite(
     }
 
 
-def _previous(x: torch.Tensor, first: float) -> torch.Tensor:
+def _previous(x: Tensor, first: float) -> Tensor:
     """(P, n) shifted by one along the order."""
     return torch.cat([torch.full_like(x[:, :1], first), x[:, :-1]], dim=1)

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from drgs.guards.doors import check_oracle
@@ -173,14 +174,8 @@ def render_volume(
 
 
 def _chunk(
-    scene: SimpleNamespace,
-    reach: torch.Tensor,
-    s: RenderSettings,
-    o: torch.Tensor,
-    d: torch.Tensor,
-    tolerance: float,
-    split: int,
-) -> dict[str, torch.Tensor]:
+    scene: SimpleNamespace, reach: Tensor, s: RenderSettings, o: Tensor, d: Tensor, tolerance: float, split: int
+) -> dict[str, Tensor]:
     """The fields of `Volume` for a few rays."""
     keep = within(scene, reach, o, d)
     index = torch.nonzero(keep)[:, 0]
@@ -195,7 +190,7 @@ def _chunk(
         index, used = index[order], used.gather(1, order)
     differentiate = torch.is_grad_enabled()
 
-    def line(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def line(o: Tensor, d: Tensor) -> tuple[Tensor, ...]:
         tau, t, slope = _meet(scene, index, o, d)
         colors = scene.colors[index] if scene.colors is not None else None
         if colors is None:
@@ -238,14 +233,12 @@ def _chunk(
     return out if scene.features is None else {**out, "features": total[:, 4:]}
 
 
-def _phi(u: torch.Tensor) -> torch.Tensor:
+def _phi(u: Tensor) -> Tensor:
     """The normal distribution function; its lower tail keeps its digits."""
     return torch.special.erfc(-u / math.sqrt(2)) / 2
 
 
-def _meet(
-    scene: SimpleNamespace, index: torch.Tensor, o: torch.Tensor, d: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _meet(scene: SimpleNamespace, index: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """tau, t*, |d'| of (P, M) pairs of ray and Gaussian."""
     whiten = scene.whiten[index]
     local = torch.einsum("pnij,pnj->pni", whiten, o[:, None, :] - scene.means[index])
@@ -302,7 +295,7 @@ def _plan(line: _Line, tolerance: float) -> tuple:
     return ray, a, h, error, nodes
 
 
-def _depths(line: _Line, ray: torch.Tensor, a: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _depths(line: _Line, ray: Tensor, a: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
     """Optical depth (Q, M) of each Gaussian from the camera to a, and from a to a + h."""
     tau, slope = line.tau[ray], line.slope[ray]
     offset = a[:, None] - line.t[ray]
@@ -311,8 +304,8 @@ def _depths(line: _Line, ray: torch.Tensor, a: torch.Tensor, h: torch.Tensor) ->
 
 
 def _batches(
-    line: _Line, ray: torch.Tensor, a: torch.Tensor, h: torch.Tensor, inside: torch.Tensor | None = None
-) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    line: _Line, ray: Tensor, a: Tensor, h: Tensor, inside: Tensor | None = None
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Yields (index into the intervals, (Q, A) the Gaussians that change T within them, -1 where fewer)."""
     step = max(1, _PAIRS // max(line.tau.shape[1], 1))
     for i in range(0, len(ray), step):
@@ -330,19 +323,14 @@ def _batches(
             first += len(chosen)
 
 
-def _size(count: int | torch.Tensor) -> int:
+def _size(count: int | Tensor) -> int:
     """Intervals at once where each has so many Gaussians."""
     return max(1, _PAIRS // (4 * len(_NODES) * max(int(count), 8)))
 
 
 def _integrate(
-    line: _Line,
-    ray: torch.Tensor,
-    a: torch.Tensor,
-    h: torch.Tensor,
-    active: torch.Tensor,
-    before: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    line: _Line, ray: Tensor, a: Tensor, h: Tensor, active: Tensor, before: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """int T s v dt of Q intervals by both rules, (2, Q, C), and int T s t dt (Q,).
 
     Args:
