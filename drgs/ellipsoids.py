@@ -22,7 +22,7 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = ["Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
+__all__ = ["DeformableScene", "Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
 
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
 # float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
@@ -60,6 +60,17 @@ class Scene(Protocol):
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """The tensors, by name, that `at` computes from and that an optimizer may change."""
+
+
+@runtime_checkable
+class DeformableScene(Scene, Protocol):
+    """A scene whose Gaussians are a pure function of its parameters: these, too, have tangents and information.
+
+    `render_jvp` takes tangents named after `parameters()`, `fisher.diagonal` groups.
+    """
+
+    def deform(self, parameters: dict[str, torch.Tensor], time: float | None) -> Gaussians:
+        """`at(time)` of a scene with these parameters, by operations that `torch.func` differentiates in both modes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -24,11 +24,11 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.doors import camera_list, check_scene, check_view
-from drgs.information.groups import GROUPS, Group, Information, groups_of
+from drgs.guards.doors import camera_list, check_scene, check_view, gaussians_at
+from drgs.information.groups import GROUPS, Group, Information, groups_of, scene_groups
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.replay import Replay, by_probes
 from drgs.integrator import render_jvp
@@ -70,7 +70,7 @@ def diagonal(
     """The diagonal of J^T J, summed over views.
 
     Args:
-        gaussians: N Gaussians, world frame.
+        gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
         cameras: One or several; nothing of a view is kept but its sum.
         settings: Default `RenderSettings.preset("exact")`; of tensors `preset("gsplat")`, as in `drgs.rasterization`.
         method: `exact`: squares of every pixel's and channel's derivative, in one traversal after the primal one.
@@ -78,7 +78,8 @@ def diagonal(
             `probes`: mean of (J^T v)^2 over Rademacher v, unbiased, relative error about sqrt(2 / probes).
             `fisherrf`: what FisherRF's rasterizer computes: channels are summed before squaring, and the derivative of
             an activation is multiplied once instead of squared; no rotations.
-        groups: Those wanted; default all that the Gaussians have.
+        groups: Those wanted; default all that the Gaussians have. Of a `drgs.ellipsoids.DeformableScene` also the names
+            of its own parameters, such as the weights of a network (`columns`, `probes`).
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
         probes, seed: Of method `probes`.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
@@ -109,12 +110,19 @@ def diagonal(
         gaussians, cameras = scene.gaussians, scene.cameras
         backgrounds, channels = scene.backgrounds, scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
+    cameras, source = _cameras("fisher.diagonal", cameras), gaussians
+    gaussians = gaussians_at("fisher.diagonal", source, cameras[0])
     check_scene("fisher.diagonal", gaussians, settings)
     assert gaussians is not None, "for type checkers: the line above has refused it"
     settings = settings or RenderSettings.preset("exact")
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    cameras, wanted = _cameras("fisher.diagonal", cameras), groups_of(gaussians, groups)
+    wanted = groups_of(gaussians, groups, source)
+    own = {name: group for name, group in wanted.items() if group.owner == "scene"}
+    if own and method not in ("columns", "probes"):
+        raise ValueError(
+            f"fisher.diagonal: method of group {next(iter(own))!r} must be 'columns' or 'probes', got {method!r}"
+        )
     if method == "fisherrf":
         wanted = {name: group for name, group in wanted.items() if group.fisherrf}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in wanted.items()}
@@ -123,10 +131,15 @@ def diagonal(
             break
         if backgrounds:  # every view has its own
             settings = settings.replace(background=backgrounds[number])
+        gaussians = gaussians_at("fisher.diagonal", source, camera)
+        theirs = {name: group for name, group in wanted.items() if name not in own}
+        part = {}
         if method == "columns":
-            part = _by_columns(gaussians, camera, settings, wanted, weights)
+            part |= _by_columns(gaussians, camera, settings, theirs, weights)
+            part |= _by_columns(gaussians, camera, settings, own, weights, source)
         elif method == "probes":
-            part = by_probes(gaussians, camera, settings, wanted, weights, probes, seed + number)
+            part |= by_probes(gaussians, camera, settings, theirs, weights, probes, seed + number)
+            part |= by_probes(gaussians, camera, settings, own, weights, probes, seed + number, source) if own else {}
         else:
             part = Replay(gaussians, camera, settings).diagonal(wanted, weights, method == "fisherrf")
         for name in wanted:
@@ -219,11 +232,12 @@ def jacobian_columns(
     Raises:
         ValueError: If a group or an index is unknown.
     """
+    scene, gaussians = gaussians, gaussians_at("fisher.jacobian_columns", gaussians, camera)
     check_view("fisher.jacobian_columns", gaussians, camera, settings)
     must_be("fisher.jacobian_columns", "index", index, Mapping, 'e.g. {"camera": range(6)}')
     chosen = []
     for name, rows in index.items():
-        shape = _tangent_shape(gaussians, name)
+        shape = _tangent_shape(gaussians, name, scene)
         rows = np.asarray(rows, np.int64)
         rows = rows[:, None] if rows.ndim == 1 else rows
         if rows.ndim != 2 or rows.shape[1] != len(shape) or (rows < 0).any() or (rows >= shape).any():
@@ -237,9 +251,9 @@ def jacobian_columns(
         part = chosen[start : start + batch]
         tangents: dict[str, torch.Tensor] = {}
         for k, (name, at) in enumerate(part):
-            shape = _tangent_shape(gaussians, name)
+            shape = _tangent_shape(gaussians, name, scene)
             tangents.setdefault(name, torch.zeros(len(part), *shape, dtype=torch.float64))[(k, *at)] = 1
-        out = render_jvp(gaussians, camera, tangents, settings, outputs=())
+        out = render_jvp(scene, camera, tangents, settings, outputs=())
         images.append(out.rgb if out.features is None else torch.cat([out.rgb, out.features], -1))
     if images:
         return torch.cat(images)
@@ -275,11 +289,11 @@ def _weights(channel_weights: Sequence[float]) -> list[float]:
     return weights
 
 
-def _tangent_shape(gaussians: Gaussians, name: str) -> tuple[int, ...]:
+def _tangent_shape(gaussians: Gaussians, name: str, scene: Scene) -> tuple[int, ...]:
     """Of a group's tangent, or the pose's."""
     if name == "camera":
         return (6,)
-    known = groups_of(gaussians)
+    known = groups_of(gaussians) | scene_groups(scene)
     if name not in known:
         raise ValueError(f"fisher: a parameter group must be one of {', '.join(known)} or camera, got {name!r}")
     return known[name].tangent(gaussians)
@@ -291,8 +305,9 @@ def _by_columns(
     settings: RenderSettings,
     wanted: Mapping[str, Group],
     weights: Sequence[float],
+    scene: Scene | None = None,
 ) -> Information:
-    """From every column of the Jacobian."""
+    """From every column of the Jacobian, of Gaussians or of the scene that they come from."""
     result = {}
     width = 0 if gaussians.features is None else gaussians.features.shape[1]
     scale = torch.tensor([*weights, *[1.0] * width], dtype=torch.float64)
@@ -300,7 +315,8 @@ def _by_columns(
         shape, squares = group.tangent(gaussians), []
         rows = np.stack(np.unravel_index(np.arange(int(np.prod(shape))), shape), 1)
         for start in range(0, len(rows), _BATCH):
-            columns = jacobian_columns(gaussians, camera, {name: rows[start : start + _BATCH]}, settings).double()
+            index = {name: rows[start : start + _BATCH]}
+            columns = jacobian_columns(scene or gaussians, camera, index, settings).double()
             squares.append((columns.square() * scale)[..., slice(*group.outputs)].sum((1, 2, 3)))
         result[name] = group.merge(torch.cat(squares).reshape(shape).cpu())
     return result

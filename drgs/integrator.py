@@ -21,11 +21,12 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians, Scene
+from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
-from drgs.tracing.call import Call, Output, to_drjit
+from drgs.tracing.bridge import to_drjit
+from drgs.tracing.call import Call, Output
 from drgs.tracing.tangents import push_forward
 
 __all__ = ["OUTPUTS", "Output", "render", "render_jvp", "render_rays"]
@@ -99,18 +100,20 @@ def render_jvp(
         tangents: Name -> tangent of the raw parameter, shaped like it, optionally with a leading axis K (the same
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
-            the pose, rotation first: c2w <- exp(xi) c2w.
+            the pose, rotation first: c2w <- exp(xi) c2w. Of a `drgs.ellipsoids.DeformableScene` the names are those
+            of its `parameters()`, `camera`, and `rotations` where it has `quats`.
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried
         through one traversal.
     Raises:
         ValueError: If a name or shape is wrong.
     """
+    scene = gaussians if isinstance(gaussians, DeformableScene) else None
     gaussians = gaussians_at("render_jvp", gaussians, camera)
     check_view("render_jvp", gaussians, camera, settings)
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
-    call = Call(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"})
+    call = Call(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene)
     return push_forward(call, dict(tangents))
 
 

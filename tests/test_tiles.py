@@ -15,7 +15,8 @@ from drgs import reference, runtime
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 from drgs.tracing import tiles
-from drgs.tracing.call import Call, to_drjit
+from drgs.tracing.bridge import to_drjit
+from drgs.tracing.call import Call
 from drgs.tracing.records import pack_records
 from drgs.tracing.tiles import TILE, build
 

@@ -1,4 +1,8 @@
-"""Parameter groups of Fisher information. A group is one entry of `GROUPS`; nothing else asks for its name."""
+"""Parameter groups of Fisher information. A group is one entry of `GROUPS`; nothing else asks for its name.
+
+A group belongs to the Gaussians, as a view sees them, or to the scene that they come from: each tensor of a
+`DeformableScene` that is none of theirs, such as a weight of a network, is a group (`scene_groups`).
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,12 @@ from collections.abc import Callable
 
 import torch
 
+from drgs.ellipsoids import DeformableScene
 from drgs.gain import Information
 from drgs.information.jacobian import GEOMETRY
 from drgs.tracing.pose import quaternion_product
 
-__all__ = ["GROUPS", "Group", "Information", "groups_of"]
+__all__ = ["GROUPS", "Group", "Information", "groups_of", "scene_groups"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -19,9 +24,10 @@ class Group:
     """What a group is shaped like, and where its numbers come from.
 
     Attributes:
+        owner: `gaussians` or `scene`: of which of them `input` and the tangents are.
         shape: Gaussians -> shape of its information.
-        entries: What it is made from, of the sums of a replay (`jacobian.Diagonal`).
-        collect: (N, entries) sums, `Replay`, channel weights -> its information.
+        entries: What it is made from, of the sums of a replay (`jacobian.Diagonal`); empty where that knows nothing.
+        collect: (N, entries) sums, `Replay`, channel weights -> its information; None likewise.
         spread: Weights shaped like its information, `Replay` -> (N, entries or 3) weights of squares in a pixel
             (`jacobian.Variance`); None where a pixel's RGB do not depend on it.
         input: The tensor that reverse mode differentiates by.
@@ -34,9 +40,10 @@ class Group:
     """
 
     shape: Callable
-    entries: tuple[int, ...]
-    collect: Callable
     input: str
+    entries: tuple[int, ...] = ()
+    collect: Callable | None = None
+    owner: str = "gaussians"
     spread: Callable | None = None
     pull: Callable = lambda slope, _: slope
     fisherrf: Callable | None = lambda _: 1.0
@@ -99,10 +106,22 @@ GROUPS = {
         there=lambda g: g.features is not None,
     ),
 }
+_FIELDS = {group.input for group in GROUPS.values()}
 
 
-def groups_of(gaussians, wanted=None) -> dict[str, Group]:
-    """The groups that Gaussians have, or those of them that are wanted, in the order of `GROUPS`.
+def scene_groups(scene) -> dict[str, Group]:
+    """The groups of a scene besides those of its Gaussians: none, unless it is a `DeformableScene`."""
+    if not isinstance(scene, DeformableScene):
+        return {}
+    own = {name: tuple(x.shape) for name, x in scene.parameters().items() if name not in _FIELDS}
+    return {
+        name: Group(shape=lambda _, shape=shape: shape, input=name, owner="scene", fisherrf=None)
+        for name, shape in own.items()
+    }
+
+
+def groups_of(gaussians, wanted=None, scene=None) -> dict[str, Group]:
+    """The groups that Gaussians have, or those of them and of their scene that are wanted, in the order of `GROUPS`.
 
     Raises:
         ValueError: If one is wanted that they do not have.
@@ -110,6 +129,8 @@ def groups_of(gaussians, wanted=None) -> dict[str, Group]:
     if isinstance(wanted, str):
         wanted = (wanted,)
     there = {name: group for name, group in GROUPS.items() if group.there(gaussians)}
+    if wanted is not None:
+        there |= scene_groups(scene)
     for name in wanted or ():
         if name not in there:
             raise ValueError(f"fisher: groups must be among {', '.join(there)}, got {name!r}")

@@ -9,13 +9,14 @@ import torch
 
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
-from drgs.tracing.call import Call, to_drjit
+from drgs.tracing.bridge import to_drjit
+from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.pose import quaternion_product
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import DeformableScene, Gaussians
     from drgs.settings import RenderSettings
     from drgs.tracing.protocols import Sink
     from drgs.tracing.walk import Part
@@ -196,14 +197,27 @@ class Replay:
         return torch.stack([_torch(x) for x in self.basis], 1).square(), torch.stack([_torch(x) for x in self.lit], 1)
 
 
-def by_probes(gaussians, camera, settings, groups: dict, weights, probes: int, seed: int) -> Information:
-    """Mean of (J^T v)^2 over Rademacher images v of RGB; what only other channels tell about is exact."""
+def by_probes(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RenderSettings,
+    groups: dict,
+    weights,
+    probes: int,
+    seed: int,
+    scene: DeformableScene | None = None,
+) -> Information:
+    """Mean of (J^T v)^2 over Rademacher images v of RGB; what only other channels tell about is exact.
+
+    Args:
+        scene: Where the Gaussians come from: all groups are of this scene then.
+    """
     if probes < 1:
         raise ValueError(f"fisher.diagonal: probes must be >= 1, got {probes}")
     other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
     groups = {name: group for name, group in groups.items() if name not in other}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
-    call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset())
+    call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset(), scene=scene)
     lib, generator = call.lib, torch.Generator().manual_seed(seed)
     inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
     dr.enable_grad([inputs[group.input] for group in groups.values()])

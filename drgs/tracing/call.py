@@ -11,17 +11,20 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.guards import memory
 from drgs.guards.arguments import ArgumentError, kind_of
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
+from drgs.tracing.bridge import Field
 from drgs.tracing.composite import Composite, Compositor
 from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.pose import checked_pose, local_directions, shifted
 from drgs.tracing.tiles import TileTraversal
 
-__all__ = ["Call", "Carried", "Output", "numbers", "to_drjit"]
+__all__ = ["OF_VIEW", "Call", "Carried", "Output", "numbers"]
+
+OF_VIEW = ("w2c", "ray_origins", "ray_directions")  # inputs that follow from the pose
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,13 +65,29 @@ class Carried(NamedTuple):
 class Call:
     """One call of `render`.
 
+    Args:
+        gaussians: At the time of the view.
+        camera: None where there are rays.
+        want: Extra outputs: `depth`, `median`, `count`, `visibility`.
+        rays: Origins and directions, (..., 3) each, instead of the camera's.
+        scene: Where the Gaussians come from, if derivatives by its parameters are wanted instead of by theirs.
     Attributes:
-        inputs: Torch tensors by name: the raw parameters, `w2c` (12 floats), rays where they are traced.
+        inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, `w2c`
+            (12 floats), rays where they are traced.
+        field: From the scene's parameters to the Gaussians'; None for those of the Gaussians themselves.
         shape: Of the images: (H, W), or that of the rays.
         extra, certificate: Of the last `trace`: outputs without a derivative, and `Output.certificate`.
     """
 
-    def __init__(self, gaussians: Gaussians, camera: Camera | None, settings: RenderSettings, want, rays=None):
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        camera: Camera | None,
+        settings: RenderSettings,
+        want: frozenset,
+        rays=None,
+        scene: DeformableScene | None = None,
+    ):
         self.lib, self.settings, self.camera, self.want = runtime.dr_types(), settings, camera, want
         if settings.traversal == "tiles" and camera.is_distorted:
             raise NotImplementedError(
@@ -78,13 +97,16 @@ class Call:
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
         self._check_memory(gaussians, rays)
         gaussians.validate("render")
-        self.device = gaussians.means.device
+        self.device, middle = gaussians.means.device, None
         if settings.traversal == "bvh" and gaussians.means.dtype == torch.float64 and len(gaussians):
             # World records are float32, so a world far from 0 is moved there; where to has no derivative.
             middle = gaussians.means.detach().mean(0)
             origin = np.asarray(gaussians.origin, np.float64) + [float(x) for x in middle]
             gaussians = gaussians.replace(means=gaussians.means - middle, origin=origin)
-        self.inputs = {name: self._move(x) for name, x in gaussians.parameters().items()}
+        given = gaussians.parameters()
+        self.field = None if scene is None else Field(scene, camera.time, given, middle)
+        given = given if scene is None else scene.parameters()
+        self.inputs = {name: self._move(x) for name, x in given.items()}
         self.count, self.coefficients = len(gaussians), gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
         origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
@@ -139,7 +161,7 @@ class Call:
     def prepare(self, inputs: dict) -> tuple[Compositor, Carried]:
         """The `Compositor` of the view, and what it composites."""
         lib, s = self.lib, self.settings
-        p = {name: x.array for name, x in inputs.items()}
+        p = {name: x.array for name, x in self.fields(inputs).items()}
         along_ray = s.sh_direction == "ray"
         coefficients = 0 if along_ray else self.coefficients
         if s.traversal == "bvh":
@@ -157,6 +179,13 @@ class Call:
         sh = lib.Float(p["sh"]) if along_ray else None
         features = lib.Float(p["features"]) if self.width else None
         return compositor, Carried(projected.record, sh, features, carried)
+
+    def fields(self, inputs: dict) -> dict:
+        """Raw fields of the Gaussians by name, and what is known of the view: the inputs, through the field if any."""
+        if self.field is None:
+            return inputs
+        view = {name: x for name, x in inputs.items() if name in OF_VIEW}
+        return self.field(self.lib, {name: x for name, x in inputs.items() if name not in OF_VIEW}) | view
 
     def _carried(self, p: dict, along_ray: bool, world: bool) -> tuple[int, list]:
         """What rays carry: the SH basis where colors are evaluated along them, then o and d of world rays."""
@@ -200,11 +229,6 @@ class Call:
         flat = {"alpha": pixels, "features": pixels * self.width} | ({"depth": pixels} if "depth" in self.want else {})
         images = {name: zero.expand(size) for name, size in flat.items()}
         return {"rgb": zero + torch.tensor(self.settings.background, device=self.home).repeat(pixels), **images}
-
-
-def to_drjit(lib, x):
-    """A torch tensor as a Dr.Jit tensor of its precision; without its graph, which the call's bridge keeps."""
-    return (lib.TensorXf64 if x.dtype == torch.float64 else lib.TensorXf)(x.detach().contiguous())
 
 
 def numbers(what: str, x) -> torch.Tensor:

@@ -7,12 +7,11 @@ import torch
 
 from drgs.guards import memory
 from drgs.settings import EPS_ALPHA
-from drgs.tracing.call import Call, Output, numbers, to_drjit
+from drgs.tracing.bridge import to_drjit
+from drgs.tracing.call import OF_VIEW, Call, Output, numbers
 from drgs.tracing.pose import checked_pose, quaternion_product, shifted, turned, twisted
 
 __all__ = ["push_forward"]
-
-_OWN = ("w2c", "ray_origins", "ray_directions")  # inputs that follow from the pose, which `camera` moves
 
 
 def push_forward(call: Call, tangents: dict) -> Output:
@@ -35,8 +34,10 @@ def push_forward(call: Call, tangents: dict) -> Output:
 
 def _columns(call: Call, tangents: dict) -> tuple[list[dict], bool]:
     """K dicts of tangents of the inputs, and whether there was a leading axis."""
-    shapes = {name: tuple(x.shape) for name, x in call.inputs.items() if name not in _OWN}
-    shapes |= {"rotations": (call.count, 3), "camera": (6,)}
+    shapes = {name: tuple(x.shape) for name, x in call.inputs.items() if name not in OF_VIEW}
+    if "quats" in shapes:
+        shapes["rotations"] = (shapes["quats"][0], 3)
+    shapes["camera"] = (6,)
     lengths, given = set(), {}
     for name, x in tangents.items():
         if name not in shapes:

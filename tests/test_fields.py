@@ -1,0 +1,131 @@
+"""Scenes whose Gaussians come out of a network: gradients, tangents and information of its weights."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import camera, gaussians
+
+from drgs import fisher
+from drgs.ellipsoids import DeformableScene, Gaussians
+from drgs.integrator import render, render_jvp
+from drgs.settings import RenderSettings
+
+FAST = RenderSettings.preset("fast", transmittance_min=1e-10)
+BVH = RenderSettings.preset("exact", traversal="bvh")
+
+
+class Swarm:
+    """Means that a small network moves, by where they are and when; it is the identity for no scene of the tests."""
+
+    def __init__(self, start: Gaussians, seed: int = 0):
+        draw = torch.Generator().manual_seed(seed)
+        shapes = {"in.weight": (3, 4), "in.bias": (3,), "out.weight": (3, 3)}
+        self.start = start.detach()
+        dtype = start.means.dtype
+        self.weights = {n: 0.3 * torch.randn(s, generator=draw, dtype=dtype) for n, s in shapes.items()}
+
+    def parameters(self):
+        return self.start.parameters() | self.weights
+
+    def at(self, time):
+        return self.deform(self.parameters(), time)
+
+    def deform(self, parameters, time):
+        p = dict(parameters)
+        weights = {name: p.pop(name) for name in self.weights}
+        x = torch.cat([p["means"], torch.full_like(p["means"][:, :1], time)], 1)
+        hidden = torch.tanh(x @ weights["in.weight"].T + weights["in.bias"])
+        return self.start.replace(**{**p, "means": p["means"] + 0.1 * hidden @ weights["out.weight"].T})
+
+
+@pytest.fixture
+def view(rng):
+    """A scene and a camera at a time."""
+    cam = dataclasses.replace(camera(rng, (18, 14)), time=0.4)
+    return Swarm(gaussians(rng, 10, 4)), dataclasses.replace(cam, w2c=cam.w2c.detach())
+
+
+def test_gradients_pass_the_network(view):
+    """Reverse mode through `render(scene)` is torch's through the network, then that of the Gaussians."""
+    scene, cam = view
+    assert isinstance(scene, DeformableScene)
+    assert not isinstance(scene.start, DeformableScene)
+    weight = scene.weights["in.weight"].requires_grad_()
+    image = render(scene, cam, FAST).rgb
+    cotangent = torch.randn(image.shape)
+    (found,) = torch.autograd.grad((image * cotangent).sum(), weight)
+    there = scene.at(cam.time)
+    means = there.means.detach().requires_grad_()
+    (slope,) = torch.autograd.grad((render(there.replace(means=means), cam, FAST).rgb * cotangent).sum(), means)
+    (want,) = torch.autograd.grad((there.means * slope).sum(), weight)
+    assert torch.equal(found, want)
+
+
+@pytest.mark.parametrize("settings", [FAST, BVH], ids=["tiles", "bvh"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_tangents_of_weights(rng, view, settings, dtype):
+    """A tangent of a weight is the Gaussians' along what it does to them; other parameters and the pose add to it."""
+    scene, cam = view
+    scene = Swarm(scene.start.replace(means=scene.start.means.to(dtype)))
+    given = {name: torch.randn(scene.parameters()[name].shape, dtype=dtype) for name in ("in.weight", "means", "sh")}
+    twist = torch.randn(6)
+    found = render_jvp(scene, cam, {**given, "camera": twist}, settings)
+    parameters = scene.parameters()
+    along = {name: given.get(name, torch.zeros_like(x)) for name, x in parameters.items()}
+    moved = torch.func.jvp(lambda p: scene.deform(p, cam.time).parameters(), (parameters,), (along,))[1]
+    want = render_jvp(scene.at(cam.time), cam, {**moved, "camera": twist}, settings)
+    for name in ("rgb", "alpha", "depth"):
+        # The same operations on the same numbers, but that float32 weights pass through float32 tangents.
+        torch.testing.assert_close(getattr(found, name), getattr(want, name), rtol=1e-5, atol=1e-5)
+    assert float(found.rgb.abs().max()) > 0.01
+
+
+def test_tangent_is_the_difference(view):
+    """Forward mode by a weight is the central difference of images, in float64 means on a smooth scene."""
+    scene, cam = view
+    settings = RenderSettings(order="center", extent=8.0)
+    v, h = torch.randn(3, 3), 2e-3
+
+    def image(step):
+        moved = {**scene.parameters(), "out.weight": scene.weights["out.weight"] + step * v}
+        return render(scene.deform(moved, cam.time), cam, settings).rgb.double()
+
+    difference = (image(h) - image(-h)) / (2 * h)
+    found = render_jvp(scene, cam, {"out.weight": v}, settings).rgb.double()
+    # float32 images, 1e-7 / h = 5e-5 a pixel; the third derivative's h^2 is smaller.
+    assert float((found - difference).abs().max()) < 2e-3 * float(found.abs().max()) + 2e-4
+
+
+def test_information_of_weights(view):
+    """By columns the squares of the Jacobian's columns; probes have that as their mean; other groups are unchanged."""
+    scene, cam = view
+    groups = ["means", "in.bias", "out.weight"]
+    H = fisher.diagonal(scene, cam, FAST, "columns", groups=groups)
+    for name in groups[1:]:
+        rows = np.argwhere(np.ones(scene.weights[name].shape))
+        columns = fisher.jacobian_columns(scene, cam, {name: rows}, FAST).double()
+        torch.testing.assert_close(H[name].flatten(), columns.square().sum((1, 2, 3)))
+        assert float(H[name].min()) > 0
+    still = fisher.diagonal(scene.at(cam.time), cam, FAST, "columns", groups=["means"])
+    assert torch.equal(H["means"], still["means"])
+    probed = fisher.diagonal(scene, cam, FAST, "probes", groups=groups, probes=64)
+    for name in groups[1:]:
+        # Relative error sqrt(2 / 64) = 0.18 an entry; four times that of the worst, 1.5 times that of their mean.
+        ratio = probed[name] / H[name]
+        assert float((ratio - 1).abs().max()) < 0.7, name
+        assert abs(float(ratio.mean()) - 1) < 0.27, name
+
+
+def test_refusals(view):
+    """Closed forms know nothing of a network, and Gaussians have no weights."""
+    scene, cam = view
+    with pytest.raises(ValueError, match="method of group 'in.bias' must be 'columns' or 'probes', got 'exact'"):
+        fisher.diagonal(scene, cam, FAST, groups=["in.bias"])
+    with pytest.raises(ValueError, match="groups must be among means"):
+        fisher.diagonal(scene.start, cam, FAST, "columns", groups=["in.bias"])
+    with pytest.raises(ValueError, match=r"named among means, .* got 'weight'"):
+        render_jvp(scene, cam, {"weight": torch.zeros(3)}, FAST)
