@@ -39,7 +39,9 @@ from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
 from drgs.lab.crops import crops  # noqa: E402
 from drgs.lab.crossval import VERDICTS, crossval  # noqa: E402
-from drgs.lab.rasterizers import PARAMETERS, cotangents, function, load, raw_of  # noqa: E402
+from drgs.lab.dumps import cotangents  # noqa: E402
+from drgs.lab.rasterizers import function, load  # noqa: E402
+from drgs.lab.raw import PARAMETERS, raw_of  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 

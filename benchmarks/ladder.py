@@ -32,7 +32,7 @@ from drgs.data.sizes import at_most
 from drgs.files import Run, atomic_write
 from drgs.fitting.records import fit_record
 from drgs.lab.ladder import Pictures, ladder, table
-from drgs.lab.rasterizers import PARAMETERS
+from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
 
 BEGIN, END = "<!-- ladder: begin -->", "<!-- ladder: end -->"

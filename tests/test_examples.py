@@ -188,7 +188,7 @@ def test_dump_script_writes_what_is_documented(tmp_path):
         path=(tmp_path, Path(tr.__file__).parent),
     )
     dump = np.load(tmp_path / "dump.npz")
-    assert set(dump) == {*written, "image", "alpha", *(f"grad_{name}" for name in tr.GROUPS)}
+    assert set(dump) == {*written, "image", "alpha", "grad_viewmat", *(f"grad_{name}" for name in tr.GROUPS)}
     for name, x in written.items():
         assert np.array_equal(dump[name], x), name
     found = dict.fromkeys(tr.GROUPS, 0)

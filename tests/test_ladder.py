@@ -13,7 +13,7 @@ import torch
 from drgs import integrator, reference
 from drgs.lab.ladder import Pictures, ladder, sequences, table
 from drgs.lab.ladder_pictures import constant_colors
-from drgs.lab.rasterizers import PARAMETERS
+from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
 
 Preset = RenderSettings.preset

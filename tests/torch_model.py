@@ -25,6 +25,7 @@ def _same(x):
 class Model:
     """The stages and constants of one rasterizer. A defect replaces one of them."""
 
+    pose: Callable = _same
     mean: Callable = lambda means, depths, near: means
     unit: Callable = lambda quats: normalize(quats, dim=-1)
     rotation: Callable = _same
@@ -69,8 +70,8 @@ class Model:
         dtype = means.dtype
         images, alphas, depths = [], [], []
         for i in range(len(viewmats)):
-            w2c, K = viewmats[i].to(dtype), Ks[i].to(dtype)
-            background = means.new_zeros(3) if backgrounds is None else backgrounds[i].to(dtype)
+            w2c, K = self.pose(viewmats[i].to(dtype)), Ks[i].to(dtype)
+            background = means.new_zeros(colors.shape[-1]) if backgrounds is None else backgrounds[i].to(dtype)
             splats = self._project(means, quats, scales, opacities, w2c, K, width, height, near_plane, eps2d)
             rgb = self._colors(means, colors, w2c, sh_degree)[splats["index"]]
             image, alpha = self._composite(splats, rgb, background, width, height)
@@ -141,10 +142,10 @@ class Model:
                 inside = {name: splats[name][touched] for name in ("at", "conic", "opacity")}
                 weights, light = self._weights(pixels, **inside)
                 color = weights @ rgb[touched] + self.behind(light, background)
-                row.append(torch.cat([color, 1 - light[:, None]], 1).reshape(len(py), len(px), 4))
+                row.append(torch.cat([color, 1 - light[:, None]], 1).reshape(len(py), len(px), -1))
             rows.append(torch.cat(row, 1))
         image = torch.cat(rows)
-        return image[..., :3], image[..., 3:]
+        return image[..., :-1], image[..., -1:]
 
     def _weights(self, pixels, at, conic, opacity):
         """(P, M) weights of M Gaussians in order at P pixels, and what light is left (P,)."""
@@ -190,17 +191,17 @@ def rasterization(
         quats: (N, 4) wxyz, any length but 0.
         scales: (N, 3) standard deviations.
         opacities: (N,) in (0, 1).
-        colors: (N, K, 3) SH coefficients when `sh_degree` is given, else (N, 3).
+        colors: (N, K, 3) SH coefficients when `sh_degree` is given, else (N, D).
         viewmats: (C, 4, 4) world to camera, +x right, +y down, +z forward.
         Ks: (C, 3, 3) in pixels.
         width, height: Pixels.
         near_plane: Means with z <= near_plane are left out.
         eps2d: Added to the diagonal of projected covariances, px^2.
         sh_degree: 0..3 or None.
-        backgrounds: (C, 3) or None for black.
+        backgrounds: (C, D) or None for black.
         **unused: Other options of gsplat are ignored.
     Returns:
-        (C, H, W, 3) colors, (C, H, W, 1) alpha, and a dict.
+        (C, H, W, D) colors, D = 3 with `sh_degree`, (C, H, W, 1) alpha, and a dict.
     """
     options = {"near_plane": near_plane, "eps2d": eps2d, "sh_degree": sh_degree, "backgrounds": backgrounds}
     return CORRECT.rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options)

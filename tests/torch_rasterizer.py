@@ -1,10 +1,12 @@
 """A rasterizer in plain torch (torch_model.py), and copies of it that are broken on purpose.
 
 `DEFECTS` holds one rasterizer per fault, each a single change of the correct one. They have the same signature and are
-functions of this module, `defect_<name>`, so that a `module:function` string finds them. Of three kinds:
+functions of this module, `defect_<name>`, so that a `module:function` string finds them. Of four kinds:
 
 - gradient: the image is the correct one bit for bit, the gradient of the raw parameters in `groups` is wrong, that of
   the others is right (raw: means, quats, log_scales, logit_opacities, sh; exp and sigmoid are the caller's);
+- beside: as gradient, but what is wrong is the gradient of the pose (`viewmats`), or of colors of more than three
+  channels (`colors`);
 - convention: the image is another one, and the gradient is the gradient of that image;
 - cutoff: the same, where what differs is which contributions are left out.
 """
@@ -70,8 +72,8 @@ class Defect:
     """One fault of a rasterizer.
 
     Attributes:
-        kind: `gradient`, `convention` or `cutoff`: see the module's text.
-        groups: Raw parameters whose gradient is wrong (kind `gradient`), else empty.
+        kind: `gradient`, `beside`, `convention` or `cutoff`: see the module's text.
+        groups: Raw parameters whose gradient is wrong (kind `gradient`), or `viewmats` or `colors`, else empty.
         words: What a report on it must mention, lower case: any one of them will do.
         what: One line on the fault.
         name: As in `DEFECTS`.
@@ -111,6 +113,14 @@ def _nan_where_culled(means, depths, near):
 
 def _wrong_band(sh):
     return torch.cat([sh[:, :1], _Backward.apply(sh[:, 1:4], torch.neg), sh[:, 4:]], 1)
+
+
+def _translation_only(w2c):
+    return torch.cat([w2c[:, :3].detach(), w2c[:, 3:]], 1)
+
+
+def _sixth_channel(color):
+    return torch.cat([color[:, :5], color[:, 5:6].detach(), color[:, 6:]], 1)
 
 
 def _phase(sh):
@@ -194,6 +204,20 @@ _TABLE = {
         ("nan", "finite", "means"),
         "Gaussians behind the camera get NaN as the gradient of their means",
         {"mean": _nan_where_culled},
+    ),
+    "pose_rotation": (
+        "beside",
+        ("viewmats",),
+        ("viewmats",),
+        "the gradient of the pose lacks the part of its rotation",
+        {"pose": _translation_only},
+    ),
+    "sixth_channel": (
+        "beside",
+        ("colors",),
+        ("colors",),
+        "the gradient of the sixth channel of plain colors is dropped",
+        {"color": _sixth_channel},
     ),
     "quaternion_order": (
         "convention",

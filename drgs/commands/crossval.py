@@ -12,7 +12,7 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import check_file, claim
-from drgs.lab import ladder, rasterizers
+from drgs.lab import dumps, ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
 
@@ -31,13 +31,13 @@ def run(args: Crossval) -> int:
     elif args.export.suffix != ".npz":
         raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
     else:
-        check_file(args.export, "crossval", inputs, rasterizers.is_export)
+        check_file(args.export, "crossval", inputs, dumps.is_export)
     given = Given.of(args)
     g, fields = given.gaussians, given.fields
     cameras, source = seen_views(args, given)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:
-        rasterizers.export(args.export, g, cameras, given.background, args.seed)
+        dumps.export(args.export, g, cameras, given.background, args.seed)
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0

@@ -10,7 +10,8 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
-from drgs.lab.rasterizers import PARAMETERS
+from drgs.lab.raw import PARAMETERS
+from drgs.lab.rows import Crop
 from drgs.settings import RenderSettings
 
 __all__ = ["crops"]
@@ -20,7 +21,7 @@ _STEP = 16  # pixels between the places that are tried: a rasterizer's tiles sta
 _PAIRS = 1_000_000  # (pixel, Gaussian) pairs of a crop that take the oracle seconds: image and gradient, by CPU
 
 
-def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tuple[Gaussians, list[Camera], list[dict]]:
+def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tuple[Gaussians, list[Camera], list[Crop]]:
     """The most varied square of each view, and the Gaussians that any of them sees.
 
     Squares have 32 pixels a side, or 16 or 8 where the oracle would take long over what one of them sees.
@@ -30,8 +31,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
         cameras: Pinhole, of one size.
         settings: Of the images that are looked at.
     Returns:
-        The Gaussians; a camera a view that shows anything; and where each crop lies: `x`, `y`, `width`, `height` in
-        pixels of the view, and `of`, the view's (width, height).
+        The Gaussians; a camera a view that shows anything; and where each crop lies.
     Raises:
         ValueError: If no view shows a Gaussian.
     """
@@ -47,7 +47,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
             K = np.array(camera.K, float)
             K[:2, 2] -= x, y
             parts.append(dataclasses.replace(camera, K=K, width=width, height=height))
-            places.append({"x": x, "y": y, "width": width, "height": height, "of": [camera.width, camera.height]})
+            places.append(Crop(x, y, width, height, [camera.width, camera.height]))
             seen.append(_looked_at(g, parts[-1], settings)[1])
         if max(int(x.sum()) for x in seen) * side**2 <= _PAIRS:
             break

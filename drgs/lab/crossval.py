@@ -1,8 +1,10 @@
 """Is a rasterizer's image right, are its gradients, and if not, what explains it?
 
 The image is compared with our models until one with the rasterizer's conventions is found (conventions.py). There the
-gradients of <u, image>, u of random signs, are compared group by group. Where they differ, a choice that is known to be
-made on purpose may explain it; else the rasterizer's own central differences decide (differences.py):
+gradients of <u, image>, u of random signs, are compared group by group: raw parameters, the pose of every view along
+rigid motions (`viewmats`), and, in an image of many channels, plain `colors` (channels.py). Where they differ, a choice
+that is known to be made on purpose may explain it; else the rasterizer's own central differences decide
+(differences.py):
 
     agreement          the gradient is the model's
     known deviation    it is the model's with a documented choice: view direction detached, clamped alpha passed through
@@ -10,7 +12,8 @@ made on purpose may explain it; else the rasterizer's own central differences de
     model difference   it agrees with them, and the model is another one
     undecided          too few differences converged, or a dump cannot be asked
 
-The verdict of the whole is the worst of them; `other convention` if only conventions differ from what was claimed.
+The verdict of the whole is the worst of them; `other convention` if only conventions differ from what was claimed. What
+a rasterizer has no gradient of is not offered, and said so.
 """
 
 from __future__ import annotations
@@ -25,10 +28,14 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.lab import conventions
-from drgs.lab.conventions import Model
+from drgs.lab.channels import wide_gradients
 from drgs.lab.crops import crops
+from drgs.lab.dumps import Dump, cotangents
 from drgs.lab.judgement import Case, compared, judge
-from drgs.lab.rasterizers import Dump, Rasterizer, cotangents, raw_of
+from drgs.lab.rasterizers import Rasterizer
+from drgs.lab.raw import COLORS, POSE, raw_of, with_pose
+from drgs.lab.reference_model import ReferenceModel
+from drgs.lab.rows import Crop, GroupRow, ViewRow
 from drgs.settings import RenderSettings
 
 __all__ = ["VERDICTS", "Result", "crossval"]
@@ -48,13 +55,19 @@ class Result:
     Attributes:
         report: Everything, JSON-serializable.
         images: A dict a view: `rasterizer`, `model`, `exact` (H, W, 3) arrays.
+        groups: A row a group whose gradient was compared.
+        views: A row a view.
+        findings: Conventions that differ from the preset's.
         model: The model at the rasterizer's conventions.
         gaussians, cameras: What was compared (a part of a large scene where the oracle is the reference).
     """
 
     report: dict
     images: list[dict[str, np.ndarray]]
-    model: Model
+    groups: dict[str, GroupRow]
+    views: list[ViewRow]
+    findings: list[conventions.Finding]
+    model: ReferenceModel
     gaussians: Gaussians
     cameras: list[Camera]
 
@@ -67,15 +80,15 @@ class Result:
         """The findings, one a line."""
         r = self.report
         lines = [f"{r['rasterizer']}: {r['verdict']} (model: preset {r['preset']})", *r["scope"]]
-        for c in r["conventions"]:
-            lines.append(f"convention: {c['name']} is {c['found']}, expected {c['expected']}")
-        for view in r["image"]["views"]:
-            if abs(bias := view["alpha"]["bias"]) > _ALPHA:
+        for finding in self.findings:
+            lines.append(f"convention: {finding.name} is {finding.found}, expected {finding.expected}")
+        for view in self.views:
+            if abs(bias := view.alpha.bias) > _ALPHA:
                 what = "lower: hits are missing" if bias < 0 else "higher"
-                lines.append(f"view {view['view']}: alpha is {abs(bias):.1e} {what} on average")
-        for name, group in r["groups"].items():
-            what = group["verdict"] + (f": {group['why']}" if group["why"] else "")
-            lines.append(f"{name}: {what}; relative difference {group['relative']:.2g}, cosine {group['cosine']:.6f}")
+                lines.append(f"view {view.view}: alpha is {abs(bias):.1e} {what} on average")
+        for name, group in self.groups.items():
+            what = group.verdict + (f": {group.why}" if group.why else "")
+            lines.append(f"{name}: {what}; relative difference {group.relative:.2g}, cosine {group.cosine:.6f}")
         return lines
 
 
@@ -89,6 +102,7 @@ def crossval(
     tolerance: float | None = None,
     entries: int = 10,
     seed: int = 0,
+    channels: int = 6,
     advance: Callable[[str], None] | None = None,
 ) -> Result:
     """Compare a rasterizer with the model that it claims to compute.
@@ -102,6 +116,7 @@ def crossval(
         tolerance: Relative L2 difference of gradients that agree; default 5e-4, and 5e-3 in float32.
         entries: Parameters a group whose central differences are taken, where they are needed.
         seed: Of the cotangents.
+        channels: Width of the plain colors whose gradient is compared, too; 0 for none.
         advance: Called with each stage's name.
     Raises:
         ValueError: If cameras differ in size, or the rasterizer's function fails.
@@ -113,15 +128,17 @@ def crossval(
     fields = dict(fields or {})
     if len(g) == 0:
         raise ValueError("crossval: the scene must have Gaussians, got 0")
-    starts = [Model(RenderSettings.preset(name, **_legal(name, fields))) for name in _presets(rasterizer, preset)]
+    presets = _presets(rasterizer, preset)
+    starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
     background = starts[0].settings.background
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
-    whole, asked, places = len(g), len(cameras), [None] * len(cameras)
+    whole, asked = len(g), len(cameras)
+    places: list[Crop | None] = [None] * asked
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
         say("crops")
         g, cameras, places = crops(g, cameras, starts[0].settings)
     dtype = getattr(rasterizer, "dtype", torch.float32)
-    raw, signs = raw_of(g), cotangents(cameras, seed)
+    raw, signs = with_pose(raw_of(g)), cotangents(cameras, seed)
     say("images")
     if isinstance(rasterizer, Dump):
         pictures, alphas, signs = list(rasterizer.images), list(rasterizer.alphas), rasterizer.cotangents
@@ -134,11 +151,11 @@ def crossval(
     first = int(np.argmax([float(x.var()) for x in pictures]))  # the view that shows most
 
     @functools.cache
-    def drawn_by(model: Model, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def drawn_by(model: ReferenceModel, view: int) -> tuple[torch.Tensor, torch.Tensor]:
         return _drawn(model, raw, cameras[view], oracle)
 
     @functools.cache
-    def ties_of(model: Model, view: int) -> torch.Tensor:
+    def ties_of(model: ReferenceModel, view: int) -> torch.Tensor:
         say("near ties")
         return model.near_ties(raw, cameras[view])
 
@@ -151,27 +168,37 @@ def crossval(
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
     beside = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
-    views, agrees, groups = beside.views, beside.agrees, beside.groups
     judge(case, model, beside)
-    worst = min((row["verdict"] for row in groups.values()), key=VERDICTS.index)
-    if not agrees:
+    not_offered = {} if POSE in beside.groups else {POSE: "its image has no gradient of them"}
+    if channels:
+        wide, reason = wide_gradients(case, model, beside, channels, seed, functools.partial(ties_of, model))
+        beside.groups |= wide
+        not_offered |= {COLORS: reason} if reason else {}
+    worst = min((row.verdict for row in beside.groups.values()), key=VERDICTS.index)
+    if not beside.agrees:
         worst = min(worst, "model difference", key=VERDICTS.index)
     elif found.findings:
         worst = min(worst, "other convention", key=VERDICTS.index)
     report = {
         "rasterizer": rasterizer.name,
         "verdict": worst,
-        "preset": next(n for n, s in zip(_presets(rasterizer, preset), starts, strict=True) if s == found.start),
+        "preset": next(n for n, s in zip(presets, starts, strict=True) if s == found.start),
         "conventions": [dataclasses.asdict(finding) for finding in found.findings],
-        "image": {"agrees": agrees, "before": found.before, "after": found.after, "views": views},
-        "groups": groups,
+        "image": {
+            "agrees": beside.agrees,
+            "before": found.before,
+            "after": found.after,
+            "views": [dataclasses.asdict(row) for row in beside.views],
+        },
+        "groups": {name: row.json() for name, row in beside.groups.items()},
+        "not_offered": not_offered,
         "reference": "float64 oracle" if oracle else "drgs.render",
         "gaussians": len(g),
         "of_gaussians": whole,
         "of_views": asked,
         "cameras": [camera.name for camera in cameras],
         "size": [cameras[0].width, cameras[0].height],
-        "crops": places,
+        "crops": [None if place is None else dataclasses.asdict(place) for place in places],
         "pixels": beside.ties.numel(),
         "near_ties": int(beside.ties.sum()),
         "near_ties_counted": beside.counted,
@@ -182,11 +209,11 @@ def crossval(
     }
     report["scope"] = _scope(report)
     say("pictures")
-    exact, images = Model(RenderSettings.preset("exact", background=background)), []
+    exact, images = ReferenceModel(RenderSettings.preset("exact", background=background)), []
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
         true, _ = _drawn(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
-    return Result(report, images, model, g, cameras)
+    return Result(report, images, beside.groups, beside.views, found.findings, model, g, cameras)
 
 
 def _scope(r: dict) -> list[str]:
@@ -208,10 +235,11 @@ def _scope(r: dict) -> list[str]:
         lines.append(
             f"{r['near_ties']:,} of {r['pixels']:,} pixels hang on near ties that float32 cannot tell apart: {what}"
         )
+    lines += [f"not compared: the gradient of {name}: {why}" for name, why in r["not_offered"].items()]
     return lines
 
 
-def _presets(rasterizer, preset: str) -> list[str]:
+def _presets(rasterizer: Rasterizer | Dump, preset: str) -> list[str]:
     if preset != "auto":
         return [preset]
     own = getattr(rasterizer, "preset", None)
@@ -227,7 +255,7 @@ def _legal(name: str, fields: dict) -> dict:
     return fields
 
 
-def _drawn(model: Model, raw: dict, camera: Camera, oracle: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def _drawn(model: ReferenceModel, raw: dict, camera: Camera, oracle: bool) -> tuple[torch.Tensor, torch.Tensor]:
     with torch.no_grad():
         image, alpha = model.draw(raw, camera, oracle)
     return image.cpu(), alpha.cpu()

@@ -14,6 +14,8 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.lab.rasterizers import Rasterizer
+from drgs.lab.raw import POSE
+from drgs.oracle import float64
 
 __all__ = ["Differences", "central"]
 
@@ -125,16 +127,19 @@ def _slopes(rasterizer, raw, camera, background, group, index) -> tuple[list[tor
 
 def _unit(raw: dict, camera: Camera, group: str, index: int) -> float:
     """The change of a parameter that changes its Gaussian's part of the image by about its own size."""
-    if group not in ("means", "quats"):
+    if group not in ("means", "quats", POSE):
         return 1.0
+    w2c, scales = float64(camera.w2c).detach(), raw["log_scales"].exp()  # a step is a constant
+    depths = raw["means"] @ w2c[2, :3] + w2c[2, 3]
+    # Nothing in the image is thinner than this.
+    thin = scales.amin(1).maximum(0.3 * depths.abs() / float(camera.K[0][0]))
+    if group == POSE:  # an angle, or a part of the depth: all Gaussians move by as much as one of them is thin
+        ahead = depths > 0
+        return float((thin / depths)[ahead].median()) if bool(ahead.any()) else 1.0
     i = index // raw[group].shape[1]
-    scales = raw["log_scales"][i].exp()
-    w2c = torch.tensor(camera.w2c) if not isinstance(camera.w2c, torch.Tensor) else camera.w2c.detach()
-    z = abs(float(w2c[2, :3] @ raw["means"][i] + w2c[2, 3]))
-    thin = max(float(scales.min()), 0.3 * z / float(camera.K[0][0]))  # nothing in the image is thinner than this
     if group == "means":
-        return thin
-    return float(raw["quats"][i].norm()) * min(1.0, thin / float(scales.max()))
+        return float(thin[i])
+    return float(raw["quats"][i].norm()) * min(1.0, float(thin[i]) / float(scales[i].max()))
 
 
 def _extrapolated(sums: list[float], bars: list[float]) -> tuple[float | None, float]:

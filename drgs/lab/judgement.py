@@ -13,9 +13,13 @@ from collections.abc import Callable
 import torch
 
 from drgs.cameras import Camera
-from drgs.lab.conventions import LEAST, Model
+from drgs.lab.conventions import LEAST
 from drgs.lab.differences import Differences, central
-from drgs.lab.rasterizers import PARAMETERS, Dump, Rasterizer
+from drgs.lab.dumps import Dump
+from drgs.lab.rasterizers import Rasterizer
+from drgs.lab.raw import POSE
+from drgs.lab.reference_model import ReferenceModel
+from drgs.lab.rows import AlphaRow, GroupRow, OwnRow, ViewRow, WorstGaussian, WorstPixel
 
 __all__ = ["Case", "Compared", "compared", "judge"]
 
@@ -67,17 +71,23 @@ class Case:
     say: Callable[[str], None]
 
     def theirs(self, u) -> dict:
-        """The rasterizer's gradient, summed over views; None where there is none."""
+        """The rasterizer's gradient, summed over views, of poses (C, 6); None where there is none."""
         if isinstance(self.rasterizer, Dump):
             return dict(self.rasterizer.gradients)
         pairs = zip(self.cameras, u, strict=True)
-        parts = [self.rasterizer.gradient(self.raw, camera, self.background, w) for camera, w in pairs]
-        return {name: None if parts[0][name] is None else sum(part[name] for part in parts) for name in PARAMETERS}
+        return _joined([self.rasterizer.gradient(self.raw, camera, self.background, w) for camera, w in pairs])
 
-    def ours(self, model: Model, u) -> dict:
-        """The model's gradient, summed over views."""
-        parts = [model.gradient(self.raw, c, w, self.oracle) for c, w in zip(self.cameras, u, strict=True)]
-        return {name: sum(part[name] for part in parts) for name in PARAMETERS}
+    def ours(self, model: ReferenceModel, u) -> dict:
+        """The model's gradient, summed over views, of poses (C, 6)."""
+        return _joined([model.gradient(self.raw, c, w, self.oracle) for c, w in zip(self.cameras, u, strict=True)])
+
+
+def _joined(views: list[dict]) -> dict:
+    """Gradients of parameters that views share are added, those of their poses are not."""
+    join = {POSE: torch.stack}
+    return {
+        name: None if x is None else join.get(name, sum)([part[name] for part in views]) for name, x in views[0].items()
+    }
 
 
 @dataclasses.dataclass
@@ -89,36 +99,37 @@ class Compared:
         agrees: Whether the images are the model's.
         u: (C, H, W, 3) cotangents, 0 at pixels that do not count.
         theirs: The rasterizer's gradients.
-        groups: A row a group.
+        groups: A row a group; of the pose only where the rasterizer has a gradient of it.
         ties: (C, H, W) bool, pixels that hang on near ties, looked for where something is to be explained.
         counted: Whether these count all the same, because next to nothing would be left.
     """
 
-    views: list[dict]
+    views: list[ViewRow]
     agrees: bool
     u: torch.Tensor
     theirs: dict
-    groups: dict
+    groups: dict[str, GroupRow]
     ties: torch.Tensor
     counted: bool
 
 
-def compared(case: Case, model: Model, signs, pictures, alphas, drawn, near_ties: Callable) -> Compared:
+def compared(case: Case, model: ReferenceModel, signs, pictures, alphas, drawn, near_ties: Callable) -> Compared:
     """Two correct renderers differ where pixels hang on near ties: these are left out before a difference counts."""
     ties, counted = torch.zeros(signs.shape[:3], dtype=torch.bool), False
     while True:
         left = ties & (not counted)
         views = [_image_row(*row) for row in zip(case.cameras, pictures, alphas, drawn, ~left, strict=True)]
-        agrees = all(row["rms"] <= _IMAGE and row["share"] <= _FEW for row in views)
+        agrees = all(row.rms <= _IMAGE and row.share <= _FEW for row in views)
         u = signs
         if not isinstance(case.rasterizer, Dump):  # whose gradients are of its own cotangents
             off = torch.stack([(a - s).abs().amax(-1) > _PIXEL for a, (s, _) in zip(pictures, drawn, strict=True)])
             u = signs * ~(left | (off & agrees))[..., None]
         case.say("gradients")
         theirs, ours = case.theirs(u), case.ours(model, u)
-        groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in PARAMETERS}
+        offered = [name for name, x in theirs.items() if name != POSE or x is not None]
+        groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in offered}
         found = Compared(views, agrees, u, theirs, groups, ties, counted)
-        if ties.any() or (agrees and all(row["verdict"] for row in groups.values())):
+        if ties.any() or (agrees and all(row.verdict for row in groups.values())):
             return found
         ties = torch.stack([near_ties(view) for view in range(len(case.cameras))])
         counted = float((~ties).double().mean()) < LEAST
@@ -126,12 +137,12 @@ def compared(case: Case, model: Model, signs, pictures, alphas, drawn, near_ties
             return dataclasses.replace(found, ties=ties, counted=counted)
 
 
-def judge(case: Case, model: Model, compared: Compared) -> None:
+def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
     """Give every group that differs its verdict."""
     rasterizer, agrees, groups = case.rasterizer, compared.agrees, compared.groups
     if agrees:
         _known(case, model, compared)
-    names = [name for name, row in groups.items() if row["verdict"] is None]
+    names = [name for name, row in groups.items() if row.verdict is None]
     if names and isinstance(rasterizer, Rasterizer):
         case.say("central differences")
         _decide(case, model if agrees else None, compared, names)
@@ -144,93 +155,92 @@ def judge(case: Case, model: Model, compared: Compared) -> None:
             tied = case.ours(model, compared.u * compared.ties[..., None])
             open_to = {name: float(tied[name].norm()) for name in names}
         for name in names:
-            groups[name] |= {"verdict": verdict, "why": why}
-            if groups[name]["relative"] * groups[name]["norm"] <= open_to[name]:
-                why_not = (
-                    f"{int(compared.ties.sum())} pixels that hang on near ties could explain it; choose other views"
+            groups[name].settle(verdict, why)
+            if groups[name].relative * groups[name].norm <= open_to[name]:
+                count = int(compared.ties.sum())
+                groups[name].settle(
+                    "undecided", f"{count} pixels that hang on near ties could explain it; choose other views"
                 )
-                groups[name] |= {"verdict": "undecided", "why": why_not}
     if compared.counted:
         share = float(compared.ties.double().mean())
         for row in groups.values():
-            if row["verdict"] == "model difference":
-                why = f"{share:.0%} of the pixels hang on near ties; choose other views"
-                row |= {"verdict": "undecided", "why": why}
+            if row.verdict == "model difference":
+                row.settle("undecided", f"{share:.0%} of the pixels hang on near ties; choose other views")
 
 
-def _image_row(camera: Camera, image, alpha, drawn: tuple, counts) -> dict:
+def _image_row(camera: Camera, image: torch.Tensor, alpha: torch.Tensor, drawn: tuple, counts: torch.Tensor) -> ViewRow:
     """How far two images are apart, at the pixels that count."""
     same, same_alpha = drawn
     error = (image - same).abs().amax(-1) * counts
     worst = torch.topk(error.reshape(-1), min(5, error.numel())).indices
-    at = [
-        {"x": int(i) % camera.width, "y": int(i) // camera.width, "difference": float(error.view(-1)[i])} for i in worst
-    ]
-    return {
-        "view": camera.name,
-        "rms": _mean((image - same).square().mean(-1), counts) ** 0.5,
-        "max": float(error.max()),
-        "share": _mean((error > _PIXEL).double(), counts),
-        "alpha": {
-            "rms": _mean((alpha - same_alpha).square(), counts) ** 0.5,
-            "bias": _mean(alpha - same_alpha, counts),
-        },
-        "near_ties": int((~counts).sum()),
-        "worst": at,
-    }
+    at = [WorstPixel(int(i) % camera.width, int(i) // camera.width, float(error.view(-1)[i])) for i in worst]
+    return ViewRow(
+        view=camera.name,
+        rms=_mean((image - same).square().mean(-1), counts) ** 0.5,
+        max=float(error.max()),
+        share=_mean((error > _PIXEL).double(), counts),
+        alpha=AlphaRow(rms=_mean((alpha - same_alpha).square(), counts) ** 0.5, bias=_mean(alpha - same_alpha, counts)),
+        near_ties=int((~counts).sum()),
+        worst=at,
+    )
 
 
 def _mean(values: torch.Tensor, counts: torch.Tensor) -> float:
     return float((values * counts).sum()) / max(int(counts.sum()), 1)
 
 
-def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float) -> dict:
+def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float) -> GroupRow:
     """How far two gradients are apart; `verdict` is None where that is still to be explained."""
-    row = {"verdict": None, "why": "", "worst": []}
+    verdict, why = None, ""
     if theirs is None:
-        theirs, row["why"] = torch.zeros_like(ours), "the image does not depend on it"
+        theirs, why = torch.zeros_like(ours), "the image does not depend on it"
     finite = torch.isfinite(theirs)
     if not finite.all():
         index = [int(i) for i in torch.nonzero(~finite)[0]]
-        row |= {"verdict": "gradient bug", "why": f"not finite, first at {index}"}
+        verdict, why = "gradient bug", f"not finite, first at {index}"
         theirs = torch.where(finite, theirs, 0.0)
     a, b = theirs.reshape(-1), ours.reshape(-1)
-    norm = float(b.norm())
-    row["relative"] = float((a - b).norm()) / max(norm, 1e-12)
-    row["cosine"] = float(a @ b / (a.norm() * b.norm()).clamp_min(1e-300)) if norm > 0 else float(not a.any())
-    row["bias"] = float(a @ b) / max(norm, 1e-12) ** 2 - 1 if norm > 0 else 0.0
-    row["max"] = float((a - b).abs().max())
-    row["norm"] = norm
+    norm, largest = float(b.norm()), float((a - b).abs().max())
+    relative = float((a - b).norm()) / max(norm, 1e-12)  # of a gradient that is 0: of next to nothing
     each = (theirs - ours).reshape(len(ours), -1).norm(dim=1)
-    for i in torch.topk(each, min(5, len(each))).indices:
-        row["worst"].append({"gaussian": int(i), "difference": float(each[i])})
-    if row["verdict"] is None and (row["relative"] <= tolerance or (norm < 1e-9 and row["max"] < 1e-9)):
-        row["verdict"], row["why"] = "agreement", ""
-    return row
+    worst = torch.topk(each, min(5, len(each))).indices
+    if verdict is None and (relative <= tolerance or (norm < 1e-9 and largest < 1e-9)):
+        verdict, why = "agreement", ""
+    return GroupRow(
+        verdict=verdict,
+        why=why,
+        worst=[WorstGaussian(int(i), float(each[i])) for i in worst],
+        relative=relative,
+        # Underflow, not 0, is kept from the division: the case of 0 is told apart.
+        cosine=float(a @ b / (a.norm() * b.norm()).clamp_min(1e-300)) if norm > 0 else float(not a.any()),
+        bias=float(a @ b) / max(norm, 1e-12) ** 2 - 1 if norm > 0 else 0.0,
+        max=largest,
+        norm=norm,
+    )
 
 
-def _known(case: Case, model: Model, compared: Compared) -> None:
+def _known(case: Case, model: ReferenceModel, compared: Compared) -> None:
     """Explain what documented choices explain: the fewest of them that settle most groups."""
     groups, theirs = compared.groups, compared.theirs
-    open_ones = [name for name, row in groups.items() if row["verdict"] is None and theirs[name] is not None]
+    open_ones = [name for name, row in groups.items() if row.verdict is None and theirs[name] is not None]
     if not open_ones:
         return
     clamp = _PASSED if model.settings.alpha_max_gradient == "zero" else _ZEROED
-    choices = [_DETACHED] if case.raw["sh"].shape[1] > 1 else []
+    choices = [_DETACHED] if "sh" in case.raw and case.raw["sh"].shape[1] > 1 else []
     choices += [clamp] if model.settings.alpha_max < 1 else []
     best: tuple[list, tuple] = ([], ())
     for size in range(1, len(choices) + 1):
         for chosen in itertools.combinations(choices, size):
             changed = model.replace(**{k: v for c in chosen for k, v in c.change.items()})
             ours = case.ours(changed, compared.u)
-            settled = [n for n in open_ones if _group_row(theirs[n], ours[n], case.tolerance)["verdict"] == "agreement"]
+            settled = [n for n in open_ones if _group_row(theirs[n], ours[n], case.tolerance).verdict == "agreement"]
             if len(settled) > len(best[0]):
                 best = settled, chosen
     for name in best[0]:
-        groups[name] |= {"verdict": "known deviation", "why": "; ".join(f"{c.name} ({c.where})" for c in best[1])}
+        groups[name].settle("known deviation", "; ".join(f"{c.name} ({c.where})" for c in best[1]))
 
 
-def _decide(case: Case, model: Model | None, compared: Compared, names: list[str]) -> None:
+def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names: list[str]) -> None:
     """Ask the rasterizer's own central differences; `model` is given if the image is its."""
     groups, rasterizer, raw, background = compared.groups, case.rasterizer, case.raw, case.background
     camera, u = case.cameras[case.first], compared.u[case.first]
@@ -244,16 +254,15 @@ def _decide(case: Case, model: Model | None, compared: Compared, names: list[str
     for name in names:
         there = torch.zeros_like(raw[name]) if kept[name] is None else kept[name]
         row = _own_row(there, None if wanted is None else wanted[name], own, name)
-        groups[name]["differences"] = row
-        row["pixels_left_out"] = int((~own.kept).sum())
+        groups[name].differences = row
         if len(own.entries[name]) < _ENOUGH:
-            groups[name] |= {"verdict": "undecided", "why": f"{row['left_out']} of its differences did not converge"}
-        elif row["bug"]:
-            groups[name] |= {"verdict": "gradient bug", "why": row["what"]}
+            groups[name].settle("undecided", f"{row.left_out} of its differences did not converge")
+        elif row.bug:
+            groups[name].settle("gradient bug", row.what)
         else:
             why = "agrees with its own central differences"
             why += "; its image is of another model" if model is None else ", which differ from the model's gradient"
-            groups[name] |= {"verdict": "model difference", "why": why}
+            groups[name].settle("model difference", why)
 
 
 def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
@@ -263,7 +272,7 @@ def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
     return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]
 
 
-def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differences, name: str) -> dict:
+def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differences, name: str) -> OwnRow:
     """A gradient, and the model's if it has the same image, against central differences at their entries."""
     values, bars = own.values[name], own.uncertainty[name]
     there = gradient.reshape(-1)[own.entries[name]]
@@ -282,13 +291,14 @@ def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differenc
         what = f"it is {ratio:.3g} times its own central differences"
     else:
         what = f"it is off its own central differences by {error / max(size, 1e-300):.2g} of their size"
-    return {
-        "entries": own.entries[name],
-        "central": values.tolist(),
-        "uncertainty": bars.tolist(),
-        "gradient": there.tolist(),
-        "relative": error / max(size, 1e-300),
-        "left_out": own.left_out[name],
-        "bug": bool(bug),
-        "what": what,
-    }
+    return OwnRow(
+        entries=own.entries[name],
+        central=values.tolist(),
+        uncertainty=bars.tolist(),
+        gradient=there.tolist(),
+        relative=error / max(size, 1e-300),  # all of them 0: any error is infinitely large beside them
+        left_out=own.left_out[name],
+        bug=bool(bug),
+        what=what,
+        pixels_left_out=int((~own.kept).sum()),
+    )

@@ -23,7 +23,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.lab.ladder_pictures import Pictures, State
 from drgs.lab.ladder_table import Step, table
-from drgs.lab.rasterizers import PARAMETERS
+from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
 
 __all__ = ["RUNGS", "Pictures", "ladder", "sequences", "table"]

@@ -12,7 +12,7 @@ from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
-from drgs.lab.rasterizers import PARAMETERS
+from drgs.lab.raw import PARAMETERS
 from drgs.oracle import sh_colors
 from drgs.settings import RenderSettings
 

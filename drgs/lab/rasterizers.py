@@ -1,19 +1,17 @@
 """Rasterizers to be compared: ours, gsplat, any torch function with gsplat's arguments, or what one wrote to a file.
 
 Each is given raw parameters (drgs.ellipsoids) and a pinhole camera and returns an image that torch can differentiate;
-activations (exp, sigmoid) are applied here, so that derivatives arrive at the raw parameters. A dump has an image and
-gradients only: it cannot be asked again.
+activations (exp, sigmoid) are applied here, so that derivatives arrive at the raw parameters, and the camera is moved
+here (raw.posed), so that they arrive at its motion. A dump has an image and gradients only: it cannot be asked again.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib
 import inspect
 import sys
-import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +19,13 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, sh_degree_of
-from drgs.files import atomic_write
-from drgs.guards.foreign import refuse_foreign
 from drgs.integrator import render
+from drgs.lab.dumps import SUFFIXES, one_line, read_dump
+from drgs.lab.raw import COLORS, POSE, gaussians_of, image_of, posed
+from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
 
-__all__ = ["PARAMETERS", "Dump", "Rasterizer", "cotangents", "export", "is_export", "load", "raw_of"]
-
-PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # raw, as crossval and the ladder compare them
-_DUMPS = (".npz", ".safetensors")
-_EXPORT = "drgs_export"  # an array by which an export can be told from a dump, which holds more
-_LARGEST = 4 << 30  # bytes of a dump
+__all__ = ["Rasterizer", "function", "load", "ours"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +34,9 @@ class Rasterizer:
 
     Attributes:
         name: As the user gave it.
-        draw: (raw parameters by group, camera, background (3,)) -> image (H, W, 3), alpha (H, W); differentiable.
+        draw: (raw parameters by group, camera, background) -> image (H, W, 3), alpha (H, W); differentiable. With
+            `colors` (N, D) instead of `sh` the image has D channels and the background D zeros; with `viewmats`, a
+            motion of the camera, its gradient arrives there.
         dtype: Of the parameters that it is given.
         device: Where it wants them.
         preset: The preset that it is, if it is ours.
@@ -65,41 +61,23 @@ class Rasterizer:
             ValueError: If torch finds no graph at all.
         """
         leaves = {name: x.requires_grad_() for name, x in self.taken(raw).items()}
-        image, _ = self.draw(leaves, camera, background)
-        if not image.requires_grad:
-            raise ValueError(f"--rasterizer {self.name}: its image must be differentiable by torch, has no graph")
-        loss = (image * cotangent.to(image)).sum()
-        found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+        try:
+            image, _ = self.draw(leaves, camera, background)
+            if not image.requires_grad:
+                raise ValueError(f"--rasterizer {self.name}: its image must be differentiable by torch, has no graph")
+            loss = (image * cotangent.to(image)).sum()
+            found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+        except Exception:
+            if POSE not in raw:
+                raise
+            # It may make an array of the pose, or refuse one that wants a gradient: the others are asked for alone.
+            fixed = {name: x for name, x in raw.items() if name != POSE}
+            return {**self.gradient(fixed, camera, background, cotangent), POSE: None}
         return {name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, found, strict=True)}
 
     def taken(self, raw: dict) -> dict:
         """Copies of the parameters as it wants them."""
-        return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}
-
-
-@dataclasses.dataclass(frozen=True)
-class Dump:
-    """What a rasterizer wrote: see `load`.
-
-    Attributes:
-        name: The file.
-        images, alphas: (C, H, W, 3) and (C, H, W) float64.
-        cotangents: (C, H, W, 3).
-        gradients: Group -> gradient of sum <cotangents, images>, raw parameters, all views together.
-    """
-
-    name: str
-    images: torch.Tensor
-    alphas: torch.Tensor
-    cotangents: torch.Tensor
-    gradients: dict
-
-
-def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
-    """Raw parameters in float64, world frame: what is differentiated."""
-    raw = {name: getattr(g, name).detach().double().cpu() for name in PARAMETERS}
-    raw["means"] = raw["means"] + torch.tensor(np.asarray(g.origin, float))
-    return raw
+        return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}  # new leaves
 
 
 def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, fields: dict | None = None):
@@ -119,8 +97,8 @@ def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = N
         ValueError: If there is no such rasterizer, or a dump is damaged or of another scene; one line.
     """
     fields = fields or {}
-    if Path(text).suffix in _DUMPS:
-        return _dump(Path(text), g, cameras, tuple(fields.get("background", (0.0, 0.0, 0.0))))
+    if Path(text).suffix in SUFFIXES:
+        return read_dump(Path(text), g, cameras, tuple(fields.get("background", (0.0, 0.0, 0.0))))
     if text.startswith("drgs:"):
         name = text.removeprefix("drgs:")
         preset = "gsplat" if name == "ewa" else name
@@ -155,8 +133,9 @@ def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rast
     """`drgs.render` with these settings."""
 
     def draw(raw: dict, camera: Camera, background: tuple):
-        out = render(Gaussians(**raw), camera, settings.replace(background=background), outputs=())
-        return out.rgb, out.alpha
+        g, shift = gaussians_of(raw)
+        out = render(g, posed(raw, camera), settings.replace(background=background[:3]), outputs=())
+        return image_of(out, raw, shift), out.alpha
 
     return Rasterizer(name, draw, torch.float64, "cpu", preset)
 
@@ -167,30 +146,28 @@ def function(call: Callable, name: str) -> Rasterizer:
     open_ended = any(p.kind is p.VAR_KEYWORD for p in accepted.values())
 
     def draw(raw: dict, camera: Camera, background: tuple):
-        means = raw["means"]
+        means, camera = raw["means"], posed(raw, camera)
         like = {"dtype": means.dtype, "device": means.device}
         arguments = {
             "means": means,
             "quats": raw["quats"],
             "scales": raw["log_scales"].exp(),
             "opacities": raw["logit_opacities"].sigmoid(),
-            "colors": raw["sh"],
-            "viewmats": _tensor(camera.w2c).to(**like)[None],
-            "Ks": _tensor(camera.K).to(**like)[None],
+            "colors": raw[COLORS] if COLORS in raw else raw["sh"],
+            "viewmats": float64(camera.w2c).to(**like)[None],
+            "Ks": float64(camera.K).to(**like)[None],
             "width": camera.width,
             "height": camera.height,
         }
-        options = {
-            "sh_degree": sh_degree_of(raw["sh"].shape[1]),
-            "backgrounds": torch.tensor([background], **like),
-            "packed": False,
-        }
+        options = {"backgrounds": torch.tensor([background], **like), "packed": False}
+        if COLORS not in raw:
+            options["sh_degree"] = sh_degree_of(raw["sh"].shape[1])
         given = {k: v for k, v in options.items() if open_ended or k in accepted}
         try:
             returned = call(**arguments, **given)
         except Exception as error:
-            raise ValueError(f"--rasterizer {name}: raised {type(error).__name__}: {_line(error)}") from error
-        image, alpha = _checked(name, returned, camera)
+            raise ValueError(f"--rasterizer {name}: raised {type(error).__name__}: {one_line(error)}") from error
+        image, alpha = _checked(name, returned, camera, len(background))
         if "backgrounds" not in given:
             image = image + (1 - alpha[..., None]) * torch.tensor(background, **like)
         return image, alpha
@@ -225,134 +202,17 @@ def _taste(draw: Callable) -> tuple[torch.dtype, str]:
     return torch.float32, "cpu"
 
 
-def _checked(name: str, returned, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """(H, W, 3) and (H, W) of what a function returned."""
+def _checked(name: str, returned: object, camera: Camera, channels: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """(H, W, channels) and (H, W) of what a function returned."""
     if not isinstance(returned, tuple | list) or len(returned) < 2:
         got = type(returned).__name__
         raise ValueError(f"--rasterizer {name}: must return (image, alpha, info), got {got}")
     image, alpha = returned[:2]
     size = camera.height, camera.width
-    for what, x, last in (("image", image, 3), ("alpha", alpha, 1)):
+    for what, x, last in (("image", image, channels), ("alpha", alpha, 1)):
         if not isinstance(x, torch.Tensor):
             raise ValueError(f"--rasterizer {name}: its {what} must be a torch tensor, got {type(x).__name__}")
         if tuple(x.shape) not in ((1, *size, last), (*size, last)):
             wanted = f"(1, {size[0]}, {size[1]}, {last})"
             raise ValueError(f"--rasterizer {name}: its {what} must have shape {wanted}, got {tuple(x.shape)}")
-    return image.reshape(*size, 3), alpha.reshape(size)
-
-
-def _tensor(x) -> torch.Tensor:
-    """Of a tensor, or of an array that may be read-only."""
-    return x.detach() if isinstance(x, torch.Tensor) else torch.tensor(np.asarray(x))
-
-
-def _line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or ["without a message"])[0][:200]
-
-
-# ------------------------------------------------------------------------------------------- dumps
-
-
-def cotangents(cameras: list[Camera], seed: int) -> torch.Tensor:
-    """(C, H, W, 3) of +-1: the mean square of an error of J^T u is the error's Frobenius norm squared.
-
-    Raises:
-        ValueError: If the cameras differ in size.
-    """
-    sizes = {(camera.height, camera.width) for camera in cameras}
-    if len(sizes) != 1:
-        raise ValueError(f"crossval: cameras must have one image size, got {len(sizes)}; choose some with --limit")
-    generator = torch.Generator().manual_seed(seed)
-    shape = (len(cameras), *sizes.pop(), 3)
-    return torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
-
-
-def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict[str, np.ndarray]:
-    """What tells a scene from another: float32 raw parameters, world frame, cameras and background."""
-    arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
-    arrays["viewmat"] = np.stack([_tensor(c.w2c).float().numpy() for c in cameras])
-    arrays["K"] = np.stack([np.asarray(c.K, np.float32) for c in cameras])
-    arrays["width"], arrays["height"] = np.int64(cameras[0].width), np.int64(cameras[0].height)
-    arrays["background"] = np.asarray(background, np.float32)
-    return arrays
-
-
-def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, seed: int) -> None:
-    """Write the scene, its cameras and cotangents for a rasterizer on another machine (.npz).
-
-    Arrays: `means` (N,3), `quats` (N,4), `log_scales` (N,3), `logit_opacities` (N,), `sh` (N,K,3), `viewmat` (C,4,4),
-    `K` (C,3,3), `width`, `height`, `background` (3,), `cotangent` (C,H,W,3).
-    """
-    arrays = scene_arrays(g, cameras, background)
-    arrays["cotangent"] = cotangents(cameras, seed).float().numpy()
-    arrays[_EXPORT] = _signature(arrays)
-    with atomic_write(path) as file:
-        np.savez_compressed(file, **arrays)
-
-
-def is_export(path: Path) -> bool:
-    """Whether `export` wrote a file; a dump that was made of one holds more arrays."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return np.array_equal(arrays[_EXPORT], _signature({*arrays.files} - {_EXPORT}))
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile):
-        return False
-
-
-def _signature(names: Iterable[str]) -> np.ndarray:
-    """Of an export: numbers, for readers that make tensors of all that they find."""
-    return np.frombuffer(hashlib.sha256(" ".join(sorted(names)).encode()).digest(), np.uint8)
-
-
-def _dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple) -> Dump:
-    found = _arrays(path)
-    scene = scene_arrays(g, cameras, background)
-    count, size = len(cameras), (cameras[0].height, cameras[0].width)
-    shapes = {"image": (*size, 3), "alpha": size, "cotangent": (*size, 3)}
-    names = [*shapes, *(f"grad_{name}" for name in PARAMETERS), *scene]
-    if missing := [name for name in names if name not in found]:
-        raise ValueError(f"{path}: must hold {', '.join(names)}; {missing[0]} is missing; write it anew from --export")
-    for name, array in found.items():
-        if name in names and not np.isfinite(array).all():
-            index = tuple(int(i) for i in np.argwhere(~np.isfinite(np.atleast_1d(array)))[0])
-            if not name.startswith("grad_"):  # a gradient that is not finite is a finding
-                raise ValueError(f"{path}: {name} must be finite, is {np.atleast_1d(array)[index]} at {index}")
-    for name, wanted in scene.items():
-        got = found[name].reshape(wanted.shape) if found[name].size == wanted.size else found[name]
-        if got.shape != wanted.shape:
-            raise ValueError(f"{path}: {name} must have shape {wanted.shape}, got {got.shape}: it is of another scene")
-        if not np.allclose(got, wanted, rtol=1e-5, atol=1e-6):
-            what = "the same scene, cameras and background"
-            raise ValueError(f"{path}: must be of {what}, its {name} differs; write it anew from --export")
-    for name, shape in shapes.items():
-        got = found[name].squeeze(-1) if name == "alpha" and found[name].shape[-1:] == (1,) else found[name]
-        if got.shape == shape and count == 1:
-            got = got[None]
-        if got.shape != (count, *shape):
-            raise ValueError(f"{path}: {name} must have shape {(count, *shape)}, got {found[name].shape}")
-        found[name] = got
-    for name in PARAMETERS:
-        if found[f"grad_{name}"].shape != scene[name].shape:
-            wanted, got = scene[name].shape, found[f"grad_{name}"].shape
-            raise ValueError(f"{path}: grad_{name} must have shape {wanted}, got {got}")
-    as_tensor = {name: torch.tensor(found[name], dtype=torch.float64) for name in names if name not in scene}
-    gradients = {name: as_tensor[f"grad_{name}"] for name in PARAMETERS}
-    return Dump(str(path), as_tensor["image"], as_tensor["alpha"], as_tensor["cotangent"], gradients)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file; nothing in it is executed."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a file, there is none")
-    refuse_foreign(path, f"a {path.suffix} file of arrays")
-    if path.stat().st_size > _LARGEST:
-        raise ValueError(f"{path}: must have at most {_LARGEST >> 30} GiB, has {path.stat().st_size >> 30}")
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.numpy import load_file
-
-            return load_file(path)
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except Exception as error:
-        raise ValueError(f"{path}: must be a {path.suffix} file of arrays, got {_line(error)}") from None
+    return image.reshape(*size, channels), alpha.reshape(size)

@@ -1,0 +1,95 @@
+"""What is differentiated where rasterizers are compared: raw parameters by group, a view's pose, wide colors."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.oracle import float64
+from drgs.splats import color_of
+
+__all__ = [
+    "COLORS",
+    "POSE",
+    "PARAMETERS",
+    "depth_of",
+    "gaussians_of",
+    "image_of",
+    "posed",
+    "raw_of",
+    "with_colors",
+    "with_pose",
+]
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # raw, as crossval and the ladder compare them
+POSE = "viewmats"  # (6,) of one view, 0: see `posed`
+COLORS = "colors"  # (N, D) in place of `sh`
+
+
+def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
+    """Raw parameters in float64, world frame, without a graph: the leaves of every gradient."""
+    raw = {name: getattr(g, name).detach().double().cpu() for name in PARAMETERS}
+    raw["means"] = raw["means"] + torch.tensor(np.asarray(g.origin, float))
+    return raw
+
+
+def with_pose(raw: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The same, and the motion of a view, which is none."""
+    return {**raw, POSE: torch.zeros(6, dtype=torch.float64)}
+
+
+def with_colors(raw: dict[str, torch.Tensor], channels: int, seed: int) -> dict[str, torch.Tensor]:
+    """The same with random colors (N, D) in [0, 1] instead of SH."""
+    generator = torch.Generator().manual_seed(seed)
+    colors = torch.rand(len(raw["means"]), channels, generator=generator).double()
+    return {name: x for name, x in raw.items() if name != "sh"} | {COLORS: colors}
+
+
+def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
+    """The camera moved by raw["viewmats"] if that is there: w2c <- exp(xi) w2c, in the camera's own axes.
+
+    xi is a rotation about the camera's center in radians, then a translation in units of the Gaussians' median depth:
+    so both change the image by as much, and neither part of a gradient hides the other.
+    """
+    if POSE not in raw:
+        return camera
+    w2c, twist = float64(camera.w2c).detach(), float64(raw[POSE])  # the motion is the parameter, not the matrix
+    turn, shift = twist[:3], twist[3:] * depth_of(raw, camera)
+    zero = torch.zeros_like(turn[0])
+    rows = [
+        zero, -turn[2], turn[1], shift[0],
+        turn[2], zero, -turn[0], shift[1],
+        -turn[1], turn[0], zero, shift[2],
+        zero, zero, zero, zero,
+    ]  # fmt: skip
+    return dataclasses.replace(camera, w2c=torch.matrix_exp(torch.stack(rows).reshape(4, 4)) @ w2c)
+
+
+def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
+    """Median depth of the means in front of a camera, 1 where there is none: a unit, so without a derivative."""
+    w2c, means = float64(camera.w2c).detach(), float64(raw["means"]).detach()  # a unit is a constant
+    depths = means @ w2c[2, :3] + w2c[2, 3]
+    ahead = depths[depths > 0]
+    return float(ahead.median()) if len(ahead) else 1.0
+
+
+def gaussians_of(raw: dict[str, torch.Tensor]) -> tuple[Gaussians, float]:
+    """Gaussians with SH, or with colors of any width, and what was added to the first three channels of those."""
+    fields = {name: x for name, x in raw.items() if name not in (POSE, COLORS)}
+    if COLORS not in raw:
+        return Gaussians(**fields), 0.0
+    sh, features, shift = color_of(raw[COLORS])
+    return Gaussians(**fields, sh=sh, features=features), shift
+
+
+def image_of(out: Any, raw: dict[str, torch.Tensor], shift: float) -> torch.Tensor:
+    """(H, W, 3) color of what was rendered of `gaussians_of(raw)`; with colors (N, D) all D channels, on black."""
+    if COLORS not in raw:
+        return out.rgb
+    image = out.rgb[..., : raw[COLORS].shape[1]] - shift * out.alpha[..., None]
+    return image if out.features is None else torch.cat([image, out.features], -1)

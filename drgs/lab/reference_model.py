@@ -1,0 +1,235 @@
+"""What a rasterizer may do differently, as variations of a model that we can render.
+
+A `ReferenceModel` is a preset and what is unusual about it: the order of quaternions, where pixels are, what is done to
+opacities, and so on. Each variation is a change of our renderer's input, settings or output, differentiable as the
+rest, so that gradients can be compared at the conventions that were found (conventions.py).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from drgs import reference
+from drgs.cameras import Camera, rigid
+from drgs.integrator import render
+from drgs.lab.raw import COLORS, gaussians_of, image_of, posed
+from drgs.oracle import activate, float64, screen_rows
+from drgs.settings import RenderSettings
+
+__all__ = ["ORDERS", "ReferenceModel"]
+
+_SH0 = math.sqrt(1 / (4 * math.pi))
+ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
+_WINDOW = 16  # pixels a side
+_NEAR = 2e-6  # of the distance: some ten times what float32 loses where it computes a depth
+_EFFECT = 1e-5  # of a weight: what moves less moves no gradient by what counts
+_COMPENSATION_FLOOR = 0.005**2  # of the ratio of determinants
+
+
+@dataclasses.dataclass(frozen=True)
+class ReferenceModel:
+    """A preset and what is unusual about it.
+
+    Attributes:
+        settings: Response, order, cut-offs, background.
+        quaternions: `wxyz`, or `xyzw`: how the four numbers are read.
+        rotation: `as given`, or `transposed`.
+        scales: `linear`, or `exponential`: exp is applied to what already is a standard deviation.
+        opacities: `linear`, or `sigmoid`: the logistic function is applied to what already is an opacity.
+        compensation: `none`, or opacities times sqrt(det / det after dilation) as in anti-aliased modes: `full`, or `at
+            least 0.005`.
+        direction: Where SH are evaluated: `to the mean`, `to the camera` (the opposite), or `camera frame` (to the
+            mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
+        direction_gradient: Whether the mean gets a gradient through that direction.
+        sh_degree: Bands above it are left out.
+        sh_sign: Coefficients whose sign is turned: `none`, `odd m` (a basis without the factor (-1)^m), or a band.
+        channels: Order of the color channels of the image, or of the Gaussians' colors alone (`bgr, not behind`).
+        transfer: `none`, or `sRGB to linear`: applied to the finished image, or to what is in front of the background
+            (`sRGB to linear, not behind`).
+        pixel_center: Of column 0 and row 0.
+        flip: `none`, `vertical`, `horizontal`.
+        pose: `w2c`, or `c2w`: how the camera matrix is read.
+    """
+
+    settings: RenderSettings
+    quaternions: str = "wxyz"
+    rotation: str = "as given"
+    scales: str = "linear"
+    opacities: str = "linear"
+    compensation: str = "none"
+    direction: str = "to the mean"
+    direction_gradient: bool = True
+    sh_degree: int = 3
+    sh_sign: str = "none"
+    channels: str = "rgb"
+    transfer: str = "none"
+    pixel_center: tuple[float, float] = (0.5, 0.5)
+    flip: str = "none"
+    pose: str = "w2c"
+
+    def draw(self, raw: dict, camera: Camera, oracle: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+        """Image (H, W, 3) and alpha (H, W), differentiable by torch with respect to the raw parameters.
+
+        Args:
+            raw: Raw parameters by group, float64, and maybe a motion of the camera, `viewmats`. With `colors` (N, D)
+                instead of `sh` the image has D channels, on black.
+            camera: Pinhole.
+            oracle: By the float64 oracle instead of the renderer.
+        """
+        rows: dict[int, list] = {}
+        for (y, _), image, alpha in self._pieces(raw, camera, oracle):
+            rows.setdefault(y, []).append(torch.cat([image, alpha[..., None]], -1))
+        whole = self._flipped(torch.cat([torch.cat(row, 1) for row in rows.values()]))
+        return whole[..., :-1], whole[..., -1]
+
+    def gradient(self, raw: dict, camera: Camera, cotangent: torch.Tensor, oracle: bool = False) -> dict:
+        """float64 gradient of <cotangent, image> by group."""
+        leaves = {name: x.detach().clone().requires_grad_() for name, x in raw.items()}
+        total = {name: torch.zeros_like(x) for name, x in raw.items()}
+        cotangent = self._flipped(cotangent)  # of what is not flipped yet
+        # One piece at a time: what autograd keeps of it is freed before the next one is drawn.
+        for (y, x), image, _ in self._pieces(leaves, camera, oracle):
+            if image.requires_grad:
+                loss = (image * cotangent[y : y + image.shape[0], x : x + image.shape[1]]).sum()
+                found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
+                for name, slope in zip(leaves, found, strict=True):
+                    total[name] += 0 if slope is None else slope.double()
+        return total
+
+    def near_ties(self, raw: dict, camera: Camera) -> torch.Tensor:
+        """(H, W) bool: pixels that hang on what float32 cannot tell, by the float64 oracle.
+
+        Two Gaussians whose depths are as good as equal, or a hit or a ray on the very edge of a cut-off, as
+        `drgs.reference` marks them `ambiguous`: two correct renderers differ there, the gradient more than the image.
+        """
+        camera = self._camera(camera)
+        found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+        with torch.no_grad():
+            g, _ = gaussians_of(self._parameters(raw, camera))
+            for x, y, width, height in _windows(camera):
+                window = (x, y, width, height)
+                out = reference.render(
+                    g, camera, self.settings, tolerance=_NEAR, window=window, exact_ties=True, effect=_EFFECT
+                )
+                found[y : y + height, x : x + width] = out.ambiguous
+        return self._flipped(found)
+
+    def _pieces(self, raw: dict, camera: Camera, oracle: bool) -> Iterator[tuple]:
+        """The image before it is flipped, in pieces: (row, column) of its corner, image and alpha."""
+        camera = self._camera(posed(raw, camera))
+        g, shift = gaussians_of(self._parameters(raw, camera))
+        settings = self.settings.replace(background=(0.0, 0.0, 0.0)) if COLORS in raw else self.settings
+        if not oracle:
+            out = render(g, camera, settings, outputs=())
+            yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
+            return
+        for x, y, width, height in _windows(camera):
+            out = reference.render(g, camera, settings, window=(x, y, width, height))
+            yield ((y, x), *self._developed(image_of(out, raw, shift), out.alpha))
+
+    def _developed(self, image: torch.Tensor, alpha: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Image and alpha, float64, with this model's channels and transfer function."""
+        image, alpha = image.double(), alpha.double()
+        if image.shape[-1] == 3 and self.channels in ORDERS:
+            image = image[..., ["rgb".index(c) for c in self.channels]]
+        if self.transfer != "none":
+            behind = 0.0
+            if self.transfer.endswith("behind"):
+                behind = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
+            image = _linear(image - behind) + behind
+        return image, alpha
+
+    def _flipped(self, picture: torch.Tensor) -> torch.Tensor:
+        return picture if self.flip == "none" else picture.flip(("vertical", "horizontal").index(self.flip))
+
+    def replace(self, **fields) -> ReferenceModel:
+        """A copy with fields, or fields of the settings, replaced."""
+        own = {k: v for k, v in fields.items() if k in {f.name for f in dataclasses.fields(self)}}
+        rest = {k: v for k, v in fields.items() if k not in own}
+        settings = own.pop("settings", self.settings)
+        return dataclasses.replace(self, settings=settings.replace(**rest), **own)
+
+    def _camera(self, camera: Camera) -> Camera:
+        """What this model reads of a camera; a torch pose keeps its graph."""
+        K = np.array(camera.K, float)
+        K[:2, 2] += 0.5 - np.asarray(self.pixel_center)
+        w2c = camera.w2c
+        if self.pose == "c2w":
+            w2c = torch.linalg.inv(w2c) if isinstance(w2c, torch.Tensor) else np.linalg.inv(w2c)
+        return dataclasses.replace(camera, K=K, w2c=w2c)
+
+    def _parameters(self, raw: dict, camera: Camera) -> dict:
+        """The raw parameters that have this model's meaning in ours."""
+        raw = dict(raw)
+        if self.quaternions == "xyzw":
+            raw["quats"] = raw["quats"][:, [3, 0, 1, 2]]
+        if self.rotation == "transposed":
+            raw["quats"] = raw["quats"] * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
+        if self.scales == "exponential":
+            raw["log_scales"] = raw["log_scales"].exp()
+        if self.opacities == "sigmoid":
+            raw["logit_opacities"] = raw["logit_opacities"].sigmoid()
+        if self.compensation != "none" and self.settings.dilation > 0:
+            floor = 1e-12 if self.compensation == "full" else _COMPENSATION_FLOOR
+            alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings, floor)
+            raw["logit_opacities"] = torch.logit(alpha.clamp(1e-12, 1 - 1e-12))
+        if COLORS in raw:
+            return raw
+        raw["sh"] = self._sh(raw, camera)
+        if self.channels not in ORDERS:
+            raw["sh"] = raw["sh"][..., ["rgb".index(c) for c in self.channels[:3]]]
+        return raw
+
+    def _sh(self, raw: dict, camera: Camera) -> torch.Tensor:
+        """Coefficients that give the colors of this model: as they are, or of degree 0 where the direction is odd."""
+        sh = raw["sh"]
+        orders = [(degree, m) for degree in range(4) for m in range(-degree, degree + 1)][: sh.shape[1]]
+        factor = torch.tensor([float(degree <= self.sh_degree) for degree, _ in orders], dtype=torch.float64)
+        turned = [m % 2 == 1 if self.sh_sign == "odd m" else self.sh_sign == f"band {degree}" for degree, m in orders]
+        factor = torch.where(torch.tensor(turned), -factor, factor)
+        if not bool((factor == 1).all()):
+            sh = sh * factor[:, None]
+        if (self.direction == "to the mean" and self.direction_gradient) or sh.shape[1] == 1:
+            return sh
+        w2c = float64(camera.w2c)
+        rotation, translation = rigid(w2c)
+        towards = raw["means"] + rotation.T @ translation
+        # What is known as a detached direction is so for the mean and the camera.
+        towards = towards if self.direction_gradient else towards.detach()
+        towards = towards / towards.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+        if self.direction == "to the camera":
+            towards = -towards
+        elif self.direction == "camera frame":
+            towards = towards @ w2c[:3, :3].T
+        color = 0.5 + (reference.sh_basis(towards, sh.shape[1])[..., None] * sh).sum(1)
+        return ((color - 0.5) / _SH0)[:, None]  # the renderer clamps at 0 as ever
+
+
+def _windows(camera: Camera) -> Iterator[tuple[int, int, int, int]]:
+    """(x, y, width, height) of squares that cover the image: the oracle takes of each the Gaussians that it can see."""
+    for y in range(0, camera.height, _WINDOW):
+        for x in range(0, camera.width, _WINDOW):
+            yield x, y, min(_WINDOW, camera.width - x), min(_WINDOW, camera.height - y)
+
+
+def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) -> torch.Tensor:
+    """(N,) sqrt(det Sigma' / det(Sigma' + dilation I)) of the projected covariances, as Mip-Splatting has it."""
+    w2c = float64(camera.w2c)
+    x, y, z = (raw["means"] @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
+    z = torch.where(z > 1e-6, z, 1e-6)
+    axes = activate(gaussians_of(raw)[0], s).axes
+    a, b = screen_rows(x, y, z, camera, s.fov_clamp, w2c[:3, :3], axes).unbind(1)
+    det = torch.linalg.cross(a, b).square().sum(-1)
+    trace = (a * a + b * b).sum(-1)
+    ratio = det / (det + s.dilation * (trace + s.dilation))
+    return ratio.clamp_min(floor).sqrt()
+
+
+def _linear(x: torch.Tensor) -> torch.Tensor:
+    """Linear light of sRGB values."""
+    return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,124 @@
+"""Rows of a cross-validation's report; `dataclasses.asdict` of them is what `crossval.json` holds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+__all__ = ["AlphaRow", "Crop", "GroupRow", "OwnRow", "ViewRow", "WorstGaussian", "WorstPixel"]
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstPixel:
+    """A pixel where two images differ most."""
+
+    x: int
+    y: int
+    difference: float
+
+
+@dataclasses.dataclass(frozen=True)
+class AlphaRow:
+    """How far alpha is off: root of the mean square, and the mean."""
+
+    rms: float
+    bias: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewRow:
+    """One view's image beside the model's.
+
+    Attributes:
+        view: The camera's name.
+        rms, max: Of the difference.
+        share: Of the pixels that differ by more than 0.001.
+        alpha: Of the difference of alphas.
+        near_ties: Pixels that do not count.
+        worst: Up to five pixels.
+    """
+
+    view: str
+    rms: float
+    max: float
+    share: float
+    alpha: AlphaRow
+    near_ties: int
+    worst: list[WorstPixel]
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstGaussian:
+    """A Gaussian (of `viewmats`: a view) whose gradient is off by most, as a norm."""
+
+    gaussian: int
+    difference: float
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnRow:
+    """A gradient beside the rasterizer's own central differences.
+
+    Attributes:
+        entries: Flat indices of the group's parameters.
+        central, uncertainty, gradient: At each of them.
+        relative: L2 norm of the error over that of the differences.
+        left_out: Entries that did not converge.
+        bug: Whether the gradient contradicts the differences.
+        what: In words.
+        pixels_left_out: That jump on one of the steps.
+    """
+
+    entries: list[int]
+    central: list[float]
+    uncertainty: list[float]
+    gradient: list[float]
+    relative: float
+    left_out: int
+    bug: bool
+    what: str
+    pixels_left_out: int
+
+
+@dataclasses.dataclass
+class GroupRow:
+    """One parameter group's gradient beside the model's.
+
+    Attributes:
+        verdict: One of `crossval.VERDICTS`, None while it is to be explained.
+        why: In words.
+        worst: Up to five Gaussians.
+        relative: L2 norm of the difference over that of the model's gradient.
+        cosine, bias: Between the two; how much too long the gradient is along the model's.
+        max: Largest difference.
+        norm: Of the model's gradient.
+        differences: What decided, where they were asked for.
+    """
+
+    verdict: str | None
+    why: str
+    worst: list[WorstGaussian]
+    relative: float
+    cosine: float
+    bias: float
+    max: float
+    norm: float
+    differences: OwnRow | None = None
+
+    def settle(self, verdict: str, why: str) -> None:
+        """Give it its verdict."""
+        self.verdict, self.why = verdict, why
+
+    def json(self) -> dict:
+        """Without `differences` where there are none."""
+        return {name: x for name, x in dataclasses.asdict(self).items() if name != "differences" or x is not None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Crop:
+    """Where a crop lies in its view: a corner, its size, and the view's (width, height), in pixels."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    of: list[int]
