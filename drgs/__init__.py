@@ -68,7 +68,18 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from drgs import cameras as cameras
+    from drgs import cli as cli
+    from drgs import crossval as crossval
     from drgs import data, fisher, gain, reference, runtime, select
+    from drgs import ellipsoids as ellipsoids
+    from drgs import files as files
+    from drgs import integrator as integrator
+    from drgs import ladder as ladder
+    from drgs import metrics as metrics
+    from drgs import settings as settings
+    from drgs import testing as testing
+    from drgs import train as train
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply
