@@ -328,7 +328,7 @@ class _Blocks:
         bad = failed.nonzero()[:, 0]
         repaired, ridge = len(bad), _ROUNDING
         while len(bad):
-            if ridge > 1e-2:
+            if ridge > 1e-2:  # a percent of the diagonal is not rounding any more
                 raise ValueError(
                     f"block_gain: H + lambda must be positive definite, but is not for Gaussian {int(bad[0])}; "
                     "raise lambda or pass blocks that are sums of outer products"

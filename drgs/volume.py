@@ -157,6 +157,7 @@ def render_volume(
         scene = cull_near(scene, view.rotation, view.center, s, 0.0)
         if s.near > 0:
             scene = take(scene, scene.near_margin > 0)
+    # What can be left out, and where to sum, are choices without a derivative.
     reach = (2 * torch.log((scene.softplus.detach() / _CUT).clamp(min=1))).sqrt()
     keep = within(scene, reach, view.origins, view.directions)
     scene, reach = take(scene, keep), reach[keep]
@@ -203,7 +204,7 @@ def _chunk(
         return torch.where(used, tau, 0.0), t, slope, _phi(-t * slope), torch.cat(values, -1)
 
     made = _Line(*(checkpoint(line, o, d, use_reentrant=False) if differentiate else line(o, d)))
-    fixed = _Line(*(x.detach() for x in vars(made).values()))
+    fixed = _Line(*(x.detach() for x in vars(made).values()))  # the rule is a constant of the derivative
     with torch.no_grad():
         ray, a, h, error, tried = _plan(fixed, tolerance)
         error += left_out
@@ -214,7 +215,7 @@ def _chunk(
         nodes = tried + torch.bincount(ray, minlength=len(o)) * (2 * len(_NODES) - 1)
     shape = (len(o), made.values.shape[-1])
     total, moment = torch.zeros(shape, dtype=torch.float64), torch.zeros(len(o), dtype=torch.float64)
-    with torch.no_grad():
+    with torch.no_grad():  # only says which Gaussians matter where
         batches = list(_batches(fixed, ray, a, h))
     for part, active in batches:
         args = (made, ray[part], a[part], h[part], active)
@@ -247,6 +248,7 @@ def _meet(scene: SimpleNamespace, index: Tensor, o: Tensor, d: Tensor) -> tuple[
     t = -(local * step).sum(-1) / length2
     rho2 = torch.linalg.cross(local, step).square().sum(-1) / length2
     tau = scene.softplus[index] * torch.exp(-rho2 / 2)
+    # Where to widen is a choice; 1e-300 keeps the quotient finite for a peak at the origin.
     return tau, t, torch.minimum(length2.sqrt(), 1 / (_SHORT * t.detach().abs()).clamp(min=1e-300))
 
 
@@ -271,18 +273,21 @@ def _plan(line: _Line, tolerance: float) -> tuple:
             before, inside = _depths(line, r, low, h)
             front = torch.exp(-before.sum(1))
             weight = front * -torch.expm1(-inside.sum(1))
-            # Behind an opaque layer, or where nothing is: its weight is what it could add to a color of 1.
+            # Behind an opaque layer, or where nothing is: its weight is what it could add to a color of 1. Some ten
+            # roundings of 1 are not worth a rule, and count as error.
             nothing = weight < 3e-15
             error.index_add_(0, r[nothing], weight[nothing])
+            # The others add less than a hundredth of the tolerance each.
             matters = inside * front[:, None] > 1e-2 * tolerance * weight[:, None]
             coarse = (matters & (h[:, None] * line.slope[r] > _COARSE)).any(1)
-            final = h <= 1e-15 * high
+            final = h <= 1e-15 * high  # a few float64 numbers long: no use in halving
             look = torch.nonzero(~nothing & (~coarse | final))[:, 0]
             bad = ~nothing & coarse & ~final
             for batch, active in _batches(line, r[look], low[look], h[look], inside[look]):
                 at = look[batch]
                 (kronrod, gauss), _ = _integrate(line, r[at], low[at], h[at], active, before[at].sum(1))
                 off = (kronrod - gauss)[:, :4].abs().amax(1)
+                # Two sums of float64 terms around 1 differ by 1e-16 anyway.
                 poor = (off > tolerance * weight[at] + 1e-16) & ~final[at]
                 bad[at] = poor
                 nodes.index_add_(0, r[at[poor]], torch.full_like(r[at[poor]], 2 * len(_NODES) - 1))

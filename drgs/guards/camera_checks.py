@@ -24,7 +24,8 @@ __all__ = [
 ]
 
 _OPENCV_LENGTHS = (4, 5, 8)
-_ROTATION_TOLERANCE = 1e-4
+_ROTATION_TOLERANCE = 1e-4  # of R R^T: what four digits a number leave; more is a scale or a shear
+_ROW_TOLERANCE = 1e-6  # of the row 0 0 0 1, which only rounding may have touched
 # Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.
 IMAGE_MAX = 2**31  # pixels
 _FOCAL_MIN, _FOCAL_MAX, _DISTANCE_MAX, _DISTORTION_MAX = 1e-4, 1e6, 1e15, 1e6
@@ -99,7 +100,7 @@ def checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
             f"{where}: the pose must be finite, got {w2c[row, column]} at [{row}, {column}]; drop this view"
         )
     check_distance(where, w2c)
-    if np.abs(w2c[3] - (0, 0, 0, 1)).max() > 1e-6:
+    if np.abs(w2c[3] - (0, 0, 0, 1)).max() > _ROW_TOLERANCE:
         raise ValueError(f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
     rotation = w2c[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()

@@ -87,6 +87,6 @@ def camera_key(camera: Camera) -> tuple:
 
 def _by_value(x: Any) -> Hashable:
     """A hashable stand-in: arrays and tensors, which compare by entry, become their bytes."""
-    if isinstance(x, torch.Tensor):
+    if isinstance(x, torch.Tensor):  # a key is a value, whatever graph it is in
         x = x.detach().cpu().numpy()
     return (x.shape, x.dtype.str, x.tobytes()) if isinstance(x, np.ndarray) else x

@@ -7,6 +7,7 @@ the float32-rounded parameters; its pixels that hang on a near tie are left out 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -14,7 +15,8 @@ import torch
 from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
-from drgs.integrator import render, render_jvp
+from drgs.integrator import Output, render, render_jvp
+from drgs.settings import RenderSettings
 
 __all__ = [
     "FIELDS",
@@ -43,7 +45,7 @@ _ENTRIES = 1 << 22  # of an intermediate of the dense Jacobian held at once: 32 
 # -------------------------------------------------- random scenes
 
 
-def rotation(vector) -> np.ndarray:
+def rotation(vector: np.ndarray) -> np.ndarray:
     """(3, 3) rotation by a rotation vector."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:
@@ -53,7 +55,15 @@ def rotation(vector) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def random_camera(rng, size=(24, 22), distance=4.0, focal=None, turn=0.2, center=None, skew=0.0) -> Camera:
+def random_camera(
+    rng: np.random.Generator,
+    size: tuple[int, int] = (24, 22),
+    distance: float = 4.0,
+    focal: float | None = None,
+    turn: float = 0.2,
+    center: tuple[float, float] | None = None,
+    skew: float = 0.0,
+) -> Camera:
     """Looks at the origin from `distance` away, off its axis, with an off-center principal point.
 
     The focal length keeps 2 world units around the origin in the image unless it is given; `skew` is a multiple of it.
@@ -69,7 +79,16 @@ def random_camera(rng, size=(24, 22), distance=4.0, focal=None, turn=0.2, center
     return Camera(K=K, w2c=pose, width=width, height=height)
 
 
-def random_gaussians(rng, n=20, K=4, D=0, scale=0.15, spread=1.0, anisotropy=0.5, opacity=1.5) -> Gaussians:
+def random_gaussians(
+    rng: np.random.Generator,
+    n: int = 20,
+    K: int = 4,
+    D: int = 0,
+    scale: float = 0.15,
+    spread: float = 1.0,
+    anisotropy: float = 0.5,
+    opacity: float = 1.5,
+) -> Gaussians:
     """N Gaussians in a cube of half size `spread` around the origin, float32, all leaves.
 
     Args:
@@ -103,7 +122,7 @@ def twist_basis() -> torch.Tensor:
 
 def pose_gradient(cam: Camera, gradient: torch.Tensor) -> torch.Tensor:
     """(6,) the part of a gradient of w2c along the world twists c2w <- exp(xi) c2w."""
-    change = -cam.w2c.detach() @ twist_basis()
+    change = -cam.w2c.detach() @ twist_basis()  # where the pose is, not how it came there
     return (change * gradient).sum((1, 2))
 
 
@@ -112,7 +131,7 @@ def leaves(g: Gaussians, cam: Camera) -> dict[str, torch.Tensor]:
     return {**g.parameters(), "camera": cam.w2c}
 
 
-def inner(a: dict, b: dict) -> float:
+def inner(a: Mapping[str, torch.Tensor], b: Mapping[str, torch.Tensor]) -> float:
     """Sum over groups of <a, b>."""
     return float(sum((a[name] * b[name]).sum() for name in a))
 
@@ -132,7 +151,16 @@ class Oracle:
         v, push: Tangents of the groups and the tangent images they give.
     """
 
-    def __init__(self, g, cam, settings, rng, tolerance=1e-5, names=FIELDS, skip=None):
+    def __init__(
+        self,
+        g: Gaussians,
+        cam: Camera,
+        settings: RenderSettings,
+        rng: np.random.Generator,
+        tolerance: float = 1e-5,
+        names: Sequence[str] = FIELDS,
+        skip: torch.Tensor | None = None,
+    ):
         self.out = reference.render(g, cam, settings, tolerance=tolerance)
         self.good = ~self.out.ambiguous
         if skip is not None:
@@ -149,6 +177,7 @@ class Oracle:
         loss = sum((images[name] * u).sum() for name, u in self.u.items())
         groups = leaves(g, cam)
         back = _grad(loss, groups, create_graph=True)
+        # Tangents are constants, and so are the results: the graph has served.
         change = {**self.v, "camera": -cam.w2c.detach() @ (self.v["camera"][:, None, None] * twist_basis()).sum(0)}
         self.push = _grad(sum((back[name].double() * change[name]).sum() for name in back), self.u)
         self.back = {n: x.detach().double() for n, x in back.items()}
@@ -156,14 +185,16 @@ class Oracle:
         self.u = {name: u.detach() for name, u in self.u.items()}
 
 
-def _grad(loss, groups: dict, **options) -> dict:
+def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
     if not loss.requires_grad:
         return {name: torch.zeros_like(x) for name, x in groups.items()}
     found = torch.autograd.grad(loss, list(groups.values()), allow_unused=True, **options)
     return {n: torch.zeros_like(x) if y is None else y for (n, x), y in zip(groups.items(), found, strict=True)}
 
 
-def gradients(g: Gaussians, cam: Camera, out, u: dict) -> dict[str, torch.Tensor]:
+def gradients(
+    g: Gaussians, cam: Camera, out: Output | reference.Output, u: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
     """float64 gradient of sum <u, image> by group, `camera` as a twist."""
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
     found = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
@@ -185,17 +216,17 @@ class Errors:
         out: The renderer's `Output`.
     """
 
-    image: dict
-    gradient: dict
-    forward: dict
+    image: dict[str, float]
+    gradient: dict[str, float]
+    forward: dict[str, float]
     joint: float
     duality: float
     finite: bool
     count: int
-    out: object
+    out: Output
 
 
-def compare(g, cam, settings, oracle: Oracle) -> Errors:
+def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle) -> Errors:
     """Render, differentiate both ways and compare with the oracle."""
     out, ref, good = render(g, cam, settings, outputs="all"), oracle.out, oracle.good
     size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])
@@ -219,7 +250,7 @@ def compare(g, cam, settings, oracle: Oracle) -> Errors:
         gradient={name: relative(x, oracle.back[name]) for name, x in ours.items()},
         forward={name: relative(x[good], oracle.push[name][good]) for name, x in jv.items()},
         joint=relative(*both),
-        duality=abs(inner(jv, oracle.u) - inner(oracle.v, ours)) / max(scale, 1e-12),
+        duality=abs(inner(jv, oracle.u) - inner(oracle.v, ours)) / max(scale, 1e-12),  # both 0: an error of 0
         finite=finite,
         count=int(_largest((out.count - ref.count)[good])),
         out=out,
@@ -233,7 +264,7 @@ def _largest(x: torch.Tensor) -> float:
 # -------------------------------------------------- the dense Jacobian
 
 
-def jacobian(g, out, features: bool = False) -> dict[str, torch.Tensor]:
+def jacobian(g: Gaussians, out: reference.Output, features: bool = False) -> dict[str, torch.Tensor]:
     """Group of `drgs.fisher` -> (3 P, parameters...) float64 derivative of the oracle's rgb.
 
     Args:
@@ -251,7 +282,7 @@ def jacobian(g, out, features: bool = False) -> dict[str, torch.Tensor]:
     return J
 
 
-def turn(quats, slope) -> torch.Tensor:
+def turn(quats: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:
     """(..., N, 3) derivative by a world-frame rotation R <- exp([w]x) R of one by the quaternion (..., N, 4)."""
     w, x, y, z = quats.unbind(1)
     moves = torch.stack(  # dq/dw_k = (0, e_k) q / 2, written out
@@ -260,14 +291,14 @@ def turn(quats, slope) -> torch.Tensor:
     return 0.5 * torch.einsum("...nq,nkq->...nk", slope, moves)
 
 
-def squares(J: dict) -> dict[str, torch.Tensor]:
+def squares(J: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """The diagonal of J^T J by group."""
     return {name: x.square().sum(0) for name, x in J.items()}
 
 
 def entry_error(a: torch.Tensor, b: torch.Tensor) -> float:
     """Largest difference, relative to the largest entry of b."""
-    return _largest(a - b) / max(_largest(b), 1e-12)
+    return _largest(a - b) / max(_largest(b), 1e-12)  # where b is 0, the difference itself, times 1e12
 
 
 def _dense(flat: torch.Tensor, inputs: list[torch.Tensor]) -> list[torch.Tensor]:

@@ -155,7 +155,7 @@ def sequences(start: RenderSettings, end: RenderSettings) -> tuple[list, list]:
 def _with_needs(order: list[str]) -> list[str]:
     """Each rung behind those that it needs; repeated where a later one needs it too."""
 
-    def whole(rung):
+    def whole(rung: str) -> list[str]:
         needed = [n for n in order if n in _NEEDS.get(rung, ())]
         return [*(x for n in needed for x in whole(n)), rung]
 
@@ -168,7 +168,9 @@ def _switched(a: RenderSettings, b: RenderSettings) -> dict:
     return {name: list(pair) for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def _rungs(names, switched, states: list[State], exact: State | None = None) -> tuple[list[dict], dict]:
+def _rungs(
+    names: list[str], switched: list[dict], states: list[State], exact: State | None = None
+) -> tuple[list[dict], dict]:
     """One row a step, and one of the whole way, as JSON."""
     exact, total = exact or states[-1], states[-1] - states[0]
     ways = zip(names, switched, states[:-1], states[1:], strict=True)

@@ -93,7 +93,7 @@ class Pictures:
         self.windows = [(x, y, width, height)]
         if x < width and y < height:
             return
-        with torch.no_grad():
+        with torch.no_grad():  # where a crop lies has no derivative
             alpha = render(self.g, camera, s, outputs=()).alpha
         corners = [(x, y) for y in (0, camera.height - height) for x in (0, camera.width - width)]
         x, y = max(corners, key=lambda at: float(alpha[at[1] : at[1] + height, at[0] : at[0] + width].sum()))
@@ -109,7 +109,7 @@ class Pictures:
         moving = {name: self.g.parameters()[name].clone().requires_grad_(self.gradients) for name in PARAMETERS}
         return self.g.replace(features=None, **moving)
 
-    def _state(self, g: Gaussians, images: list, cotangents: list) -> State:
+    def _state(self, g: Gaussians, images: list[torch.Tensor], cotangents: list[torch.Tensor]) -> State:
         """Images as rows of pixels, and J^T u by backward mode where gradients are wanted."""
         gradient = {}
         if self.gradients:
@@ -121,6 +121,7 @@ class Pictures:
                 found = [None] * len(leaves)
             for name, leaf, x in zip(PARAMETERS, leaves, found, strict=True):
                 gradient[name] = torch.zeros_like(leaf) if x is None else x.detach().cpu()
+        # What is kept are numbers: a graph would hold every picture's intermediates.
         return State(torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in images]), gradient)
 
     def _full(self, s: RenderSettings, detached: bool) -> State:

@@ -13,7 +13,7 @@ import functools
 import math
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,9 +22,11 @@ import torch
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
+    from drgs.gain import Information
     from drgs.lab.accuracy import Oracle
     from drgs.lab.extremes import Case
     from drgs.lab.refusals import Refusal
+    from drgs.settings import RenderSettings
 
 __all__ = ["BOUNDS", "Row", "Truth", "measure", "refused", "rows", "truth_of"]
 
@@ -77,7 +79,7 @@ def rows(case: Case | Refusal) -> Iterator[Row]:
         yield _caught(case.name, traversal, lambda traversal=traversal: measure(case, traversal, truth()))
 
 
-def _caught(name: str, traversal: str, make) -> Row:
+def _caught(name: str, traversal: str, make: Callable[[], Row]) -> Row:
     try:
         return make()
     except Exception as error:  # whatever a backend does wrong must not end the run
@@ -101,7 +103,7 @@ class Truth:
     cam: Camera
     oracle: Oracle
     view: Camera | None
-    information: dict
+    information: Information
     remark: str
 
 
@@ -113,6 +115,7 @@ def truth_of(case: Case) -> Truth:
     rng, settings = np.random.default_rng(3), case.settings
     g, cam = case.build(rng)
     names = [name for name in FIELDS if case.depth or name != "depth"]
+    # 1e-6: near ties of float32 keys, ten times its rounding.
     oracle = Oracle(g, cam, settings, rng, 1e-6, names)
     good, out, view, remark = oracle.good, oracle.out, cam, ""
     whole = settings.culling == "extent" and settings.fov_clamp == "none"
@@ -182,15 +185,16 @@ def measure(case: Case, traversal: str, truth: Truth) -> Row:
     )
 
 
-def _rounded(g, cam) -> dict:
+def _rounded(g: Gaussians, cam: Camera) -> dict[str, float]:
     """`BOUNDS` of hits in float32 world space; derivatives have four times the error, their squares twice that."""
+    # Numbers for a bound, no part of a graph.
     far = (g.means.detach().double() - torch.tensor(cam.center - g.origin)).norm(dim=1)
     unit = _ROUNDING * float((far / g.scales.detach().double().amin(1)).max())
     more = {"image": unit, "gradient": 4 * unit, "forward": 4 * unit, "fisher": 8 * unit}
     return {name: max(bound, more.get(name, 0.0)) for name, bound in BOUNDS.items()}
 
 
-def _information(case: Case, settings, truth: Truth) -> tuple[float | None, bool, str]:
+def _information(case: Case, settings: RenderSettings, truth: Truth) -> tuple[float | None, bool, str]:
     """Error of the Fisher diagonal (and gains), whether all of it and of the blocks is finite, and a remark."""
     from drgs import fisher
     from drgs.lab.accuracy import entry_error
@@ -209,7 +213,7 @@ def _information(case: Case, settings, truth: Truth) -> tuple[float | None, bool
     return max(error, gain), finite, remark
 
 
-def _gain(g, cam, settings, H, truth) -> tuple[float, str]:
+def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, truth: Information) -> tuple[float, str]:
     """Relative error of the gains of a second view for lambda = 0, and a remark; NaN if one is not defined."""
     from drgs import fisher, reference
     from drgs.gain import Prior, information_gain
@@ -228,7 +232,7 @@ def _gain(g, cam, settings, H, truth) -> tuple[float, str]:
             a, c = truth[name][keep], true[name][keep]
             terms = {"logdet": (c / a).log1p(), "eig": c / a, "trace_cov": 1 / a - 1 / (a + c)}
             want += float(terms[criterion].sum())
-        worst = max(worst, abs(gain.total - want) / max(abs(want), 1e-12))
+        worst = max(worst, abs(gain.total - want) / max(abs(want), 1e-12))  # a gain of 0 is compared absolutely
     left = {name: int((~keep).sum()) for name, keep in seen.items()}
     blocks = information_gain(
         {"blocks": fisher.blocks(g, other, settings)},
@@ -242,7 +246,7 @@ def _gain(g, cam, settings, H, truth) -> tuple[float, str]:
     return worst, f"gain of a second view (logdet, eig, trace_cov) {worst:.0e}, {count} of {total} entries left out"
 
 
-def _window(cam, good, most: int):
+def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
     """The camera of the largest rectangle of good pixels, shortened to `most` pixels."""
     height, width = good.shape
     best, heights = (0, 0, 0, 0, 0), np.zeros(width, int)
