@@ -19,7 +19,7 @@ from drgs.integrator import render
 from drgs.lab.tradeoff import measure
 from drgs.lab.tradeoff_advice import USES, interval, recommend
 from drgs.lab.tradeoff_full import measure_full
-from drgs.lab.tradeoff_rows import VARIANTS
+from drgs.lab.tradeoff_rows import VARIANTS, Errors, GroupInformation, Interval, Measured, Row
 from drgs.settings import RenderSettings
 
 BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
@@ -140,8 +140,7 @@ def test_gradient_error_is_the_jacobians(place, monkeypatch):
     )
     variants = tuple(v for v in VARIANTS if v.name in ("exact", "fast"))
     found = [
-        measure(g, [camera], variants, repeats=0, seed=seed)["rows"][1]["gradient"]["groups"]["log_scales"]
-        for seed in range(40)
+        measure(g, [camera], variants, repeats=0, seed=seed).rows[1].gradient.groups["log_scales"] for seed in range(40)
     ]
     want = float((fast - exact).norm() / exact.norm())
     assert np.median(found) == pytest.approx(want, rel=0.3)
@@ -229,56 +228,61 @@ def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     assert [(view["width"], view["height"]) for view in report["views"]] == [(20, 16)] * 2
     assert report["full"]["forward"]["size"] == report["full"]["forward"]["drawn"] == [80, 64]
 
+    g, variants = load_ply(place / "scene.ply"), tuple(v for v in VARIANTS if v.name in ("exact", "fast"))
+    measured = measure(g, [camera.resized(20, 16) for camera in large], variants, repeats=1)
+
     def timed(seconds):
         monkeypatch.setattr("drgs.lab.tradeoff_full.clocked", lambda work: (None, seconds))  # whatever is done
-        found = measure_full(report, load_ply(place / "scene.ply"), large, BUDGETS, 1, 60.0, 0, lambda text: None)
-        return found["forward"]
+        return measure_full(measured, g, large, BUDGETS, 1, 60.0, 0, lambda text: None)["forward"]
 
     smaller = timed(8.0)
-    assert [20, 16] < smaller["size"] < smaller["drawn"] == [80, 64]
-    assert 1 <= smaller["rounds"] < 3
+    assert [20, 16] < smaller.size < smaller.drawn == [80, 64]
+    assert 1 <= smaller.rounds < 3
     assert tradeoff._size(smaller).endswith("(of 80x64: --seconds)")
-    row = rows(report)["fast"]
-    scatter = report["scatter"]["forward"]
-    assert row["full"]["forward"]["low"] <= scatter["low"]  # a ratio of 1, as wide as equal work scatters
-    assert row["full"]["forward"]["high"] >= scatter["high"]
-    assert timed(100.0)["names"] == []
+    row, scatter = measured.rows[1], measured.scatter["forward"]
+    assert row.full["forward"].low <= scatter.low  # a ratio of 1, as wide as equal work scatters
+    assert row.full["forward"].high >= scatter.high
+    assert timed(100.0).names == []
 
 
 def test_intervals_of_the_median():
     """All of fewer than six ratios; of more, what a sign test leaves: 95 % of medians of equal work lie around 1."""
     assert interval([]) is None
-    assert interval([0.9, 1.2, 1.0]) == {"ratio": 1.0, "low": 0.9, "high": 1.2, "rounds": 3}
+    assert interval([0.9, 1.2, 1.0]) == Interval(ratio=1.0, low=0.9, high=1.2, rounds=3)
     found = interval([x / 10 for x in range(1, 13)])  # of twelve: from the third to the tenth
-    assert (found["low"], found["high"]) == (0.3, 1.0)
+    assert (found.low, found.high) == (0.3, 1.0)
     rng = np.random.default_rng(0)
-    inside = [found["low"] <= 1 <= found["high"] for found in map(interval, rng.normal(1, 0.1, (2000, 9)).tolist())]
+    inside = [found.low <= 1 <= found.high for found in map(interval, rng.normal(1, 0.1, (2000, 9)).tolist())]
     assert 0.95 <= np.mean(inside) <= 0.97  # between the second and the eighth of nine: 96.1 %
 
 
 def test_jitter_is_no_gain():
     """Of settings that do exact's own work none is recommended, however the times fall; real gains are."""
-    times = lambda low, ratio, high: {"ratio": ratio, "low": low, "high": high, "rounds": 5}  # noqa: E731
-    made = {"rows": [], "scatter": {"forward": times(0.93, 1.0, 1.06)}}
-    rows_made = (("exact", (1, 1, 1), 1e-7), ("same", (0.9, 0.92, 0.96), 1e-7), ("half", (0.4, 0.5, 0.6), 1e-4))
-    for name, span, error in rows_made:
-        row = {"name": name, "kind": "x", "share": 1, "by": "view", "skipped": None, "errors": {"image": error}}
-        made["rows"].append(row | {"times": {"forward": times(*span)}, "full": {}})
-    picks = recommend(made, "image", [1e-9, 1e-5, 1e-3])
-    assert picks[0]["name"] is None
-    assert picks[1]["name"] == "exact"
-    assert not picks[1]["gain"]
-    assert picks[1]["reason"] == "no measurable gain over exact"
-    assert picks[2]["name"] == "half"
-    assert picks[2]["gain"]
+    times = lambda low, ratio, high: Interval(ratio=ratio, low=low, high=high, rounds=5)  # noqa: E731
+    row = lambda name, span, error: Row(  # noqa: E731
+        name=name, kind="x", errors=Errors(image=error), times={"forward": times(*span)}
+    )
+    exact, same, half = (
+        row("exact", (1, 1, 1), 1e-7),
+        row("same", (0.9, 0.92, 0.96), 1e-7),
+        row("half", (0.4, 0.5, 0.6), 1e-4),
+    )
+    scatter = {"forward": times(0.93, 1.0, 1.06)}
+    made = lambda *rows: Measured(list(rows), Errors(), scatter, 1.0, 5, "wall")  # noqa: E731
+    picks = recommend(made(exact, same, half), "image", [1e-9, 1e-5, 1e-3])
+    assert picks[0].name is None
+    assert picks[1].name == "exact"
+    assert not picks[1].gain
+    assert picks[1].reason == "no measurable gain over exact"
+    assert picks[2].name == "half"
+    assert picks[2].gain
     # At full size half is no faster: that is what counts.
-    made["rows"][2]["full"] = {"forward": times(0.9, 1.0, 1.1)}
-    assert not recommend(made, "image", [1e-3])[0]["gain"]
+    half.full = {"forward": times(0.9, 1.0, 1.1)}
+    assert not recommend(made(exact, same, half), "image", [1e-3])[0].gain
     # One as fast and more exact is preferred.
-    made["rows"][2]["full"] = {}
-    made["rows"].append(made["rows"][2] | {"name": "finer", "errors": {"image": 1e-6}})
-    made["rows"][3] |= {"times": {"forward": times(0.55, 0.57, 0.59)}}
-    assert recommend(made, "image", [1e-3])[0]["name"] == "finer"
+    half.full = {}
+    finer = row("finer", (0.55, 0.57, 0.59), 1e-6)
+    assert recommend(made(exact, same, half, finer), "image", [1e-3])[0].name == "finer"
 
 
 def test_flags_can_be_used(report):
@@ -390,7 +394,7 @@ def test_groups_without_a_derivative_have_no_error(place):
     g = load_ply(place / "scene.ply")
     g = g.replace(log_scales=g.log_scales[:, :1].expand(-1, 3).contiguous())
     variants = tuple(v for v in VARIANTS if v.name in ("exact", "extent=4"))
-    row = measure(g, load_cameras_json(place / "cameras.json"), variants, repeats=0)["rows"][1]
-    assert row["gradient"]["groups"]["quats"] is None
-    assert row["information"]["groups"]["rotations"] == {"l1": None, "median": None}
-    assert 0 < row["gradient"]["worst"] < 0.2
+    row = measure(g, load_cameras_json(place / "cameras.json"), variants, repeats=0).rows[1]
+    assert row.gradient.groups["quats"] is None
+    assert row.information.groups["rotations"] == GroupInformation(None, None)
+    assert 0 < row.gradient.worst < 0.2

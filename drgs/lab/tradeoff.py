@@ -1,36 +1,50 @@
-"""Times and errors of render settings against preset `exact`, (what they are: commands/tradeoff.py)."""
+"""Times and errors of render settings against preset `exact` (what they are: commands/tradeoff.py)."""
 
 from __future__ import annotations
 
-import math
+import dataclasses
 import random
 import statistics
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
 
 from drgs import fisher, reference, runtime
-from drgs.integrator import render
+from drgs.integrator import render, render_rays
 from drgs.lab.tradeoff_advice import interval
-from drgs.lab.tradeoff_rows import one_line, rows_of
-from drgs.settings import RenderSettings
+from drgs.lab.tradeoff_rows import (
+    CLOCKS,
+    Errors,
+    GradientError,
+    ImageError,
+    InformationError,
+    Measured,
+    Row,
+    Variant,
+    one_line,
+    rows_of,
+)
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
-    from drgs.lab.tradeoff_rows import Variant
+    from drgs.integrator import Output
+    from drgs.settings import RenderSettings
 
 __all__ = ["clocked", "measure", "placed"]
+
+Tensors = dict[str, torch.Tensor]
+Result = TypeVar("Result")
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
 _AT_LEAST = 3  # but not before so many
 _RAYS = 200  # of a sample on Mitsuba's traversal
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
 _NOTHING = 1e-6  # alpha of a view that shows nothing
-_UNSEEN = 1e-6  # of the largest: entries of the diagonal, and groups, that are left out of relative errors
+_UNSEEN = 1e-6  # of the largest: entries of the diagonal that are left out of relative errors
 
 
 def measure(
@@ -41,7 +55,7 @@ def measure(
     repeats: int = 5,
     seed: int = 0,
     advance: Callable[[], None] = lambda: None,
-) -> dict:
+) -> Measured:
     """Times and errors of settings.
 
     Args:
@@ -53,20 +67,17 @@ def measure(
         seed: Of the cotangents, of the samples of pixels and of the order within a round.
         advance: Called after each turn.
     Returns:
-        `rows`, in the order of `variants` (name, kind, settings, share, by, skipped; image, gradient, information,
-        errors, seconds, ratio, times (intervals of the ratios, see tradeoff_advice.py), first_call), `scatter` (of the
-        truth's times against itself), `own` (errors of the truth against the oracle), `pixels` (of one view on
-        average), `rounds`, `clock` (wall or processor). Where there is no number there is None, and the reason in
-        `skipped` or `notes`.
+        A row for each of `variants`. Where there is no number there is None, and the reason in `skipped` or `notes`.
     Raises:
         ValueError: If no view shows a Gaussian, or the truth cannot be computed.
     """
     gaussians = placed(gaussians)
     stage = _Stage(gaussians, cameras, seed)
     rows = rows_of(variants, fields or {})
-    turns = [_Turn(row, stage) for row in rows if row["skipped"] is None and row["by"] == "view"]
+    turns = [_Turn(row, stage) for row in rows if row.skipped is None and row.by == "view"]
     truth, others = turns[0], turns[1:]
-    again = _Turn(dict(truth.row), stage)  # the truth once more in every round: how much equal work scatters
+    # The truth once more in every round: how much equal work scatters.
+    again = _Turn(dataclasses.replace(truth.row), stage)
     others.append(again)
     order, done = random.Random(seed), 0
     began = time.perf_counter(), time.process_time()
@@ -88,22 +99,30 @@ def measure(
         turn.finish(truth)
     own = _sampled(rows, stage, truth, seed)
     for row in rows:
-        row["errors"] = _bound(row, own)
+        row.errors = row.bound(own)
     pixels = statistics.mean(camera.width * camera.height for camera in cameras)
-    return {
-        "rows": rows,
-        "own": own,
-        "scatter": again.row["times"],
-        "pixels": pixels,
-        "rounds": done,
-        "clock": _clock_name(),
-    }
+    return Measured(rows, own, again.row.times, pixels, done, _clock_name())
 
 
 def placed(gaussians: Gaussians) -> Gaussians:
     """Where they are rendered, without a graph."""
     device = "cuda" if runtime.backend().name == "cuda" else "cpu"
     return gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
+
+
+@dataclasses.dataclass(frozen=True)
+class _Seen:
+    """What a setting makes of a view.
+
+    Attributes:
+        image: (H, W, 3), on the CPU.
+        slopes: J^T u by group.
+        information: The Fisher diagonal by group; None where the setting has none.
+    """
+
+    image: torch.Tensor
+    slopes: Tensors
+    information: Tensors | None
 
 
 class _Stage:
@@ -114,7 +133,7 @@ class _Stage:
         sampled: The view of which rays are sampled.
     """
 
-    def __init__(self, gaussians, cameras, seed):
+    def __init__(self, gaussians: Gaussians, cameras: list[Camera], seed: int):
         self.gaussians, self.cameras = gaussians, cameras
         self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
         self.moving = gaussians.replace(**self.leaves)
@@ -124,9 +143,10 @@ class _Stage:
         self.cotangents = [
             (torch.randint(0, 2, size, generator=generator) * 2 - 1).float().to(device) for size in sizes
         ]
-        self.truth, self.shown, self.sampled = {}, False, 0
+        self.truth: dict[int, _Seen] = {}
+        self.shown, self.sampled = False, 0
 
-    def image(self, g, camera, settings, share):
+    def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
         """(H, W, 3), whatever the share of its resolution that is rendered."""
         out = render(g, _reduced(camera, share), settings, outputs=())
         self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)
@@ -136,7 +156,7 @@ class _Stage:
         image = out.rgb.permute(2, 0, 1)[None]
         return torch.nn.functional.interpolate(image, size=size, mode="bilinear")[0].permute(1, 2, 0)
 
-    def check(self, settings) -> None:
+    def check(self, settings: RenderSettings) -> None:
         """Find a view that shows something.
 
         Raises:
@@ -151,13 +171,14 @@ class _Stage:
         count = len(self.cameras)
         raise ValueError(f"tradeoff: one of {count} cameras must show a Gaussian, all are empty; choose others")
 
-    def pull(self, image, cotangent) -> dict:
+    def pull(self, image: torch.Tensor, cotangent: torch.Tensor) -> Tensors:
         """J^T u by group."""
         found = torch.autograd.grad((image * cotangent).sum(), list(self.leaves.values()), allow_unused=True)
         pairs = zip(self.leaves.items(), found, strict=True)
         return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
 
-    def information(self, camera, settings, share) -> dict:
+    def information(self, camera: Camera, settings: RenderSettings, share: float) -> Tensors:
+        """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is looked at."""
         small = _reduced(camera, share)
         found = fisher.diagonal(self.gaussians, small, settings)
         scale = camera.width * camera.height / (small.width * small.height)
@@ -167,26 +188,31 @@ class _Stage:
 class _Turn:
     """One row's measurements, view by view and round by round."""
 
-    def __init__(self, row, stage):
+    def __init__(self, row: Row, stage: _Stage):
         self.row, self.stage = row, stage
-        self.settings = RenderSettings(**row["settings"])
-        self.seconds = {"forward": {}, "forward_backward": {}, "fisher": {}}
+        self.settings = row.settings
+        self.seconds = {name: {} for name in CLOCKS}
         self.pixels, self.slopes, self.parts, self.medians = [], {}, {}, {}
         self.first = 0.0
 
     def take(self, number: int, timed: bool) -> None:
         """Render, differentiate and inform one view; errors if it is new."""
-        if self.row["skipped"] is not None:
+        if self.row.skipped is not None:
             return
         try:
             self._take(number, timed)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
             if number % len(self.stage.cameras) not in self.stage.truth:
                 raise  # this is the truth
-            self.row["skipped"] = one_line(error)
+            self.row.skipped = one_line(error)
 
-    def _take(self, number, timed):
-        stage, view, share = self.stage, number % len(self.stage.cameras), self.row["share"]
+    def _take(self, number: int, timed: bool) -> None:
+        """`take`, unless the row is skipped.
+
+        Raises:
+            ValueError, NotImplementedError, OSError, RuntimeError: If the setting cannot be, or gives no numbers.
+        """
+        stage, view, share = self.stage, number % len(self.stage.cameras), self.row.share
         camera, took = stage.cameras[view], {}
         with torch.no_grad():
             _, took["forward"] = clocked(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
@@ -197,11 +223,11 @@ class _Turn:
 
         (image, slopes), took["forward_backward"] = clocked(both)
         parts = None
-        if "information" not in self.row["notes"]:
+        if "information" not in self.row.notes:
             try:
                 parts, took["fisher"] = clocked(lambda: stage.information(camera, self.settings, share))
             except NotImplementedError as error:
-                self.row["notes"]["information"] = one_line(error)
+                self.row.notes["information"] = one_line(error)
         if number == 0:
             self.first = sum(took.values())
         if timed:
@@ -209,115 +235,109 @@ class _Turn:
                 self.seconds[name][number] = seconds
         if number < len(stage.cameras):
             if not all(bool(torch.isfinite(x).all()) for x in (image, *slopes.values(), *(parts or {}).values())):
-                raise ValueError(f"{self.row['name']}: must be finite, view {camera.name or view} has NaN or Inf")
-            self._compare(stage.truth.setdefault(view, (image, slopes, parts)), image, slopes, parts)
+                raise ValueError(f"{self.row.name}: must be finite, view {camera.name or view} has NaN or Inf")
+            seen = _Seen(image, slopes, parts)
+            self._compare(stage.truth.setdefault(view, seen), seen)
 
-    def _compare(self, truth, image, slopes, parts):
-        self.pixels.append((image - truth[0]).abs().double().reshape(-1).numpy())
-        for name, x in slopes.items():
+    def _compare(self, truth: _Seen, seen: _Seen) -> None:
+        """Add one view's differences from the truth: sizes of pixels', sums by group, medians of entries."""
+        self.pixels.append((seen.image - truth.image).abs().double().reshape(-1).numpy())
+        for name, x in seen.slopes.items():
             a, b = self.slopes.get(name, (0.0, 0.0))
-            y = truth[1][name]
+            y = truth.slopes[name]
             self.slopes[name] = a + _squares(x - y), b + _squares(y)
-        for name, x in (parts or {}).items() if truth[2] else ():
-            y, (a, b) = truth[2][name], self.parts.get(name, (0.0, 0.0))
+        for name, x in (seen.information or {}).items() if truth.information else ():
+            y, (a, b) = truth.information[name], self.parts.get(name, (0.0, 0.0))
             self.parts[name] = a + float((x - y).abs().sum()), b + float(y.sum())
-            seen = y > _UNSEEN * y.max()
-            if bool(seen.any()):
-                self.medians.setdefault(name, []).append(float(((x - y).abs()[seen] / y[seen]).median()))
+            known = y > _UNSEEN * y.max()
+            if bool(known.any()):
+                self.medians.setdefault(name, []).append(float(((x - y).abs()[known] / y[known]).median()))
 
     def finish(self, truth: _Turn) -> None:
         """Fill the row."""
-        if self.row["skipped"] is not None:
+        if self.row.skipped is not None:
             return
-        self.row["image"] = _image_errors(np.concatenate(self.pixels))
-        self.row["gradient"] = _gradient_errors(self.slopes)
+        self.row.image = ImageError.of(np.concatenate(self.pixels))
+        self.row.gradient = GradientError.of(self.slopes)
         if self.parts:
-            names = _compared({name: b for name, (_, b) in self.parts.items()}, _UNSEEN**2)
-            groups = {}
-            for name, (a, b) in self.parts.items():
-                known = name in names
-                groups[name] = {
-                    "l1": a / b if known else None,
-                    "median": statistics.mean(self.medians[name]) if known else None,
-                }
-            worst = max(names, key=lambda name: max(groups[name].values()), default=None)
-            self.row["information"] = {"groups": groups, "group": worst, **(groups[worst] if worst else {})}
+            medians = {name: statistics.mean(x) for name, x in self.medians.items()}
+            self.row.information = InformationError.of(self.parts, medians)
         warm, times = {}, {}
         for name, x in self.seconds.items():
             both = x.keys() & truth.seconds[name].keys()
             warm[name] = statistics.median(x.values()) if x else None
             times[name] = interval([x[k] / truth.seconds[name][k] for k in both])
-        self.row["seconds"], self.row["times"] = warm, times
-        self.row["ratio"] = {name: x and x["ratio"] for name, x in times.items()}
-        self.row["first_call"] = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
+        self.row.seconds, self.row.times = warm, times
+        self.row.ratio = {name: x and x.ratio for name, x in times.items()}
+        self.row.first_call = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
 
 
-def _sampled(rows, stage: _Stage, truth: _Turn, seed: int) -> dict:
+def _sampled(rows: list[Row], stage: _Stage, truth: _Turn, seed: int) -> Errors:
     """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
     camera, count = stage.cameras[stage.sampled], len(stage.gaussians)
     pixels = camera.width * camera.height
     places = torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
-    own = {"image": None, "gradient": None, "information": None}
+    own = Errors()
     for row in rows:
-        if row["skipped"] is not None or row["by"] == "view":
+        if row.skipped is not None or row.by == "view":
             continue
-        wanted = _RAYS if row["by"] == "rays" else max(32, min(_RAYS, _PAIRS // count))
+        wanted = _RAYS if row.by == "rays" else max(32, min(_RAYS, _PAIRS // count))
         chosen = places[:wanted].sort().values
         try:
             found = _by_rays(row, stage, truth, chosen)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
-            row["skipped"] = one_line(error)
+            row.skipped = one_line(error)
             continue
-        if row["by"] == "oracle":
+        if row.by == "oracle":
             own = found
     return own
 
 
-def _by_rays(row, stage: _Stage, truth: _Turn, chosen) -> dict:
+def _by_rays(row: Row, stage: _Stage, truth: _Turn, chosen: torch.Tensor) -> Errors:
     """One row on some pixels of a view: errors against the truth's image, time scaled to all of them."""
-    camera, oracle = stage.cameras[stage.sampled], row["by"] == "oracle"
+    camera, oracle = stage.cameras[stage.sampled], row.by == "oracle"
     whole = stage.cotangents[stage.sampled]
     pixels = camera.width * camera.height
-    forward, both = _tracer(stage, RenderSettings(**row["settings"]), chosen, oracle)
+    forward, both = _tracer(stage, row.settings, chosen, oracle)
     fixed, start = [0.0, 0.0], 0.0
     if not oracle:
         # The acceleration structure does not grow with the number of rays. The first call compiles.
-        few = _tracer(stage, RenderSettings(**row["settings"]), chosen[:1], oracle)
+        few = _tracer(stage, row.settings, chosen[:1], oracle)
         start = sum(clocked(work)[1] for work in few)
         fixed = [clocked(work)[1] for work in few]
     out, first = clocked(forward)
     good = ~out.ambiguous if oracle else torch.ones(len(chosen), dtype=torch.bool)
     slopes, second = clocked(lambda: both(good))
-    off = (out.rgb.cpu().double() - stage.truth[stage.sampled][0].reshape(-1, 3)[chosen].double()).abs()
-    row["image"] = _image_errors(off[good].numpy().reshape(-1))
+    off = (out.rgb.cpu().double() - stage.truth[stage.sampled].image.reshape(-1, 3)[chosen].double()).abs()
+    row.image = ImageError.of(off[good].numpy().reshape(-1))
     u = torch.zeros_like(whole)
     u.reshape(-1, 3)[chosen[good]] = whole.reshape(-1, 3)[chosen[good]]
     right = stage.pull(stage.image(stage.moving, camera, truth.settings, 1), u)
     # Relative to whichever is the better of the two.
-    row["gradient"] = _gradient_errors(
+    row.gradient = GradientError.of(
         {name: (_squares(slopes[name] - x), _squares(slopes[name] if oracle else x)) for name, x in right.items()}
     )
     times = [a + max(b - a, 0.0) * pixels / len(chosen) for a, b in zip(fixed, (first, second), strict=True)]
     names = ("forward", "forward_backward")
-    row["seconds"] = dict(zip(names, times, strict=True)) | {"fisher": None}
-    exact = truth.row["seconds"]
-    row["ratio"] = {k: x / exact[k] if x and exact[k] else None for k, x in row["seconds"].items()}
-    row["first_call"] = max(start - sum(fixed), 0.0)
-    row["notes"] |= {
+    row.seconds = dict(zip(names, times, strict=True)) | {"fisher": None}
+    exact = truth.row.seconds
+    row.ratio = {k: x / exact[k] if x and exact[k] else None for k, x in row.seconds.items()}
+    row.first_call = max(start - sum(fixed), 0.0)
+    row.notes |= {
         "sample": f"{len(chosen)} of {pixels} rays of one view; times scaled to all of them",
         "information": "not measured on single rays",
     }
     if oracle:
-        row["notes"] |= {"ties": int((~good).sum()), "max with ties": float(off.max())}
-    own = row["gradient"]["worst"]
+        row.notes |= {"ties": int((~good).sum()), "max with ties": float(off.max())}
+    own = row.gradient.worst
     # |x^2 - y^2| = |x - y| |x + y|, summed: at most 2 e + e^2 of sum y^2 where x - y is e of y in the L2 norm.
-    return {"image": row["image"]["max"], "gradient": own, "information": own and 2 * own + own**2}
+    return Errors(row.image.max, own, own and 2 * own + own**2)
 
 
-def _tracer(stage: _Stage, settings, chosen, oracle: bool):
+def _tracer(
+    stage: _Stage, settings: RenderSettings, chosen: torch.Tensor, oracle: bool
+) -> tuple[Callable[[], Output], Callable[..., Tensors]]:
     """Functions that trace these pixels' rays: the image, and the gradients of some of them."""
-    from drgs.integrator import render_rays
-
     camera = stage.cameras[stage.sampled]
     directions = torch.from_numpy(camera.pixel_directions().reshape(-1, 3))[chosen]
     origins = torch.from_numpy(camera.center.copy()).expand(directions.shape)
@@ -339,49 +359,6 @@ def _tracer(stage: _Stage, settings, chosen, oracle: bool):
     return forward, both
 
 
-def _bound(row: dict, own: dict) -> dict:
-    """What budgets are compared with: the worst measure of each kind, plus the truth's own error."""
-    found = {"image": None, "gradient": None, "information": None}
-    if row["skipped"] is not None or row["by"] == "oracle":
-        return found
-    if row["image"]:
-        found["image"] = max(row["image"]["rms"], row["image"]["p999"])
-    if row["gradient"]:
-        found["gradient"] = row["gradient"]["worst"]
-    if row["information"] and row["information"]["group"]:
-        found["information"] = max(row["information"]["l1"], row["information"]["median"])
-    return {kind: None if x is None else x + (own[kind] or 0.0) for kind, x in found.items()}
-
-
-def _image_errors(off: np.ndarray) -> dict:
-    if not off.size:
-        raise ValueError("every sampled pixel is a tie; choose another --seed")
-    rms = float(np.sqrt(np.mean(off**2)))
-    psnr = -20 * math.log10(rms) if rms > 0 else None
-    return {"rms": rms, "p999": float(np.quantile(off, 0.999)), "max": float(off.max()), "psnr": psnr}
-
-
-def _gradient_errors(squares: dict) -> dict:
-    """From sums of squares of the difference and of the truth, by group."""
-    names = _compared({name: b for name, (_, b) in squares.items()}, _UNSEEN**2)
-    groups = {name: math.sqrt(a / b) if name in names else None for name, (a, b) in squares.items()}
-    worst = max(names, key=groups.get, default=None)
-    total = sum(b for _, b in squares.values())
-    return {
-        "all": math.sqrt(sum(a for a, _ in squares.values()) / total) if total else None,
-        "worst": groups[worst] if worst else None,
-        "group": worst,
-        "groups": groups,
-    }
-
-
-def _compared(sizes: dict, share: float) -> list[str]:
-    """Groups that have a relative error: rotating spheres changes nothing, and rounding would look like an error."""
-    # Means have a unit, the others do not.
-    least = share * max((x for name, x in sizes.items() if name != "means"), default=0.0)
-    return [name for name, x in sizes.items() if x > (0.0 if name == "means" else least)]
-
-
 def _squares(x: torch.Tensor) -> float:
     return float(x.double().square().sum())
 
@@ -392,7 +369,7 @@ def _reduced(camera: Camera, share: float) -> Camera:
     return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
-def clocked(work: Callable):
+def clocked(work: Callable[[], Result]) -> tuple[Result, float]:
     """What it returns, and the seconds until it was computed."""
     import drjit as dr
 

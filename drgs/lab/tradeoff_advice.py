@@ -7,10 +7,15 @@ scatters. A setting has a gain if its whole interval lies below 1 and below that
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import statistics
+from collections.abc import Sequence
+from typing import Any
 
-__all__ = ["USES", "interval", "leaders", "recommend"]
+from drgs.lab.tradeoff_rows import Interval, Measured, Row
+
+__all__ = ["USES", "Pick", "interval", "leaders", "recommend"]
 
 USES = {
     "image": ("forward", ("image",)),
@@ -23,11 +28,48 @@ USES = {
 _SURE = 0.05  # two-sided; of the interval, by the sign test
 
 
-def interval(ratios: list[float]) -> dict | None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pick:
+    """What is recommended for a use and a budget.
+
+    Attributes:
+        use, budget: For which.
+        clock: The time that counts.
+        name: Of the row; None where no setting is within the budget, and then all that follows `reason` is None.
+        gain: Whether it is faster than `exact`.
+        reason: Why there is no setting, or no gain.
+        kind, flags: Of the row.
+        error: Its largest that counts.
+        full: Whether its time is of views as large as they are drawn.
+        ratio, low, high, rounds: Of its times to exact's.
+    """
+
+    use: str
+    budget: float
+    clock: str
+    name: str | None = None
+    gain: bool = False
+    reason: str | None = None
+    kind: str | None = None
+    flags: str | None = None
+    error: float | None = None
+    full: bool | None = None
+    ratio: float | None = None
+    low: float | None = None
+    high: float | None = None
+    rounds: int | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As tradeoff.json holds it: what was not found has no numbers."""
+        value = dataclasses.asdict(self)
+        return value if self.name else {k: value[k] for k in ("use", "budget", "clock", "name", "gain", "reason")}
+
+
+def interval(ratios: Sequence[float]) -> Interval | None:
     """The median and the two order statistics between which it lies with 95 %; fewer than six: all of them.
 
     Returns:
-        `ratio`, `low`, `high` and `rounds`; None of an empty list.
+        None of an empty list.
     """
     if not ratios:
         return None
@@ -35,67 +77,71 @@ def interval(ratios: list[float]) -> dict | None:
     while 2 * (tail + math.comb(n, k + 1) * 0.5**n) <= _SURE:
         k += 1
         tail += math.comb(n, k) * 0.5**n
-    return {"ratio": statistics.median(x), "low": x[k], "high": x[-1 - k], "rounds": n}
+    return Interval(ratio=statistics.median(x), low=x[k], high=x[-1 - k], rounds=n)
 
 
-def leaders(measured: dict, clock: str, budgets) -> list[str]:
+def leaders(measured: Measured, clock: str, budgets: Sequence[float]) -> list[str]:
     """Names of the rows that are worth timing at full size: the fastest within each budget, and preset `fast`."""
     names = []
     for use, (its, _) in USES.items():
         for budget in budgets if its == clock else ():
-            rows = [row for row, _ in _within(measured, use, budget) if row["times"][clock]["ratio"] < 1]
-            names += [min(rows, key=lambda row: row["times"][clock]["ratio"])["name"]] if rows else []
-    fast = [r["name"] for r in measured["rows"] if r["name"] == "fast" and r["skipped"] is None and r["times"][clock]]
+            rows = [row for row, _ in _within(measured, use, budget) if row.times[clock].ratio < 1]
+            names += [min(rows, key=lambda row: row.times[clock].ratio).name] if rows else []
+    fast = [row.name for row in measured.rows if row.name == "fast" and row.skipped is None and row.times[clock]]
     return list(dict.fromkeys([*fast, *names]))
 
 
-def recommend(measured: dict, use: str, budgets) -> list[dict]:
+def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Pick]:
     """For each budget the fastest setting with a gain, the most exact one of those as fast, or why there is none.
 
     Args:
-        measured: Of `tradeoff.measure`, and what `tradeoff_full.measure_full` added to its rows under `full`:
-            where a clock was read at full size, only that counts. Rows of a reduced resolution and rows that were
-            measured on a sample of the rays are no candidates.
+        measured: Of `tradeoff.measure`, and what `tradeoff_full.measure_full` added to its rows under `full`: where a
+            clock was read at full size, only that counts. Rows of a reduced resolution and rows that were measured on
+            a sample of the rays are no candidates.
         use: One of `USES`.
         budgets: > 0.
     """
-    clock, kinds = USES[use]
-    scatter = measured["scatter"][clock]
-    sure = min(1.0, scatter["low"]) if scatter else 1.0
+    clock = USES[use][0]
+    scatter = measured.scatter[clock]
+    sure = min(1.0, scatter.low) if scatter else 1.0
     picks = []
     for budget in budgets:
-        pick = {"use": use, "budget": budget, "clock": clock, "name": None, "gain": False, "reason": None}
         within = _within(measured, use, budget)
-        full = any(row["full"].get(clock) for row, _ in within)
-        timed = [(row, error, row["full"].get(clock) if full else row["times"][clock]) for row, error in within]
-        faster = [(row, error, times) for row, error, times in timed if times and times["high"] < sure]
-        exact = next((entry for entry in timed if entry[0] is measured["rows"][0]), None)
+        full = any(row.full.get(clock) for row, _ in within)
+        timed = [(row, error, row.full.get(clock) if full else row.times[clock]) for row, error in within]
+        faster = [(row, error, times) for row, error, times in timed if times and times.high < sure]
+        exact = next((entry for entry in timed if entry[0] is measured.truth), None)
+        pick = Pick(use=use, budget=budget, clock=clock)
         if faster or exact:
             if faster:
-                least = min(faster, key=lambda entry: entry[2]["ratio"])
-                alike = [entry for entry in faster if entry[2]["low"] <= least[2]["high"]]
+                least = min(faster, key=lambda entry: entry[2].ratio)
+                alike = [entry for entry in faster if entry[2].low <= least[2].high]
                 row, error, times = min(alike, key=lambda entry: entry[1])
             else:
                 row, error, times = exact
-                times = times or row["times"][clock]
-                pick["reason"] = "no measurable gain over exact"
-            pick |= {"name": row["name"], "kind": row["kind"], "flags": row.get("flags"), "gain": bool(faster)}
-            pick |= {"error": error, "full": full, **{k: times[k] for k in ("ratio", "low", "high", "rounds")}}
+                times = times or row.times[clock]
+                pick = dataclasses.replace(pick, reason="no measurable gain over exact")
+            found = {"name": row.name, "kind": row.kind, "flags": row.flags, "gain": bool(faster), "full": full}
+            numbers = {name: getattr(times, name) for name in ("ratio", "low", "high", "rounds")}
+            pick = dataclasses.replace(pick, error=error, **found, **numbers)
         else:
-            every = _within(measured, use, math.inf)
-            if every:
-                row, error = min(every, key=lambda entry: entry[1])
-                pick["reason"] = f"no setting is within it, the least error is {error:.1e} ({row['name']})"
-            else:
-                pick["reason"] = f"there is no setting whose {' and '.join(kinds)} error could be measured"
+            pick = dataclasses.replace(pick, reason=_why_none(measured, use))
         picks.append(pick)
     return picks
 
 
-def _within(measured: dict, use: str, budget: float) -> list[tuple[dict, float]]:
+def _why_none(measured: Measured, use: str) -> str:
+    """Why a budget has no setting."""
+    every = _within(measured, use, math.inf)
+    if not every:
+        return f"there is no setting whose {' and '.join(USES[use][1])} error could be measured"
+    row, error = min(every, key=lambda entry: entry[1])
+    return f"no setting is within it, the least error is {error:.1e} ({row.name})"
+
+
+def _within(measured: Measured, use: str, budget: float) -> list[tuple[Row, float]]:
     """Candidates whose errors are within the budget, with the largest of them."""
     clock, kinds = USES[use]
-    rows = [r for r in measured["rows"] if r["skipped"] is None and r["share"] == 1 and r["by"] == "view"]
-    rows = [r for r in rows if all(r["errors"][k] is not None for k in kinds) and r["times"][clock] is not None]
-    found = [(row, max(row["errors"][k] for k in kinds)) for row in rows]
-    return [(row, error) for row, error in found if error <= budget]
+    rows = [row for row in measured.rows if row.skipped is None and row.share == 1 and row.by == "view"]
+    found = [(row, row.errors.worst(kinds)) for row in rows if row.times[clock] is not None]
+    return [(row, error) for row, error in found if error is not None and error <= budget]

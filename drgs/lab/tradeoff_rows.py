@@ -1,12 +1,39 @@
-"""Rows of `drgs tradeoff`: the settings that are compared with preset `exact`."""
+"""Rows of `drgs tradeoff`: the settings that are compared with preset `exact`, and what is measured of each."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
 
 from drgs.settings import RenderSettings
 
-__all__ = ["VARIANTS", "Variant", "one_line", "rows_of"]
+__all__ = [
+    "CLOCKS",
+    "VARIANTS",
+    "Errors",
+    "GradientError",
+    "GroupInformation",
+    "ImageError",
+    "InformationError",
+    "Interval",
+    "Measured",
+    "Row",
+    "Variant",
+    "one_line",
+    "rows_of",
+]
+
+CLOCKS = ("forward", "forward_backward", "fisher")
+"""What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""
+
+_UNSEEN = 1e-6  # of the largest: groups that are left out of relative errors
+
+
+# ------------------------------------------------------------------------------- which settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,28 +111,6 @@ VARIANTS = (
 )
 
 
-def rows_of(variants, fields: dict) -> list[dict]:
-    """Rows without numbers; those that cannot or need not be measured say why."""
-    rows, seen = [], {}
-    for variant in variants:
-        row = {"name": variant.name, "kind": variant.kind, "share": variant.share, "by": variant.by, "skipped": None}
-        row |= {"settings": None, "image": None, "gradient": None, "information": None, "notes": {}}
-        row |= {"seconds": None, "ratio": None, "times": None, "first_call": None, "full": {}}
-        try:
-            settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
-        except (ValueError, NotImplementedError) as error:
-            if not rows:
-                raise  # the truth itself
-            row["skipped"] = one_line(error)
-        else:
-            row["settings"] = dataclasses.asdict(settings)
-            same = seen.setdefault((settings, variant.share, variant.by == "oracle"), variant.name)
-            if same != variant.name:
-                row["skipped"] = f"the same as {same}, with these --set"
-        rows.append(row)
-    return rows
-
-
 def _short(value) -> str:
     if value == 1 / 255:
         return "1/255"
@@ -117,3 +122,227 @@ def _short(value) -> str:
 def one_line(error: Exception) -> str:
     """Why something was skipped."""
     return " ".join(str(error).split()).removeprefix("RenderSettings: ") or type(error).__name__
+
+
+# ------------------------------------------------------------------------------ what is measured
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageError:
+    """Absolute differences of all values of all views: RMS, 99.9th percentile, largest; PSNR for peak 1, None of 0."""
+
+    rms: float
+    p999: float
+    max: float
+    psnr: float | None
+
+    @classmethod
+    def of(cls, off: np.ndarray) -> ImageError:
+        """From the differences' sizes (P,).
+
+        Raises:
+            ValueError: If there is none.
+        """
+        if not off.size:
+            raise ValueError("every sampled pixel is a tie; choose another --seed")
+        rms = float(np.sqrt(np.mean(off**2)))
+        psnr = -20 * math.log10(rms) if rms > 0 else None
+        return cls(rms, float(np.quantile(off, 0.999)), float(off.max()), psnr)
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientError:
+    """Relative L2 errors of a gradient.
+
+    Attributes:
+        all: Of all groups together; None where there is no gradient.
+        worst, group: The largest of a group, and that group's name; None where no group has one.
+        groups: Group -> its error; None where it has no gradient to speak of.
+    """
+
+    all: float | None
+    worst: float | None
+    group: str | None
+    groups: dict[str, float | None]
+
+    @classmethod
+    def of(cls, squares: dict[str, tuple[float, float]]) -> GradientError:
+        """From sums of squares of the difference and of the truth, by group."""
+        names = _compared({name: b for name, (_, b) in squares.items()})
+        groups = {name: math.sqrt(a / b) if name in names else None for name, (a, b) in squares.items()}
+        worst = max(names, key=groups.get, default=None)
+        total = sum(b for _, b in squares.values())
+        whole = math.sqrt(sum(a for a, _ in squares.values()) / total) if total else None
+        return cls(whole, groups[worst] if worst else None, worst, groups)
+
+
+@dataclasses.dataclass(frozen=True)
+class GroupInformation:
+    """Relative errors of a group's diagonal: L1, and the median of its entries'; None where it is all but 0."""
+
+    l1: float | None
+    median: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class InformationError:
+    """Relative errors of the Fisher diagonal.
+
+    Attributes:
+        groups: Group -> its errors.
+        group: That with the largest, None where no group has one.
+        l1, median: Its errors.
+    """
+
+    groups: dict[str, GroupInformation]
+    group: str | None
+    l1: float | None
+    median: float | None
+
+    @classmethod
+    def of(cls, sums: dict[str, tuple[float, float]], medians: dict[str, float]) -> InformationError:
+        """From sums of the differences' sizes and of the truth, and medians of relative differences, by group."""
+        names = _compared({name: b for name, (_, b) in sums.items()})
+        nothing = GroupInformation(None, None)
+        groups = {n: GroupInformation(a / b, medians[n]) if n in names else nothing for n, (a, b) in sums.items()}
+        worst = max(names, key=lambda name: max(groups[name].l1, groups[name].median), default=None)
+        chosen = groups[worst] if worst else nothing
+        return cls(groups, worst, chosen.l1, chosen.median)
+
+
+def _compared(sizes: dict[str, float]) -> list[str]:
+    """Groups that have a relative error: rotating spheres changes nothing, and rounding would look like an error."""
+    # Means have a unit, the others do not.
+    least = _UNSEEN**2 * max((x for name, x in sizes.items() if name != "means"), default=0.0)
+    return [name for name, x in sizes.items() if x > (0.0 if name == "means" else least)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """What a budget is compared with, by kind; None where there is no number."""
+
+    image: float | None = None
+    gradient: float | None = None
+    information: float | None = None
+
+    def worst(self, kinds: Sequence[str]) -> float | None:
+        """The largest of some kinds, None if one of them is missing."""
+        values = [getattr(self, kind) for kind in kinds]
+        return None if None in values else max(values)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A median of ratios of times, the two order statistics between which it lies with 95 %, and how many there are."""
+
+    ratio: float
+    low: float
+    high: float
+    rounds: int
+
+
+@dataclasses.dataclass(kw_only=True)
+class Row:
+    """A variant, and what was measured of it, in the order of tradeoff.json.
+
+    Attributes:
+        name, kind, share, by: Of the variant.
+        skipped: Why nothing was measured, else None.
+        settings: Its own, with the user's; None where these cannot be.
+        image, gradient, information: Differences from the truth; None where there are none.
+        notes: What a reader should know, by subject.
+        seconds: Clock -> median; None where a clock was not read.
+        ratio: Clock -> median ratio to the truth's.
+        times: Clock -> these ratios; None of what was measured once, on a sample.
+        first_call: Seconds that the first view took longer than others.
+        full: Clock -> ratios on views as large as they are drawn (tradeoff_full.py), where they were timed.
+        errors: What budgets are compared with: the worst measure of each kind, plus the truth's own error.
+        flags: Options of other commands for these settings; None of the oracle.
+    """
+
+    name: str
+    kind: str
+    share: float = 1.0
+    by: str = "view"
+    skipped: str | None = None
+    settings: RenderSettings | None = None
+    image: ImageError | None = None
+    gradient: GradientError | None = None
+    information: InformationError | None = None
+    notes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    seconds: dict[str, float | None] | None = None
+    ratio: dict[str, float | None] | None = None
+    times: dict[str, Interval | None] | None = None
+    first_call: float | None = None
+    full: dict[str, Interval] = dataclasses.field(default_factory=dict)
+    errors: Errors = Errors()
+    flags: str | None = None
+
+    def bound(self, own: Errors) -> Errors:
+        """`errors`, where the truth's own are known."""
+        if self.skipped is not None or self.by == "oracle":
+            return Errors()
+        found = {}
+        if self.image:
+            found["image"] = max(self.image.rms, self.image.p999)
+        if self.gradient and self.gradient.worst is not None:
+            found["gradient"] = self.gradient.worst
+        if self.information and self.information.group:
+            found["information"] = max(self.information.l1, self.information.median)
+        return Errors(**{kind: x + (getattr(own, kind) or 0.0) for kind, x in found.items()})
+
+    def to_json(self) -> dict[str, Any]:
+        """As tradeoff.json holds it."""
+        value = dataclasses.asdict(self)
+        if self.information and self.information.group is None:
+            del value["information"]["l1"], value["information"]["median"]
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """Times and errors of settings.
+
+    Attributes:
+        rows: In the order of the variants; the first one is the truth.
+        own: Errors of the truth against the oracle.
+        scatter: Clock -> the truth's times against itself.
+        pixels: Of one view, on average.
+        rounds: Of timing.
+        clock: `wall` or `processor`.
+    """
+
+    rows: list[Row]
+    own: Errors
+    scatter: dict[str, Interval | None]
+    pixels: float
+    rounds: int
+    clock: str
+
+    @property
+    def truth(self) -> Row:
+        """What the others are compared with."""
+        return self.rows[0]
+
+    def to_json(self) -> dict[str, Any]:
+        """As tradeoff.json holds it."""
+        return dataclasses.asdict(self) | {"rows": [row.to_json() for row in self.rows]}
+
+
+def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[Row]:
+    """Rows without numbers; those that cannot or need not be measured say why."""
+    rows, seen = [], {}
+    for variant in variants:
+        row = Row(name=variant.name, kind=variant.kind, share=variant.share, by=variant.by)
+        try:
+            row.settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
+        except (ValueError, NotImplementedError) as error:
+            if not rows:
+                raise  # the truth itself
+            row.skipped = one_line(error)
+        else:
+            same = seen.setdefault((row.settings, variant.share, variant.by == "oracle"), variant.name)
+            if same != variant.name:
+                row.skipped = f"the same as {same}, with these --set"
+        rows.append(row)
+    return rows

@@ -1,0 +1,110 @@
+"""The plot of `drgs tradeoff`: error against time, for each use."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs.guards.outputs import replacing
+from drgs.lab.tradeoff_rows import Measured, Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot"]
+
+Point = tuple[float, float, Row]
+"""Ratio of times, error, and whose they are."""
+
+_PANELS = (
+    ("image", "forward", "image error (larger of RMS and 99.9 %)"),
+    ("gradient", "forward_backward", "gradient error (worst group)"),
+    ("information", "fisher", "information error (worst group)"),
+)
+_COLORS = {"approximation": "#1f77b4", "model": "#d62728", "resolution": "#2ca02c", "precision": "#7f7f7f"}
+
+
+def plot(measured: Measured, budgets: Sequence[float], title: str, path: Path) -> bool:
+    """Write error against time for each use, one panel below the other.
+
+    Args:
+        measured: Times and errors of all rows; those of samples are left out.
+        budgets: Drawn as lines.
+        title: Above.
+        path: A .png.
+    Returns:
+        False where there is no matplotlib.
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(3, 1, figsize=(10, 15), dpi=90)
+    for axis, (kind, clock, label) in zip(panels, _PANELS, strict=True):
+        rows = [row for row in measured.rows if row.skipped is None and row.by == "view"]
+        points = [(row.ratio[clock], getattr(row.errors, kind), row) for row in rows]
+        points = [(x, y, row) for x, y, row in points if x and y]
+        for name, color in _COLORS.items():
+            part = [(x, y) for x, y, row in points if row.kind == name]
+            axis.plot(*zip(*part, strict=True), "o", ms=5, color=color, label=name) if part else None
+        points.sort(key=lambda p: p[:2])
+        front = [p for i, p in enumerate(points) if all(p[1] < q[1] for q in points[:i])]
+        axis.plot([p[0] for p in front], [p[1] for p in front], "-", lw=1, color="black", label="front", zorder=0)
+        axis.set(xscale="log", yscale="log", ylabel=label, xlabel=f"time, {clock.replace('_', ' + ')} / exact")
+        axis.margins(x=0.25, y=0.12)
+        for budget in budgets:
+            axis.axhline(budget, lw=0.6, ls=":", color="gray", zorder=0)
+        axis.legend(fontsize=7, loc="upper right")
+        # The front first: what finds no free place is left without a label.
+        rest = [p for p in points if p not in front]
+        _labels(figure, axis, [*front, *rest], points)
+    figure.suptitle(title, fontsize=10)
+    figure.tight_layout(rect=(0, 0, 1, 0.985))
+    with replacing(path, path.suffix) as name:
+        figure.savefig(name)
+    plt.close(figure)
+    return True
+
+
+def _labels(figure: Figure, axis: Axes, points: list[Point], dots: list[Point]) -> None:
+    """Names beside points, without overlaps; a point whose surroundings are full goes without."""
+    from matplotlib.transforms import Bbox
+
+    figure.tight_layout(rect=(0, 0, 1, 0.985))  # places do not move any more
+    renderer, inside = figure.canvas.get_renderer(), axis.get_window_extent()
+    places = [axis.transData.transform(p[:2]) for p in dots]
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
+    taken.append(axis.get_legend().get_window_extent(renderer))
+    for x, y, row in points:
+        for reach in (6, 16, 30, 46):
+            for angle in (0, 180, 90, 270, 45, 315, 135, 225):
+                dx, dy = reach * math.cos(math.radians(angle)), reach * math.sin(math.radians(angle))
+                text = axis.annotate(
+                    row.name,
+                    (x, y),
+                    xytext=(dx, dy),
+                    textcoords="offset points",
+                    fontsize=7.5,
+                    color=_COLORS[row.kind],
+                    ha="left" if dx > 1 else "right" if dx < -1 else "center",
+                    va="bottom" if dy > 1 else "top" if dy < -1 else "center",
+                    arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "gray"} if reach > 6 else None,
+                )
+                box = text.get_window_extent(renderer)
+                if (
+                    inside.contains(box.x0, box.y0)
+                    and inside.contains(box.x1, box.y1)
+                    and not box.count_overlaps(taken)
+                ):
+                    taken.append(box)
+                    break
+                text.remove()
+            else:
+                continue
+            break
