@@ -47,7 +47,7 @@ def rasterization(
     rasterize_mode="classic",
     **unused,
 ):
-    """(C, H, W, 3) image, (C, H, W, 1) alpha and gsplat's dict; arguments as gsplat's `rasterization`.
+    """(..., C, H, W, 3) image, (..., C, H, W, 1) alpha and gsplat's dict; arguments as gsplat's `rasterization`.
 
     Raises:
         ImportError: If gsplat 1.5.3 is not installed, or a version without these functions.
@@ -114,9 +114,10 @@ def listed(
     As gsplat's CUDA function of the same arguments: a range counts batches of tile_size^2 Gaussians of a tile's list;
     alphas below 1/255 do not count, and a pixel ends before the hit that would leave no more than 1e-4.
     """
-    images, rows, columns = isect_offsets.shape
+    images, rows, columns = isect_offsets.shape[:-2].numel(), *isect_offsets.shape[-2:]
     offsets = [*isect_offsets.flatten().tolist(), len(flatten_ids)]
     at, conic, opacity = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
+    front = transmittances.reshape(images, -1)
     block, found = tile_size * tile_size, []
     for k in range(images * rows * columns):
         image, row, column = k // (rows * columns), k // columns % rows, k % columns
@@ -132,7 +133,7 @@ def listed(
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
         alpha = (opacity[ids] * torch.exp(-sigma)).clamp(max=_ALPHA_MAX)
         counts = (sigma >= 0) & (alpha >= _ALPHA_MIN)
-        left = torch.cumprod(torch.where(counts, 1 - alpha, 1), 1) * transmittances[image].reshape(-1)[pixel][:, None]
+        left = torch.cumprod(torch.where(counts, 1 - alpha, 1), 1) * front[image][pixel][:, None]
         p, i = (counts & (left > _TRANSMITTANCE_MIN)).nonzero(as_tuple=True)
         found.append(torch.stack([ids[i] % means2d.shape[-2], pixel[p], torch.full_like(p, image)]))
     gaussians, pixels, where = torch.cat(found, 1) if found else torch.zeros(3, 0, dtype=torch.int64)

@@ -98,7 +98,7 @@ def test_every_mode_is_gsplats(mode, rasterize_mode):
 
 
 @needs_gsplat
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 40])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 32, 128])
 def test_colors_of_any_width_are_gsplats(channels):
     """Plain colors (N, D): the first three travel as color, the others as features; negative ones are not clamped."""
     from examples import gsplat_torch
@@ -120,6 +120,63 @@ def test_colors_by_camera_and_fewer_degrees_are_gsplats():
     options = {"eps2d": 0.1, "near_plane": 1.7, "far_plane": 4.0}
     given["sh_degree"] = 1
     agree(given, drawn(drgs.rasterization, given, **options), drawn(gsplat_torch.rasterization, given, **options))
+
+
+def in_front(lead, per_camera, degree, n=40, cameras=3, width=30, height=20):
+    """Float64 arguments as gsplat's own test of `rasterization` draws them, smaller: a unit cube before three cameras.
+
+    The cube begins at the camera, and standard deviations are up to its size: Gaussians cover the image, some are cut
+    by the near plane, and transmittance ends early.
+    """
+    make = torch.Generator().manual_seed(42)
+    uniform = lambda *shape: torch.rand(*lead, *shape, generator=make, dtype=torch.float64)  # noqa: E731
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float64)
+    shown = (cameras, n) if per_camera else (n,)
+    return {
+        "means": uniform(n, 3),
+        "quats": torch.randn(*lead, n, 4, generator=make, dtype=torch.float64),
+        "scales": uniform(n, 3),
+        "opacities": uniform(n),
+        "colors": uniform(*shown, 3) if degree is None else uniform(*shown, (degree + 1) ** 2, 3),
+        "viewmats": torch.eye(4, dtype=torch.float64).expand(*lead, cameras, 4, 4),
+        "Ks": K.expand(*lead, cameras, 3, 3),
+        "width": width,
+        "height": height,
+        "sh_degree": degree,
+    }
+
+
+@needs_gsplat
+@pytest.mark.parametrize("per_camera", [True, False])
+@pytest.mark.parametrize("degree", [None, 3])
+@pytest.mark.parametrize("lead", [(), (2,), (1, 2)])
+def test_the_table_of_gsplats_own_test(lead, degree, per_camera):
+    """Colors by camera or not, plain or SH, leading axes, every mode, packed or not: their shapes and numbers.
+
+    Within their test's own tolerance of 1e-4, which is float32's; `packed` changes not a bit.
+    """
+    from examples import gsplat_torch
+
+    given = in_front(lead, per_camera, degree)
+    for mode, channels in (("RGB", 3), ("RGB+D", 4), ("D", 1)):
+        image, alpha, _ = drgs.rasterization(**given, render_mode=mode, packed=True)
+        assert tuple(image.shape) == (*lead, 3, 20, 30, channels)
+        theirs, their_alpha, _ = gsplat_torch.rasterization(**given, render_mode=mode)
+        torch.testing.assert_close(image, theirs, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(alpha, their_alpha, rtol=1e-4, atol=1e-4)
+    assert torch.equal(image, drgs.rasterization(**given, render_mode=mode, packed=False)[0])
+    assert 0.05 < float(alpha.mean()) < 1
+
+
+@needs_gsplat
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_degree_is_gsplats(degree):
+    """Of 16 coefficients those of the degree count, colors below 0 are clamped: image and gradients."""
+    from examples import gsplat_torch
+
+    given = arguments(seed=7, degree=3, n=40, width=30, height=24)
+    given["sh_degree"] = degree
+    agree(given, drawn(drgs.rasterization, given), drawn(gsplat_torch.rasterization, given))
 
 
 @needs_gsplat
