@@ -313,7 +313,7 @@ def _by_columns(
     scale = torch.tensor([*weights, *[1.0] * width], dtype=torch.float64)
     for name, group in wanted.items():
         shape, squares = group.tangent(gaussians), []
-        rows = np.stack(np.unravel_index(np.arange(int(np.prod(shape))), shape), 1)
+        rows = np.argwhere(np.ones(shape))
         for start in range(0, len(rows), _BATCH):
             index = {name: rows[start : start + _BATCH]}
             columns = jacobian_columns(scene or gaussians, camera, index, settings).double()

@@ -77,8 +77,8 @@ def select(
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
-        **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`; None is
-            the default.
+        **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
+            `groups`; None is the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, or information is negative, NaN
             or infinite.
@@ -132,7 +132,7 @@ def fisher(pool: Pool) -> Selection:
     """Largest gain of Fisher information."""
     if pool.scoring.criterion == "block_logdet":
         return _greedy(pool, "blocks")
-    return _greedy(pool, "diagonal", method=pool.scoring.method)
+    return _greedy(pool, "diagonal", method=pool.scoring.method, groups=pool.scoring.groups)
 
 
 def fisherrf(pool: Pool) -> Selection:
@@ -161,7 +161,9 @@ def _greedy(pool: Pool, function: str, **options: Hashable) -> Selection:
     def compute(camera: Camera) -> Information:
         from drgs import fisher  # loads Dr.Jit, which the other policies need not have
 
-        found = getattr(fisher, function)(pool.scene.at(camera.time), camera, settings, **options)
+        # `diagonal` also knows the parameters that a scene computes its Gaussians from.
+        scene = pool.scene if function == "diagonal" else pool.scene.at(camera.time)
+        found = getattr(fisher, function)(scene, camera, settings, **options)
         return {function: found} if isinstance(found, torch.Tensor) else found
 
     if pool.information:

@@ -307,7 +307,6 @@ class _Counter:
         self.n, self.alive, self.most, self.calls = n, weakref.WeakSet(), 0, 0
 
     def __call__(self, camera):
-        gc.collect()
         self.most = max(self.most, len(self.alive))
         self.calls += 1
         generator = torch.Generator().manual_seed(int(camera.name[1:]))
@@ -434,7 +433,11 @@ class _Moving:
         self.g, self.speed = g, torch.zeros(())
 
     def at(self, time):
-        return self.g.replace(means=self.g.means + self.speed * time * torch.eye(3)[0])
+        return self.deform(self.parameters(), time)
+
+    def deform(self, parameters, time):
+        moved = parameters["means"] + parameters["speed"] * time * torch.eye(3)[0]
+        return self.g.replace(means=moved)
 
     def parameters(self):
         return {**self.g.parameters(), "speed": self.speed}
@@ -454,6 +457,11 @@ def test_scene_that_moves(world, one_thread):
         assert score == pytest.approx(information_gain(part, H).total, rel=1e-5)
     assert found.scores[0] != pytest.approx(found.scores[1], rel=1e-2)
     assert select(moving, cameras, known, cache=cache).computed == 0
+    # The speed moves nothing at time 0; other groups are other information.
+    options = {"method": "columns", "groups": ("speed",), "cache": cache}
+    found = select(moving, cameras, known, **options)
+    assert found.computed == 3
+    assert found.scores[0] == 0 < found.scores[1] == found.parts[1]["speed"]
     moving.speed.fill_(0.25)
     assert select(moving, cameras, known, cache=cache).computed == 3
     other = _Moving(g)
@@ -603,7 +611,7 @@ def test_scoring_is_its_fields():
         run(scoring=Scoring(), **options)
     with pytest.raises(TypeError, match="unexpected keyword argument 'criterium'"):
         run(criterium="eig")
-    for field in ("scoring", "prior", "settings", "weights"):
+    for field in ("scoring", "prior", "settings", "weights", "groups"):
         with pytest.raises(ValueError, match=f"select: {field} must be a"):
             run(**{field: "logdet"})
     with pytest.raises(

@@ -27,6 +27,8 @@ class Scoring:
         method: Of `drgs.fisher.diagonal`; of `fisher` only, not of `block_logdet`.
         prior: lambda. `coverage` takes its `value`, not its `groups`.
         weights: Group -> factor, 1 where none is given; of `fisher` and `fisherrf` only.
+        groups: Of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that Gaussians have. Of
+            `fisher` only, not of `block_logdet`. Those of a scene's network need method `columns` or `probes`.
     Raises:
         ValueError: If a criterion or method is unknown, or something else is of the wrong kind.
     """
@@ -36,6 +38,7 @@ class Scoring:
     method: str = METHODS[0]
     prior: Prior = dataclasses.field(default_factory=Prior)
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    groups: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         for name, known in (("criterion", CRITERIA), ("method", METHODS)):
@@ -44,6 +47,9 @@ class Scoring:
         must_be("select", "settings", self.settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')
         must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
         must_be("select", "weights", self.weights, Mapping, 'e.g. {"means": 0.5}')
+        if self.groups is not None:
+            must_be("select", "groups", self.groups, (tuple, list), 'e.g. ("means", "sh")')
+            object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
 
 
 @dataclasses.dataclass(frozen=True)
