@@ -7,12 +7,12 @@ heavy: `drgs --help` reads them all.
 from __future__ import annotations
 
 import dataclasses
-import typing
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from drgs.commands.overrides import check_color, parsed
 from drgs.fitting.config import ActiveConfig, Degree, FitConfig, InitPoints, Mask, PickPoints
 from drgs.information.choices import Criterion, Method, Policy
 from drgs.settings import Preset, RenderSettings
@@ -69,23 +69,13 @@ class _Settings(_Common):
         """
         return RenderSettings.preset(self.preset, **self.replaced())
 
-    def replaced(self) -> dict:
+    def replaced(self) -> dict[str, Any]:
         """The fields that --set replaces.
 
         Raises:
             ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
         """
-        hints = typing.get_type_hints(RenderSettings)
-        values = {}
-        for text in self.overrides:
-            key, equals, value = text.partition("=")
-            if not equals or key not in hints:
-                what = "KEY=VALUE" if not equals else "a render setting"
-                raise ValueError(f"--set: must be {what}, got {text!r}; known: {', '.join(hints)}")
-            values[key] = _parse(key, hints[key], value)
-        if "background" in values:
-            check_color("--set background", values["background"])
-        return values
+        return parsed(self.overrides)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -386,27 +376,3 @@ class Demo(_Common):
     """Folder for pictures and tables."""
     quick: bool = False
     """Half a minute with poor pictures, to see that everything runs."""
-
-
-def check_color(option: str, color: tuple[float, ...]) -> None:
-    """Raise ValueError unless a color of an option is one that a photograph can have: R, G, B in [0, 1]."""
-    if len(color) != 3 or not all(0 <= x <= 1 for x in color):
-        got = " ".join(f"{x:g}" for x in color)
-        raise ValueError(f"{option} must be R, G and B in [0, 1], got {got}; 255 is 1.0 here")
-
-
-def _parse(key: str, hint, text: str):
-    """One --set value by its field's type: str, float, `float | None`, or a tuple of floats."""
-    kinds = typing.get_args(hint) or (hint,)
-    try:
-        if typing.get_origin(hint) is tuple:
-            return tuple(float(part) for part in text.strip("()[] ").split(","))
-        if type(None) in kinds and text.lower() == "none":
-            return None
-        if bool in kinds:
-            return {"true": True, "false": False}[text.lower()]
-        number = next((kind for kind in (int, float) if kind in kinds), None)
-        return number(text) if number else text
-    except (ValueError, KeyError):
-        kind = hint.__name__ if kinds == (hint,) else hint
-        raise ValueError(f"--set {key}: must be of type {kind}, got {text!r}") from None
