@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
-from test_train import config, dataset, random_rows  # noqa: F401 (a fixture)
+from test_times import Drift
+from test_train import FAST, config, dataset, random_rows  # noqa: F401 (a fixture)
 
+from drgs.cameras import orbit
 from drgs.files import load_state, save_state
 from drgs.fitting.density import add_gaussians, relocate
-from drgs.fitting.frames import load_frames
+from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import Photometric
 from drgs.fitting.networks import Network, saved_networks
 from drgs.fitting.parts import Parts, parts_of
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
+from drgs.integrator import render
 
 
 class Affine(torch.nn.Module):
@@ -119,6 +123,29 @@ def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path, one_thre
     assert one.keys() == other.keys()
     assert {"affine.parameter.gain", "affine.adam.gain.exp_avg", "parameter.features"} <= one.keys()
     assert [name for name, x in one.items() if not torch.equal(x, other[name])] == []
+
+
+def test_a_scene_that_moves_is_fitted_at_the_times_of_its_views(rng):
+    """Velocities, one row a Gaussian, are found from views at several times: from 0 to within a third of the truth."""
+    truth = random_rows(12, dead=0)
+    velocities = torch.from_numpy(rng.normal(size=(12, 3)).astype(np.float32)) * 0.3
+
+    def moving(rows: GaussianRows) -> Drift:
+        return Drift(rows.gaussians(), rows.tensors["velocities"])
+
+    scene, cfg = Drift(truth.gaussians().detach(), velocities), config(max_steps=60)
+    cameras = orbit((0, 0, 0), 3.0, 6, width=32, height=32)
+    views = [dataclasses.replace(camera, time=time) for time in (0.0, 0.5, 1.0) for camera in cameras]
+    with torch.no_grad():
+        frames = [Frame(f"{i}", view, render(scene, view, FAST).rgb) for i, view in enumerate(views)]
+    rates = {**dict.fromkeys(truth.tensors, 0.0), "velocities": lambda part: 0.05 * (1 - part)}
+    parts = Parts([Photometric(0.0)], rates, scene=moving)
+    rows = GaussianRows({**truth.tensors, "velocities": torch.zeros(12, 3)})
+    trainer = Trainer(dataclasses.replace(cfg, sh_degree=0, refine_stop=0.0), frames, rows, 3.0, parts)
+    steps(trainer, 60)
+    error = (rows.tensors["velocities"].detach() - velocities).norm(dim=1)
+    assert float(error.median()) < float(velocities.norm(dim=1).median()) / 3
+    assert torch.equal(rows.tensors["means"], truth.tensors["means"])
 
 
 def test_a_fit_without_networks_says_nothing_of_them(dataset):  # noqa: F811

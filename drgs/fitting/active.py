@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -172,11 +173,13 @@ class ActiveViews:
                 progress=bar.update,
             )
         best = selection.picks[0]
-        extra = zip(selection.parts or [{}] * len(left), selection.unseen or [None] * len(left), strict=True)
+        index, count = left[best.index], len(left)
+        unseen: Sequence[float | None] = selection.unseen or [None] * count
+        scored = zip(left, selection.scores, selection.parts or [{}] * count, unseen, strict=True)
         record = {
             "number": len(self.picks) + 1,
             "step": step,
-            "index": left[best.index],
+            "index": index,
             "name": best.name,
             "score": best.score,
             "parts": best.parts,
@@ -189,13 +192,13 @@ class ActiveViews:
             "left_out": selection.left_out,
             "notes": selection.notes,
             "candidates": [
-                {"index": i, "name": self.views[i].name, "score": score, "parts": parts, "unseen": unseen}
-                for i, score, (parts, unseen) in zip(left, selection.scores, extra, strict=True)
+                {"index": i, "name": self.views[i].name, "score": score, "parts": parts, "unseen": share}
+                for i, score, parts, share in scored
             ],
         }
-        self.chosen.append(record["index"])
+        self.chosen.append(index)
         self.picks.append(record)
-        return self._read(record["index"]), record
+        return self._read(index), record
 
     def to_json(self) -> dict:
         """selection.json."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
 from drgs.fitting.losses import LossTerm, terms_of
 from drgs.fitting.networks import Network, Rate
+from drgs.fitting.rows import GaussianRows
 
 __all__ = ["Parts", "means_rate", "parts_of"]
 
@@ -19,12 +21,14 @@ class Parts:
     Attributes:
         terms: Of the loss, in the order in which they are added up.
         rates: Learning rates by the name of the tensor in `GaussianRows`.
-        networks: What is fitted beside the Gaussians, and terms call.
+        networks: What is fitted beside the Gaussians, and called by terms or by the scene.
+        scene: What is rendered of the rows: their Gaussians, or a scene that has others at the time of a view.
     """
 
     terms: Sequence[LossTerm]
     rates: Mapping[str, Rate]
     networks: Sequence[Network] = ()
+    scene: Callable[[GaussianRows], Scene] = GaussianRows.gaussians
 
 
 def parts_of(config: FitConfig, extent: float) -> Parts:

@@ -37,7 +37,7 @@ class Trainer:
         frames: Training photographs.
         rows: The Gaussians and their optimizer.
         extent: Of the scene, its unit of length.
-        parts: Terms of the loss, learning rates and networks.
+        parts: Terms of the loss, learning rates, networks, and what is rendered.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
@@ -96,7 +96,8 @@ class Trainer:
         """
         config, rows, done = self.config, self.rows, self.step_index
         events = self._prepare(done)
-        frame, gaussians = self.frames[self._next_view()], rows.gaussians()
+        frame = self.frames[self._next_view()]
+        gaussians = self.parts.scene(rows).at(frame.camera.time)
         outputs = {name: None for term in self.parts.terms for name in term.outputs}  # each once, in their order
         out = render(gaussians, frame.camera, config.settings, outputs=tuple(outputs))
         loss, terms = self._loss(out, frame, gaussians)
@@ -132,7 +133,7 @@ class Trainer:
         }
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians as they are, without a graph."""
+        """The Gaussians of the rows as they are, without a graph."""
         return self.rows.gaussians().detach()
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
