@@ -186,7 +186,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """0..3."""
+        """The degree of `sh`, 0 to 3."""
         return sh_degree_of(self.sh.shape[1])
 
     @property

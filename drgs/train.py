@@ -192,7 +192,7 @@ def _start(
 
 
 def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame]) -> None:
-    """See to it that no picture of somebody else's is in the way, before the first step."""
+    """Refuse, before the first step, a folder where pictures that drgs did not draw are in the way."""
     every = _preview_every(max_steps)
     names = [_preview_name(step) for step in range(every, max_steps + 1, every)]
     names += [f"test/{name}.png" for name in file_names([frame.name for frame in held_out])]
@@ -275,7 +275,7 @@ class _Loop:
         self._saved = now
 
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
-        """One more view."""
+        """Choose one more view, and add its photograph and points to the fit."""
         trainer = self.trainer
         frame, record = plan.pick(trainer.gaussians(), trainer.frames, trainer.step_index)
         points, colors, dense = plan.points(frame, trainer.gaussians())

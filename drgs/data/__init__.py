@@ -73,7 +73,7 @@ def load(
 
 
 def _nothing_found(path: Path) -> FileNotFoundError:
-    """What to say of a folder that holds no data set: photographs without poses, or where was looked."""
+    """The error for a folder that holds no data set: it has photographs without poses, or nothing where one looks."""
     for folder in (path, path / "images"):
         if folder.is_dir() and list_images(folder):
             return FileNotFoundError(

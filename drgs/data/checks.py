@@ -199,7 +199,7 @@ def _jpeg_size(file: Any) -> tuple[int, int] | None:
 
 
 def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
-    """(4,4) w2c of a c2w (3 or 4 rows) that a file states; a rotation's transpose stands for its inverse.
+    """(4,4) w2c of a c2w (3 or 4 rows) that a file states; the inverse of its rotation is its transpose.
 
     `Camera` then refuses what is no rotation.
 

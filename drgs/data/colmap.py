@@ -127,7 +127,7 @@ def _mask(folder: Path, name: str) -> Path | None:
 
 
 def _camera(camera: Any, w2c: np.ndarray, name: str, where: str) -> Camera:
-    """Ours of a pycolmap camera; a lens whose coefficients are all 0 is a pinhole."""
+    """A `Camera` of a pycolmap camera; a lens whose coefficients are all 0 is a pinhole."""
     p = [float(v) for v in camera.params]
     kind = camera.model_name
     if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):

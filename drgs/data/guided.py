@@ -34,7 +34,7 @@ _ROWS = 1000  # features whose candidates are looked at together
 
 @dataclasses.dataclass(frozen=True)
 class Features:
-    """Of one picture.
+    """SIFT features of one picture.
 
     Attributes:
         camera: Pinhole.
@@ -111,7 +111,7 @@ class Matches:
             progress("matching", len(left), len(left))
 
     def triangulate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What belongs together as one point.
+        """The points of all matches; matches that share a feature make one point.
 
         Returns:
             Points (P, 3) float64, colors (P, 3) float32, and whether the last picture shows each (P,) bool.
@@ -166,7 +166,7 @@ def _match(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _homogeneous(pixels: np.ndarray) -> np.ndarray:
-    """(N, 3) of (N, 2)."""
+    """(N, 3) homogeneous coordinates of (N, 2) pixels."""
     return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
 
 

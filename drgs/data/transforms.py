@@ -168,7 +168,7 @@ def _fill(
     background: tuple[float, float, float],
     first: _FirstImage | None,
 ) -> bool:
-    """Complete a view whose image is there; whether its frame carries its own intrinsics.
+    """Complete a view whose image is there; returns whether its frame carries its own intrinsics.
 
     `first` where no other image may be opened.
     """

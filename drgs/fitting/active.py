@@ -80,7 +80,7 @@ class ActiveViews:
 
     @property
     def names(self) -> list[str]:
-        """Of the views that have been seen, in the order of `chosen`."""
+        """Names of the views that have been seen, in the order of `chosen`."""
         return [self.views[i].name for i in self.chosen]
 
     def start_views(self) -> list[View]:
@@ -90,12 +90,14 @@ class ActiveViews:
 
     @property
     def reserved(self) -> int:
-        """Gaussians to leave room for: those of views that are still to be picked."""
+        """How many Gaussians density control leaves room for: the shares of the views that are still to be picked."""
         return self._share * (self.active.add - len(self.picks))
 
     def points(self, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, torch.Tensor, bool]:
-        """Points of the view that was picked last: those triangulated with it, and where the Gaussians leave its pixels
-        more than half transparent also random ones; of a view with a depth map only there, from the map.
+        """Points for new Gaussians from the view that was picked last.
+
+        Those that can be triangulated with it, and random ones where the Gaussians leave its pixels more than half
+        transparent. Of a view with a depth map: points of the map, there only.
 
         Args:
             frame: Its photograph.
@@ -201,7 +203,7 @@ class ActiveViews:
         return self._read(index), record
 
     def to_json(self) -> dict:
-        """selection.json."""
+        """What selection.json holds."""
         initial = self.chosen[: self.active.initial]
         return {
             "schema": SCHEMA,
@@ -253,7 +255,7 @@ class ActiveViews:
         return load_frames([view], self._config.max_pixels, self._config.mask)[0]
 
     def _camera(self, index: int) -> Camera:
-        """Of a candidate, as its frame would have it."""
+        """The camera of a candidate, as its frame would have it."""
         view = self.views[index]
         camera = dataclasses.replace(view.camera.undistorted(), name=view.name)
         if not view.is_checked:

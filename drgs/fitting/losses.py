@@ -26,15 +26,15 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 class LossTerm(Protocol):
-    """A part of what a step minimizes. `terms_of` lists those of a fit; another one is a class like those below."""
+    """A part of what a step minimizes. `terms_of` lists those of a fit; a new one is a class like those below."""
 
     @property
     def name(self) -> str:
-        """Of its own among the terms of a fit; a plain attribute does."""
+        """What no other term of the fit is called; a plain attribute will do."""
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """What it needs of `drgs.render` besides rgb, alpha and features; a plain attribute does."""
+        """What it needs of `drgs.render` besides rgb, alpha and features; a plain attribute will do."""
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
         """The term for one view.

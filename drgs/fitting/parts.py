@@ -16,7 +16,7 @@ __all__ = ["Parts", "means_rate", "parts_of"]
 
 @dataclasses.dataclass(frozen=True)
 class Parts:
-    """The parts of a fit.
+    """What a fit is made of.
 
     Attributes:
         terms: Of the loss, in the order in which they are added up.
@@ -32,7 +32,7 @@ class Parts:
 
 
 def parts_of(config: FitConfig, extent: float) -> Parts:
-    """Those of a fit of its config; `extent` of the scene is its unit of length."""
+    """The parts of a plain fit with a config; the `extent` of the scene is its unit of length."""
     rates: dict[str, Rate] = {
         "means": lambda part: means_rate(config, part) * extent,
         "quats": config.rotation_rate,

@@ -78,10 +78,10 @@ class LoadedRun:
 
 
 def load_run(run: Run) -> LoadedRun:
-    """A run, from its last checkpoint: point_cloud.ply holds less, it is what other programs read.
+    """What a run holds, from its last checkpoint; point_cloud.ply holds less, and is for other programs.
 
-    Where the checkpoint is missing or damaged the PLY is taken, and where both are there but differ, for somebody has
-    edited the PLY, the checkpoint; the log has a warning in one line. (`drgs.load_ply` reads a PLY that is named.)
+    Where the checkpoint is missing or damaged, the PLY is taken. Where both are there but differ, because somebody has
+    edited the PLY, the checkpoint is taken; `drgs.load_ply` reads the PLY. Either way the log has one line about it.
 
     Raises:
         FileNotFoundError: If it is no run folder, or has neither a checkpoint nor a PLY.
@@ -115,7 +115,7 @@ def load_run(run: Run) -> LoadedRun:
 
 
 def _shows(path: Path, gaussians: Gaussians) -> bool:
-    """Whether a PLY has the same bits, as far as its layout has room for them; one that is damaged has not."""
+    """Whether a PLY holds the same bits, as far as its layout has room for them; a damaged one does not."""
     try:
         shown = load_ply(path).parameters()
     except ValueError:

@@ -64,7 +64,7 @@ class GaussianRows:
 
     @property
     def sh_degree(self) -> int:
-        """0..3."""
+        """The degree of SH that is in use, 0 to 3."""
         return math.isqrt(1 + self.tensors["sh_rest"].shape[1]) - 1
 
     def gaussians(self) -> Gaussians:
@@ -84,7 +84,7 @@ class GaussianRows:
         self._extend("sh_rest", old.new_zeros(len(old), 2 * self.sh_degree + 3, 3), 1)
 
     def append(self, rows: dict[str, torch.Tensor]) -> None:
-        """Add Gaussians with zero moments; their rows of tensors that `rows` lacks are 0."""
+        """Add Gaussians with zero moments; in tensors that `rows` lacks, their rows are 0."""
         count = len(rows["means"])
         for name, old in list(self.tensors.items()):
             new = rows[name] if name in rows else old.new_zeros(count, *old.shape[1:])

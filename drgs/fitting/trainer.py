@@ -75,7 +75,7 @@ class Trainer:
         self._start_count, self.reserved = len(rows), 0
 
     def add_points(self, points: torch.Tensor, colors: torch.Tensor, opacity: float, scale: float) -> None:
-        """More Gaussians, arguments as of `GaussianRows.from_points`; what there is stays as it is."""
+        """Add Gaussians at points, as `GaussianRows.from_points` makes them; those that are there stay as they are."""
         new = GaussianRows.from_points(points, colors, opacity, scale).take(torch.arange(len(points)))
         del new["sh_rest"]  # 0 up to the degree that the others have
         self.rows.append(new)
