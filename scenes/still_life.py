@@ -21,6 +21,7 @@ import numpy as np
 
 import scenes
 from drgs import runtime
+from drgs.display.progress import Bar
 from scenes import box, grid, join, mix, noise, ramp, revolve, spline, tube, turned
 
 __all__ = ["generate", "main"]
@@ -379,11 +380,10 @@ def main(argv=None) -> int:
         parser.add_argument(f"--{name}", type=int, default=default, help="default: %(default)s")
     options = vars(parser.parse_args(argv))
 
-    def show(done, total):
-        print(f"\rpath tracing {done}/{total}", end="\n" if done == total else "", flush=True)
-
     try:
-        print(generate(options.pop("out"), **options, progress=show))
+        with Bar("path tracing", options["views"], show=True) as bar:
+            folder = generate(options.pop("out"), **options, progress=bar.update)
+        print(folder)
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

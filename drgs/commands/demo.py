@@ -75,6 +75,27 @@ class Plan:
         return cls(views=9, width=80, height=60, spp=4, steps=60, gaussians=1500, crop=(16, 12), repeats=2, frames=6)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PresetRow:
+    """One preset on the held-out views.
+
+    Attributes:
+        preset, what: Its name, and its rules in words.
+        psnr_to_photographs: Mean, in dB.
+        psnr_to_exact, max_difference: Between its images and those of `exact`; None of `exact` itself.
+        seconds: A view, median.
+        time_of_exact: Median ratio to the time of `exact` in the same round.
+    """
+
+    preset: str
+    what: str
+    psnr_to_photographs: float
+    psnr_to_exact: float | None
+    max_difference: float | None
+    seconds: float
+    time_of_exact: float
+
+
 def run(args: Demo) -> None:
     """`drgs demo`."""
     make_demo(args.output, Plan.quick() if args.quick else Plan(), progress=not args.quiet)
@@ -176,7 +197,7 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
         "command": "demo",
         "plan": dataclasses.asdict(plan),
         "fit": {"gaussians": len(g), "seconds": fitted.seconds, "split": fitted.metrics["split_rule"], "mean": mean},
-        "presets": rows,
+        "presets": [dataclasses.asdict(row) for row in rows],
         "oracle": oracle,
         "peer": peer,
         "seconds": seconds,
@@ -196,7 +217,7 @@ def _still_life():
     return still_life
 
 
-def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str, list[torch.Tensor]], list[dict]]:
+def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str, list[torch.Tensor]], list[PresetRow]]:
     """Images of every preset, and one row of numbers each."""
     settings = {name: RenderSettings.preset(name) for name in _PRESETS}
     images = {name: [_draw(g, frame.camera, s) for frame in frames] for name, s in settings.items()}
@@ -211,15 +232,15 @@ def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str,
         photos = [metrics.psnr(a.clamp(0, 1), f.image()) for a, f in zip(images[name], frames, strict=True)]
         same = name == "exact"
         rows.append(
-            {
-                "preset": name,
-                "what": _PRESETS[name],
-                "psnr_to_photographs": statistics.mean(photos),
-                "psnr_to_exact": None if same else statistics.mean(metrics.psnr(a, b) for a, b in pairs),
-                "max_difference": None if same else max(float((a - b).abs().max()) for a, b in pairs),
-                "seconds": statistics.median(times[name]),
-                "time_of_exact": statistics.median(t / e for t, e in zip(times[name], times["exact"], strict=True)),
-            }
+            PresetRow(
+                preset=name,
+                what=_PRESETS[name],
+                psnr_to_photographs=statistics.mean(photos),
+                psnr_to_exact=None if same else statistics.mean(metrics.psnr(a, b) for a, b in pairs),
+                max_difference=None if same else max(float((a - b).abs().max()) for a, b in pairs),
+                seconds=statistics.median(times[name]),
+                time_of_exact=statistics.median(t / e for t, e in zip(times[name], times["exact"], strict=True)),
+            )
         )
     return images, rows
 
@@ -321,19 +342,19 @@ def _turntable(g: Gaussians, path: Path, plan: Plan, progress: bool) -> None:
             bar.advance()
 
 
-def _table(rows: list[dict]) -> None:
+def _table(rows: list[PresetRow]) -> None:
     """On stdout."""
     cells = []
     for row in rows:
-        same = row["psnr_to_exact"] is None
+        same = row.psnr_to_exact is None
         cells.append(
             (
-                row["preset"],
-                f"{row['psnr_to_photographs']:.2f}",
-                "-" if same else f"{row['psnr_to_exact']:.1f}",
-                "-" if same else f"{row['max_difference']:.3f}",
-                f"{1e3 * row['seconds']:.0f}",
-                f"{row['time_of_exact']:.2f}",
+                row.preset,
+                f"{row.psnr_to_photographs:.2f}",
+                "-" if same else f"{row.psnr_to_exact:.1f}",
+                "-" if same else f"{row.max_difference:.3f}",
+                f"{1e3 * row.seconds:.0f}",
+                f"{row.time_of_exact:.2f}",
             )
         )
     columns = ("preset", "dB to photos", "dB to exact", "most off", "ms a view", "time / exact")

@@ -10,7 +10,8 @@ known views and Hc that of the view itself:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from drgs.guards.outputs import claim
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Fisher
+    from drgs.commands.viewpoints import Known
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
@@ -69,6 +71,7 @@ def run(args: Fisher) -> None:
         for camera, name in zip(views, names, strict=True):
             rows.append(_view(args, given.gaussians, camera, settings, name, H, prior))
             bar.advance()
+    groups = {name: GroupRow.of(x) for name, x in H.items()}
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
     save_state(args.output / "information.safetensors", H, header)
     report = {
@@ -81,13 +84,75 @@ def run(args: Fisher) -> None:
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
-        "groups": {name: _summary(x) for name, x in H.items()},
+        "groups": {name: dataclasses.asdict(row) for name, row in groups.items()},
         "source": source,
-        "views": rows,
+        "views": [row.to_json() for row in rows],
     }
     write_json(args.output / "fisher.json", report)
     if not args.quiet:
-        _print(report, args)
+        _print(args, known, groups, rows, source)
+
+
+@dataclasses.dataclass(frozen=True)
+class GroupRow:
+    """What the known views say about a group of parameters: a summary of its information's entries."""
+
+    shape: list[int]
+    sum: float
+    median_of_positive: float | None
+    zero: int
+
+    @classmethod
+    def of(cls, x: torch.Tensor) -> GroupRow:
+        """Of the information of a group."""
+        positive = x[x > 0]
+        median = float(positive.median()) if positive.numel() else None
+        return cls(list(x.shape), float(x.sum()), median, int((x == 0).sum()))
+
+
+@dataclasses.dataclass(frozen=True)
+class MapRow:
+    """A map in three numbers."""
+
+    sum: float
+    mean: float
+    max: float
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseRow:
+    """What a view says about its own pose: a 6x6 matrix, and its eigenvalues, the least first."""
+
+    information: list[list[float]]
+    eigenvalues: list[float]
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewRow:
+    """What a view shows.
+
+    Attributes:
+        name, camera: The view's.
+        files: Its maps.
+        gain: What it would add to the known views, by criterion.
+        variance, share: Its maps.
+        pose: With --pose, else None.
+    """
+
+    name: str
+    camera: Camera
+    files: list[str]
+    gain: dict[str, float]
+    variance: MapRow
+    share: MapRow
+    pose: PoseRow | None
+
+    def to_json(self) -> dict[str, Any]:
+        """As fisher.json holds it."""
+        fields = {name: getattr(self, name) for name in ("name", "camera", "files", "gain")}
+        fields |= {"camera": described(self.camera)}
+        fields |= {name: dataclasses.asdict(getattr(self, name)) for name in ("variance", "share")}
+        return fields | ({} if self.pose is None else {"pose": dataclasses.asdict(self.pose)})
 
 
 def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[Information, Information]:
@@ -109,55 +174,42 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
 
 def _view(
     args: Fisher, g: Gaussians, camera: Camera, settings: RenderSettings, name: str, H: Information, prior: Prior
-) -> dict:
+) -> ViewRow:
     """Maps of one view, and what it says."""
     Hc = fisher.diagonal(g, camera, settings, args.method)
-    row = {"name": camera.name, "camera": described(camera), "files": []}
-    row["gain"] = {c: information_gain(Hc, H, c, prior).total for c in ("logdet", "eig")}
     # Maps are of the image's colors; features have an image of their own.
     parts = map_weights(*({k: x for k, x in y.items() if k != "features"} for y in (H, Hc)), prior)
+    files, maps = [], []
     for kind, weights in zip(("variance", "share"), parts, strict=True):
         values = fisher.variance_map(g, camera, weights, settings).numpy()
-        pictures.write_png(args.output / f"{name}.{kind}.png", pictures.map_picture(values))
-        row["files"].append(f"{name}.{kind}.png")
-        row[kind] = {
-            "sum": float(values.sum(dtype=np.float64)),
-            "mean": float(values.mean()),
-            "max": float(values.max()),
-        }
+        files.append(f"{name}.{kind}.png")
+        pictures.write_png(args.output / files[-1], pictures.map_picture(values))
+        maps.append(MapRow(float(values.sum(dtype=np.float64)), float(values.mean()), float(values.max())))
+    pose = None
     if args.pose:
-        pose = fisher.pose_information(g, camera, settings)
-        row["pose"] = {"information": pose.tolist(), "eigenvalues": torch.linalg.eigvalsh(pose).tolist()}
-    return row
+        found = fisher.pose_information(g, camera, settings)
+        pose = PoseRow(found.tolist(), torch.linalg.eigvalsh(found).tolist())
+    gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
+    return ViewRow(camera.name, camera, files, gain, *maps, pose)
 
 
-def _summary(x: torch.Tensor) -> dict:
-    positive = x[x > 0]
-    return {
-        "shape": list(x.shape),
-        "sum": float(x.sum()),
-        "median_of_positive": float(positive.median()) if positive.numel() else None,
-        "zero": int((x == 0).sum()),
-    }
-
-
-def _print(report: dict, args: Fisher) -> None:
+def _print(args: Fisher, known: Known, groups: dict[str, GroupRow], views: list[ViewRow], source: str) -> None:
     """What was found, as tables on stdout."""
     rows = []
-    for name, row in report["groups"].items():
-        share = f"{row['zero'] / max(int(np.prod(row['shape'])), 1):.1%}"
-        shape = "x".join(map(str, row["shape"]))
-        rows.append((name, shape, f"{row['sum']:.4g}", f"{row['median_of_positive'] or 0:.4g}", share))
-    title = f"information of {len(report['known']['names'])} views ({report['known']['source']})"
+    for name, row in groups.items():
+        share = f"{row.zero / max(math.prod(row.shape), 1):.1%}"
+        shape = "x".join(map(str, row.shape))
+        rows.append((name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share))
+    title = f"information of {len(known.cameras)} views ({known.source})"
     tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known"), rows)
     rows = []
-    for row in report["views"]:
-        values = row["pose"]["eigenvalues"] if args.pose else []
-        numbers = (row["gain"]["eig"], row["gain"]["logdet"], row["variance"]["mean"], *values[:1], *values[-1:])
-        rows.append((row["name"], *(f"{x:.3g}" for x in numbers)))
+    for row in views:
+        values = row.pose.eigenvalues if row.pose else []
+        numbers = (row.gain["eig"], row.gain["logdet"], row.variance.mean, *values[:1], *values[-1:])
+        rows.append((row.name, *(f"{x:.3g}" for x in numbers)))
     columns = ("view", "eig", "logdet", "mean variance", *(("pose: least", "most") if args.pose else ()))
-    tables.show(f"views ({report['source']})", columns, rows)
+    tables.show(f"views ({source})", columns, rows)
     if args.pose:
         print("pose: information about the least and the best known of its six directions; fisher.json has all six")
-    files = sum(len(row["files"]) for row in report["views"])
+    files = sum(len(row.files) for row in views)
     print(f"information.safetensors, fisher.json and {files} maps: {args.output}")
