@@ -18,13 +18,13 @@ Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than re
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians, Scene
+from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_scene, check_view, gaussians_at
@@ -56,7 +56,7 @@ _BATCH = 16  # tangents of one traversal
 
 @alone
 def diagonal(
-    gaussians: Gaussians | None = None,
+    gaussians: Scene | None = None,
     cameras: Camera | Sequence[Camera] | None = None,
     settings: RenderSettings | None = None,
     method: str = "exact",
@@ -110,14 +110,13 @@ def diagonal(
         gaussians, cameras = scene.gaussians, scene.cameras
         backgrounds, channels = scene.backgrounds, scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
-    cameras, source = _cameras("fisher.diagonal", cameras), gaussians
-    gaussians = gaussians_at("fisher.diagonal", source, cameras[0])
-    check_scene("fisher.diagonal", gaussians, settings)
-    assert gaussians is not None, "for type checkers: the line above has refused it"
+    cameras = _cameras("fisher.diagonal", cameras)
+    seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
+    check_scene("fisher.diagonal", seen, settings)
     settings = settings or RenderSettings.preset("exact")
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    wanted = groups_of(gaussians, groups, source)
+    wanted = groups_of(seen, groups, gaussians)
     own = {name: group for name, group in wanted.items() if group.owner == "scene"}
     if own and method not in ("columns", "probes"):
         raise ValueError(
@@ -125,23 +124,24 @@ def diagonal(
         )
     if method == "fisherrf":
         wanted = {name: group for name, group in wanted.items() if group.fisherrf}
-    total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in wanted.items()}
+    network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
+    total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
     for number, camera in enumerate(cameras):
-        if not len(gaussians):
+        if not len(seen):
             break
         if backgrounds:  # every view has its own
             settings = settings.replace(background=backgrounds[number])
-        gaussians = gaussians_at("fisher.diagonal", source, camera)
+        seen = gaussians_at("fisher.diagonal", gaussians, camera)
         theirs = {name: group for name, group in wanted.items() if name not in own}
-        part = {}
+        part: dict[str, torch.Tensor] = {}
         if method == "columns":
-            part |= _by_columns(gaussians, camera, settings, theirs, weights)
-            part |= _by_columns(gaussians, camera, settings, own, weights, source)
+            part |= _by_columns(seen, camera, settings, theirs, weights)
+            part |= _by_columns(seen, camera, settings, own, weights, network)
         elif method == "probes":
-            part |= by_probes(gaussians, camera, settings, theirs, weights, probes, seed + number)
-            part |= by_probes(gaussians, camera, settings, own, weights, probes, seed + number, source) if own else {}
+            part |= by_probes(seen, camera, settings, theirs, weights, probes, seed + number)
+            part |= by_probes(seen, camera, settings, own, weights, probes, seed + number, network) if own else {}
         else:
-            part = Replay(gaussians, camera, settings).diagonal(wanted, weights, method == "fisherrf")
+            part |= Replay(seen, camera, settings).diagonal(wanted, weights, method == "fisherrf")
         for name in wanted:
             total[name] += part[name]
     if "sh" in total:
@@ -218,7 +218,11 @@ def variance_map(
 
 
 def jacobian_columns(
-    gaussians: Gaussians, camera: Camera, index: dict, settings: RenderSettings | None = None, batch: int = _BATCH
+    gaussians: Scene,
+    camera: Camera,
+    index: Mapping[str, Any],
+    settings: RenderSettings | None = None,
+    batch: int = _BATCH,
 ) -> torch.Tensor:
     """Columns of the Jacobian by forward mode: how the image changes with single parameters.
 
@@ -232,12 +236,12 @@ def jacobian_columns(
     Raises:
         ValueError: If a group or an index is unknown.
     """
-    scene, gaussians = gaussians, gaussians_at("fisher.jacobian_columns", gaussians, camera)
-    check_view("fisher.jacobian_columns", gaussians, camera, settings)
+    seen = gaussians_at("fisher.jacobian_columns", gaussians, camera)
+    check_view("fisher.jacobian_columns", seen, camera, settings)
     must_be("fisher.jacobian_columns", "index", index, Mapping, 'e.g. {"camera": range(6)}')
     chosen = []
     for name, rows in index.items():
-        shape = _tangent_shape(gaussians, name, scene)
+        shape = _tangent_shape(seen, name, gaussians)
         rows = np.asarray(rows, np.int64)
         rows = rows[:, None] if rows.ndim == 1 else rows
         if rows.ndim != 2 or rows.shape[1] != len(shape) or (rows < 0).any() or (rows >= shape).any():
@@ -251,13 +255,13 @@ def jacobian_columns(
         part = chosen[start : start + batch]
         tangents: dict[str, torch.Tensor] = {}
         for k, (name, at) in enumerate(part):
-            shape = _tangent_shape(gaussians, name, scene)
+            shape = _tangent_shape(seen, name, gaussians)
             tangents.setdefault(name, torch.zeros(len(part), *shape, dtype=torch.float64))[(k, *at)] = 1
-        out = render_jvp(scene, camera, tangents, settings, outputs=())
+        out = render_jvp(gaussians, camera, tangents, settings, outputs=())
         images.append(out.rgb if out.features is None else torch.cat([out.rgb, out.features], -1))
     if images:
         return torch.cat(images)
-    width = 3 + (0 if gaussians.features is None else gaussians.features.shape[1])
+    width = 3 + (0 if seen.features is None else seen.features.shape[1])
     return torch.zeros(0, camera.height, camera.width, width)
 
 

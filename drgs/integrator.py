@@ -70,9 +70,9 @@ def render(
 
 
 def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wanted: frozenset) -> Output:
-    gaussians = gaussians_at("render", gaussians, camera)
-    check_view("render", gaussians, camera, settings)
-    call = Call(gaussians, camera, settings or RenderSettings.preset("exact"), wanted)
+    seen = gaussians_at("render", gaussians, camera)
+    check_view("render", seen, camera, settings)
+    call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted)
     with _own_errors():
         return call.output(_differentiable(call))
 
@@ -109,11 +109,11 @@ def render_jvp(
         ValueError: If a name or shape is wrong.
     """
     scene = gaussians if isinstance(gaussians, DeformableScene) else None
-    gaussians = gaussians_at("render_jvp", gaussians, camera)
-    check_view("render_jvp", gaussians, camera, settings)
+    seen = gaussians_at("render_jvp", gaussians, camera)
+    check_view("render_jvp", seen, camera, settings)
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
-    call = Call(gaussians.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene)
+    call = Call(seen.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene)
     return push_forward(call, dict(tangents))
 
 

@@ -77,7 +77,10 @@ class Call:
         field: From the scene's parameters to the Gaussians'; None for those of the Gaussians themselves.
         shape: Of the images: (H, W), or that of the rays.
         extra, certificate: Of the last `trace`: outputs without a derivative, and `Output.certificate`.
+        result_names: Of the images that the last differentiable `trace` gave, in their order.
     """
+
+    result_names: list[str]
 
     def __init__(
         self,
