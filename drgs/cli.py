@@ -17,7 +17,7 @@ import logging
 import os
 import sys
 import typing
-from typing import Annotated
+from typing import Annotated, Any, TextIO
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
@@ -99,15 +99,15 @@ class _Stderr(logging.StreamHandler):
     """Writes to what sys.stderr is now: a bar that is being drawn puts itself there, and keeps below other lines."""
 
     @property
-    def stream(self):
+    def stream(self) -> TextIO:
         return sys.stderr
 
     @stream.setter
-    def stream(self, _):
+    def stream(self, _: TextIO) -> None:
         pass
 
 
-def _parse_arguments(argv: list[str]):
+def _parse_arguments(argv: list[str]) -> Any:
     """The dataclass of the command in argv; tyro's framed usage errors become one line."""
     commands = typing.Union[  # noqa: UP007 (built at run time)
         tuple(Annotated[options, subcommand(name)] for name, options in _OPTIONS.items())

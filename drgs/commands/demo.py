@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -207,7 +208,7 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
     return report
 
 
-def _still_life():
+def _still_life() -> ModuleType:
     try:
         from scenes import still_life
     except ImportError:

@@ -87,7 +87,7 @@ class _Data:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Around:
+class Around:
     """Options of commands that can make cameras around a scene; what is not given is as a run's photographs or the
     known views have it, where there are any.
     """
@@ -139,7 +139,7 @@ class Info(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(_Settings, _Around, _Data):
+class Render(_Settings, Around, _Data):
     """Render a Gaussian PLY, or a finished run, to pictures or a video."""
 
     scene: Positional[Path]
@@ -235,7 +235,7 @@ class Fit(_Policy, _Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Views(_Information, _Around, _Data):
+class _Views(_Information, Around, _Data):
     """Options of commands that compare views with known ones."""
 
     scene: Positional[Path]
@@ -277,7 +277,7 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seen(_Settings, _Around, _Data):
+class _Seen(_Settings, Around, _Data):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Positional[Path]

@@ -15,6 +15,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
@@ -26,6 +27,7 @@ from drgs.settings import RenderSettings
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from drgs.commands.options import Around
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["UP", "Wish", "capture_orbit", "dome", "scene_orbit", "seen_distance"]
@@ -89,7 +91,7 @@ class Wish:
                 raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
 
     @classmethod
-    def of(cls, args) -> Wish:
+    def of(cls, args: Around) -> Wish:
         """Of a command's options: `up`, `center`, `distance`, `elevation`, `span` and, if it has one, `fov`."""
         up = None if args.up == "auto" else UP[args.up]
         fields = {name: getattr(args, name) for name in ("center", "distance", "elevation", "span")}
@@ -268,7 +270,15 @@ class _Lens:
         return Camera(K=self.K, w2c=w2c, width=self.width, height=self.height, name=f"orbit_{index:04d}")
 
 
-def _around(center, up, front, turns, distance: float, elevation: float, lens: _Lens) -> list[Camera]:
+def _around(
+    center: np.ndarray,
+    up: np.ndarray,
+    front: np.ndarray,
+    turns: np.ndarray,
+    distance: float,
+    elevation: float,
+    lens: _Lens,
+) -> list[Camera]:
     """Cameras at azimuths (radians) from the direction `front`, looking at the center."""
     side, rise = np.cross(up, front), math.radians(elevation)
     made = []
@@ -289,11 +299,11 @@ def _turns(frames: int, span: float, returns: bool) -> np.ndarray:
     return math.radians(span) * ((index + 0.5) / frames - 0.5)
 
 
-def _unit(vector) -> np.ndarray:
+def _unit(vector: npt.ArrayLike) -> np.ndarray:
     vector = np.asarray(vector, np.float64)
     return vector / np.linalg.norm(vector)
 
 
-def _level(direction, up) -> np.ndarray:
+def _level(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
     """The direction without its part along up, of length 1."""
     return _unit(direction - (direction @ up) * up)

@@ -10,7 +10,7 @@ import dataclasses
 import logging
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -217,11 +217,11 @@ def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tupl
 # ----------------------------------------------------------------------------------------- outputs
 
 
-def _number(value) -> int | None:
+def _number(value: torch.Tensor | int | None) -> int | None:
     return None if value is None else int(value)
 
 
-def _total(values) -> int | None:
+def _total(values: Iterable[int | None]) -> int | None:
     known = [value for value in values if value is not None]
     return sum(known) if known else None
 

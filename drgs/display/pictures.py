@@ -11,6 +11,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
@@ -109,7 +110,7 @@ def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     high = max(high, low + 1e-12 + 1e-6 * abs(low))
 
-    def colors(values):
+    def colors(values: np.ndarray) -> np.ndarray:
         near = to_bytes((high - values) / (high - low))
         return cv2.applyColorMap(near, cv2.COLORMAP_INFERNO)[..., ::-1]
 
@@ -186,7 +187,9 @@ class Video:
         self._name = self._stack.enter_context(_temporary(self.path))
         return self
 
-    def __exit__(self, kind, error, trace) -> bool:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
         if self._writer is not None:
             self._writer.release()
             if kind is None and (problem := self._problem()):

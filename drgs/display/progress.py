@@ -44,7 +44,7 @@ class Bar:
         _open(self)
         return self
 
-    def __exit__(self, error, *_) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if error is None and self.is_told and self.total is not None:
             self.note(self.line())
         _close(self)

@@ -41,7 +41,7 @@ def lines(
             break
         widths[widest] -= 1
 
-    def line(cells) -> str:
+    def line(cells: Sequence[str]) -> str:
         placed = zip(cells, widths, is_text, strict=True)
         return _GAP.join(cell.ljust(w) if text else cell.rjust(w) for cell, w, text in placed).rstrip()
 

@@ -21,25 +21,18 @@ from drgs.data.sizes import at_most
 from drgs.integrator import render
 from drgs.lab.tradeoff import clocked, placed
 from drgs.lab.tradeoff_advice import interval, leaders
-from drgs.lab.tradeoff_rows import CLOCKS, Interval, Measured, Row
+from drgs.lab.tradeoff_rows import CLOCKS, FullTime, Interval, Measured, Row
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
-__all__ = ["FullSize", "FullTime", "measure_full"]
+__all__ = ["FullSize", "measure_full"]
 
 _ROUNDS = 3  # that say how much times scatter
 _FORWARD = 0.6  # of the seconds are for images, which is what is drawn at full size
 _GROW = 4  # times as many pixels are tried next, on the way to full size
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FullTime(Interval):
-    """Times of a row on views as large as they are drawn: ratios to exact's, and the median in seconds."""
-
-    seconds: float
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ __all__ = [
     "CLOCKS",
     "VARIANTS",
     "Errors",
+    "FullTime",
     "GradientError",
     "GroupInformation",
     "ImageError",
@@ -241,6 +242,13 @@ class Interval:
     rounds: int
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FullTime(Interval):
+    """Times of a row on views as large as they are drawn: ratios to exact's, and the median in seconds."""
+
+    seconds: float
+
+
 @dataclasses.dataclass(kw_only=True)
 class Row:
     """A variant, and what was measured of it, in the order of tradeoff.json.
@@ -274,7 +282,7 @@ class Row:
     ratio: dict[str, float | None] | None = None
     times: dict[str, Interval | None] | None = None
     first_call: float | None = None
-    full: dict[str, Interval] = dataclasses.field(default_factory=dict)
+    full: dict[str, FullTime] = dataclasses.field(default_factory=dict)
     errors: Errors = Errors()
     flags: str | None = None
 
