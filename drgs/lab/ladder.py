@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
@@ -87,7 +88,7 @@ def ladder(
     if made.crop and not made.windows:
         made.place_crops(start)
     orders = sequences(start, end)
-    report = {
+    report: dict[str, Any] = {
         "start": dataclasses.asdict(start),
         "end": dataclasses.asdict(end),
         "gaussians": len(g),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -113,12 +114,11 @@ class Pictures:
         """Images as rows of pixels, and J^T u by backward mode where gradients are wanted."""
         gradient = {}
         if self.gradients:
-            loss = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
+            loss: Any = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
             leaves = [g.parameters()[name] for name in PARAMETERS]
+            found: Sequence[torch.Tensor | None] = [None] * len(leaves)
             if loss.requires_grad:
                 found = torch.autograd.grad(loss, leaves, allow_unused=True)
-            else:
-                found = [None] * len(leaves)
             for name, leaf, x in zip(PARAMETERS, leaves, found, strict=True):
                 gradient[name] = torch.zeros_like(leaf) if x is None else x.detach().cpu()
         # What is kept are numbers: a graph would hold every picture's intermediates.
@@ -151,7 +151,7 @@ class Pictures:
 
 def _joined(states: list[State]) -> State:
     """Pixels of all, and the sum of their gradients."""
-    gradient = {name: sum(x.gradient[name] for x in states) for name in states[0].gradient}
+    gradient: dict[str, Any] = {name: sum(x.gradient[name] for x in states) for name in states[0].gradient}
     return State(torch.cat([x.image for x in states]), gradient)
 
 
