@@ -82,6 +82,7 @@ class Adjoint:
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
     def _take(self, index, rays, states, places, active):
+        """The same, where the Gaussian is hit: its part of every gradient, and the states of the rays behind it."""
         m, lib, out = self.m, self.m.lib, []
         D = lib.Float64
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
