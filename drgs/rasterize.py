@@ -188,6 +188,7 @@ def _view(
     meta, compensation = _projected(splats, camera, settings, antialiased)
     if compensation is not None:
         splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
+    # `meta` is to be looked at: no gradient passes through it.
     meta["opacities"] = splats.opacities.detach().to(splats.means.dtype)
     # A Gaussian that is left out must not be drawn: the renderer itself knows no far plane and no smallest radius.
     kept = (meta["depths"] <= far) & (meta["depths"] > settings.near)
@@ -227,7 +228,7 @@ def _projected(
         w2c = torch.as_tensor(camera.w2c).to(**like)
         fx, skew, cx, fy, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
         x, y, z = (splats.means.to(**like) @ w2c[:3, :3].T + w2c[:3, 3]).unbind(1)
-        valid = z.detach() > settings.near
+        valid = z.detach() > settings.near  # which ones are drawn is a constant of every derivative
         z = torch.where(valid, z, 1)  # the others have no projection
         u, v = x / z, y / z
         means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
@@ -254,7 +255,7 @@ def _projected(
         if antialiased:
             # The square root has no derivative at 0, where the opacity is 0 anyway.
             compensation = (sharp.clamp_min(1e-30) / blurred).sqrt().to(splats.means.dtype)
-    with torch.no_grad():
+    with torch.no_grad():  # `meta` has no graph
         opacity = splats.opacities.to(**like) * (1 if compensation is None else compensation)
         extent = (2 * (255 * opacity).clamp_min(1).log()).sqrt().clamp_max(3.33)
         valid = valid & (opacity >= 1 / 255)  # not in place: the graph of z keeps the mask
@@ -265,9 +266,9 @@ def _projected(
         kind = splats.means.dtype
         meta = {
             "radii": (radii * valid[:, None]).to(torch.int32),
-            "means2d": means2d.detach().to(kind),
+            "means2d": means2d.detach().to(kind),  # has a graph in antialiased mode
             "depths": torch.where(valid, z, 0).to(kind),
-            "conics": conics.detach().to(kind),
+            "conics": conics.detach().to(kind),  # as means2d
         }
     return meta, compensation
 

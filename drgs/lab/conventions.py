@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 
@@ -182,6 +183,7 @@ def _refined(
     if distance(model) <= settled or value == float(flip):
         return model
     center, ratio = math.log(1 - value if flip else value), (math.sqrt(5) - 1) / 2
+    # What is searched for stays below 1.
     low, high = center - 1.0, min(center + 1.0, -1e-3)
 
     def at(x: float) -> ReferenceModel:
@@ -198,7 +200,7 @@ def _refined(
     return new if distance(new) < 0.5 * distance(model) else model
 
 
-def _get(model: ReferenceModel, field: str):
+def _get(model: ReferenceModel, field: str) -> Any:
     return getattr(model if hasattr(model, field) else model.settings, field)
 
 
@@ -206,5 +208,5 @@ def _different(model: ReferenceModel, start: ReferenceModel) -> list[str]:
     return [field for field in _VARIATIONS if _get(model, field) != _get(start, field)]
 
 
-def _text(value) -> str:
+def _text(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -53,6 +53,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
             break
     seen = torch.stack(seen).any(0)
     index = torch.nonzero(seen)[:, 0]
+    # What is compared has leaves of its own.
     fields = {name: getattr(g, name).detach()[index] for name in PARAMETERS}
     return Gaussians(**fields, origin=g.origin), parts, places
 
@@ -68,7 +69,7 @@ def _liveliest(image: torch.Tensor, width: int, height: int) -> tuple[int, int]:
     """Corner (x, y) of the crop of an (H, W, 4) image whose colors and alpha vary most."""
     x = image.double().permute(2, 0, 1)[None]
 
-    def mean(values):
+    def mean(values: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.avg_pool2d(values, (height, width), stride=_STEP)
 
     variance = (mean(x * x) - mean(x) ** 2).sum(1)[0]

@@ -107,7 +107,9 @@ def central(
     )
 
 
-def _slopes(rasterizer, raw, camera, background, group, index) -> tuple[list[torch.Tensor], list[float]]:
+def _slopes(
+    rasterizer: Rasterizer, raw: dict, camera: Camera, background: tuple, group: str, index: int
+) -> tuple[list[torch.Tensor], list[float]]:
     """(I(+h) - I(-h)) / 2h for each step, as (H, W, 3), and the steps as they were after rounding."""
     first = _FIRST[rasterizer.dtype] * _unit(raw, camera, group, index)
     found, used = [], []
@@ -122,6 +124,7 @@ def _slopes(rasterizer, raw, camera, background, group, index) -> tuple[list[tor
         width = places[0] - places[1]
         used.append(width / 2)
         found.append((images[0] - images[1]) / width if width > 0 else torch.zeros_like(images[0]))
+    # A step that rounding has taken away is 0, and is divided by: its rounding then counts for everything.
     return found, [max(h, 1e-300) for h in used]
 
 
@@ -156,8 +159,10 @@ def _extrapolated(sums: list[float], bars: list[float]) -> tuple[float | None, f
         if best is None or error < best[1]:
             best = value, error, k
     value, error, k = best
+    # An error of 1e-3 is far below what is a bug (judgement._OWN).
     if error <= 1e-3 * abs(value) or all(gap <= 4 * bar for gap, bar in zip(gaps, bars[1:], strict=True)):
         return value, error  # settled, or below rounding on all steps
+    # A gap of 0 has a logarithm, too, far from 2.
     ratios = [math.log2(max(a, 1e-300) / b) for a, b, bar in zip(gaps, gaps[1:], bars[2:], strict=False) if b > 4 * bar]
     if ratios and all(1.5 <= ratio <= 2.5 for ratio in ratios):
         return value, error

@@ -70,14 +70,14 @@ class Case:
     first: int
     say: Callable[[str], None]
 
-    def theirs(self, u) -> dict:
+    def theirs(self, u: torch.Tensor) -> dict:
         """The rasterizer's gradient, summed over views, of poses (C, 6); None where there is none."""
         if isinstance(self.rasterizer, Dump):
             return dict(self.rasterizer.gradients)
         pairs = zip(self.cameras, u, strict=True)
         return _joined([self.rasterizer.gradient(self.raw, camera, self.background, w) for camera, w in pairs])
 
-    def ours(self, model: ReferenceModel, u) -> dict:
+    def ours(self, model: ReferenceModel, u: torch.Tensor) -> dict:
         """The model's gradient, summed over views, of poses (C, 6)."""
         return _joined([model.gradient(self.raw, c, w, self.oracle) for c, w in zip(self.cameras, u, strict=True)])
 
@@ -113,7 +113,15 @@ class Compared:
     counted: bool
 
 
-def compared(case: Case, model: ReferenceModel, signs, pictures, alphas, drawn, near_ties: Callable) -> Compared:
+def compared(
+    case: Case,
+    model: ReferenceModel,
+    signs: torch.Tensor,
+    pictures: list[torch.Tensor],
+    alphas: list[torch.Tensor],
+    drawn: list[tuple[torch.Tensor, torch.Tensor]],
+    near_ties: Callable[[int], torch.Tensor],
+) -> Compared:
     """Two correct renderers differ where pixels hang on near ties: these are left out before a difference counts."""
     ties, counted = torch.zeros(signs.shape[:3], dtype=torch.bool), False
     while True:
@@ -204,6 +212,7 @@ def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float
     relative = float((a - b).norm()) / max(norm, 1e-12)  # of a gradient that is 0: of next to nothing
     each = (theirs - ours).reshape(len(ours), -1).norm(dim=1)
     worst = torch.topk(each, min(5, len(each))).indices
+    # Both are 0 up to rounding: what is left of 1e-9 has no direction to be compared.
     if verdict is None and (relative <= tolerance or (norm < 1e-9 and largest < 1e-9)):
         verdict, why = "agreement", ""
     return GroupRow(
@@ -213,6 +222,7 @@ def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float
         relative=relative,
         # Underflow, not 0, is kept from the division: the case of 0 is told apart.
         cosine=float(a @ b / (a.norm() * b.norm()).clamp_min(1e-300)) if norm > 0 else float(not a.any()),
+        # The same floor as of `relative`.
         bias=float(a @ b) / max(norm, 1e-12) ** 2 - 1 if norm > 0 else 0.0,
         max=largest,
         norm=norm,
@@ -290,6 +300,7 @@ def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differenc
     elif spread < 0.02 and abs(ratio - 1) > 0.02:
         what = f"it is {ratio:.3g} times its own central differences"
     else:
+        # Differences that are all 0 are divided by, too.
         what = f"it is off its own central differences by {error / max(size, 1e-300):.2g} of their size"
     return OwnRow(
         entries=own.entries[name],

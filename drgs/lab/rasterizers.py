@@ -20,7 +20,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, sh_degree_of
 from drgs.integrator import render
-from drgs.lab.dumps import SUFFIXES, one_line, read_dump
+from drgs.lab.dumps import SUFFIXES, Dump, one_line, read_dump
 from drgs.lab.raw import COLORS, POSE, gaussians_of, image_of, posed
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
@@ -52,6 +52,7 @@ class Rasterizer:
         """Image and alpha without derivatives, float64 on the CPU."""
         with torch.no_grad():
             image, alpha = self.draw(self.taken(raw), camera, background)
+        # A function may turn gradients on for itself.
         return image.detach().double().cpu(), alpha.detach().double().cpu()
 
     def gradient(self, raw: dict, camera: Camera, background: tuple, cotangent: torch.Tensor) -> dict:
@@ -73,6 +74,7 @@ class Rasterizer:
             # It may make an array of the pose, or refuse one that wants a gradient: the others are asked for alone.
             fixed = {name: x for name, x in raw.items() if name != POSE}
             return {**self.gradient(fixed, camera, background, cotangent), POSE: None}
+        # Numbers from here on.
         return {name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, found, strict=True)}
 
     def taken(self, raw: dict) -> dict:
@@ -80,15 +82,17 @@ class Rasterizer:
         return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}  # new leaves
 
 
-def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, fields: dict | None = None):
+def load(
+    text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, fields: dict | None = None
+) -> Rasterizer | Dump:
     """A rasterizer by its name.
 
     Args:
         text: `drgs:ewa` (preset gsplat) or `drgs:PRESET`; `gsplat`; `package.module:function`, a function with the
             argument names of gsplat's `rasterization` that returns (image (C,H,W,3), alpha (C,H,W,1), anything); or a
             file .npz or .safetensors with `image` (C,H,W,3), `alpha` (C,H,W), `cotangent` (C,H,W,3), `grad_means`,
-            `grad_quats`, `grad_log_scales`, `grad_logit_opacities`, `grad_sh` (of raw parameters), and the arrays of
-            the scene as `export` wrote them (C = 1 may be left out).
+            `grad_quats`, `grad_log_scales`, `grad_logit_opacities`, `grad_sh` (of raw parameters), maybe `grad_viewmat`
+            (C,4,4), and the arrays of the scene as `export` wrote them (C = 1 may be left out).
         g, cameras: What a dump must be of.
         fields: Settings that hold whatever the preset is: ours are drawn with them, a dump is of their background.
     Returns:
@@ -132,7 +136,7 @@ def load(text: str, g: Gaussians | None = None, cameras: list[Camera] | None = N
 def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rasterizer:
     """`drgs.render` with these settings."""
 
-    def draw(raw: dict, camera: Camera, background: tuple):
+    def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
         g, shift = gaussians_of(raw)
         out = render(g, posed(raw, camera), settings.replace(background=background[:3]), outputs=())
         return image_of(out, raw, shift), out.alpha
@@ -145,7 +149,8 @@ def function(call: Callable, name: str) -> Rasterizer:
     accepted = inspect.signature(call).parameters
     open_ended = any(p.kind is p.VAR_KEYWORD for p in accepted.values())
 
-    def draw(raw: dict, camera: Camera, background: tuple):
+    def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        """Its image, or one line that says how it failed."""
         means, camera = raw["means"], posed(raw, camera)
         like = {"dtype": means.dtype, "device": means.device}
         arguments = {

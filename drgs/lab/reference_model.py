@@ -89,6 +89,7 @@ class ReferenceModel:
 
     def gradient(self, raw: dict, camera: Camera, cotangent: torch.Tensor, oracle: bool = False) -> dict:
         """float64 gradient of <cotangent, image> by group."""
+        # New leaves, whatever the raw parameters came from.
         leaves = {name: x.detach().clone().requires_grad_() for name, x in raw.items()}
         total = {name: torch.zeros_like(x) for name, x in raw.items()}
         cotangent = self._flipped(cotangent)  # of what is not flipped yet
@@ -175,8 +176,10 @@ class ReferenceModel:
         if self.opacities == "sigmoid":
             raw["logit_opacities"] = raw["logit_opacities"].sigmoid()
         if self.compensation != "none" and self.settings.dilation > 0:
+            # The root has no derivative at 0; gsplat has no floor, and 1e-6 of an opacity is not drawn by anyone.
             floor = 1e-12 if self.compensation == "full" else _COMPENSATION_FLOOR
             alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings, floor)
+            # Logits of 0 and 1 are infinite.
             raw["logit_opacities"] = torch.logit(alpha.clamp(1e-12, 1 - 1e-12))
         if COLORS in raw:
             return raw
@@ -201,6 +204,7 @@ class ReferenceModel:
         towards = raw["means"] + rotation.T @ translation
         # What is known as a detached direction is so for the mean and the camera.
         towards = towards if self.direction_gradient else towards.detach()
+        # A mean at the camera has no direction: 0 instead of NaN.
         towards = towards / towards.norm(dim=-1, keepdim=True).clamp_min(1e-300)
         if self.direction == "to the camera":
             towards = -towards
@@ -221,7 +225,7 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
     """(N,) sqrt(det Sigma' / det(Sigma' + dilation I)) of the projected covariances, as Mip-Splatting has it."""
     w2c = float64(camera.w2c)
     x, y, z = (raw["means"] @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
-    z = torch.where(z > 1e-6, z, 1e-6)
+    z = torch.where(z > 1e-6, z, 1e-6)  # behind the camera nothing is drawn: any number without a derivative
     axes = activate(gaussians_of(raw)[0], s).axes
     a, b = screen_rows(x, y, z, camera, s.fov_clamp, w2c[:3, :3], axes).unbind(1)
     det = torch.linalg.cross(a, b).square().sum(-1)
