@@ -8,8 +8,8 @@ import typing
 
 import pytest
 
-from drgs import fisher, gain, select
-from drgs.commands import options
+from drgs import fisher, gain, runtime, select
+from drgs.commands import options, orbits
 from drgs.data import sfm
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.settings import PRESETS, RenderSettings
@@ -47,7 +47,7 @@ def test_information_options_are_those_of_an_active_fit(command):
 
 
 def test_choices_are_what_there_is():
-    """Presets, policies, criteria, methods, lenses and ways of matching: no more and no fewer than the code knows."""
+    """What an option offers is what the code knows, no more and no fewer."""
     for command in (options.Render, options.Fit, options.Select, options.Fisher, options.Tradeoff):
         assert _choices(command, "preset") == PRESETS
     assert _choices(options.Crossval, "preset") == ("auto", *PRESETS)
@@ -57,6 +57,8 @@ def test_choices_are_what_there_is():
         assert _choices(command, "policy") == tuple(select.POLICIES)
         assert _choices(command, "criterion") == gain.CRITERIA
         assert _choices(command, "method") == fisher.METHODS
+    assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
+    assert _choices(options.Render, "up") == ("auto", *orbits.UP)
     parameters = inspect.signature(sfm.run_sfm).parameters
     assert _choices(options.Sfm, "camera_model") == sfm.CAMERA_MODELS
     assert _choices(options.Sfm, "matcher") == sfm.MATCHING

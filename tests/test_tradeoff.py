@@ -19,7 +19,7 @@ from drgs.integrator import render
 from drgs.lab.tradeoff import measure
 from drgs.lab.tradeoff_advice import USES, interval, recommend
 from drgs.lab.tradeoff_full import measure_full
-from drgs.lab.tradeoff_rows import VARIANTS, Errors, GroupInformation, Interval, Measured, Row
+from drgs.lab.tradeoff_rows import VARIANTS, GroupInformation, Interval, Measured, TradeoffRow, WorstErrors
 from drgs.settings import RenderSettings
 
 BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
@@ -259,8 +259,8 @@ def test_intervals_of_the_median():
 def test_jitter_is_no_gain():
     """Of settings that do exact's own work none is recommended, however the times fall; real gains are."""
     times = lambda low, ratio, high: Interval(ratio=ratio, low=low, high=high, rounds=5)  # noqa: E731
-    row = lambda name, span, error: Row(  # noqa: E731
-        name=name, kind="x", errors=Errors(image=error), times={"forward": times(*span)}
+    row = lambda name, span, error: TradeoffRow(  # noqa: E731
+        name=name, kind="x", errors=WorstErrors(image=error), times={"forward": times(*span)}
     )
     exact, same, half = (
         row("exact", (1, 1, 1), 1e-7),
@@ -268,7 +268,7 @@ def test_jitter_is_no_gain():
         row("half", (0.4, 0.5, 0.6), 1e-4),
     )
     scatter = {"forward": times(0.93, 1.0, 1.06)}
-    made = lambda *rows: Measured(list(rows), Errors(), scatter, 1.0, 5, "wall")  # noqa: E731
+    made = lambda *rows: Measured(list(rows), WorstErrors(), scatter, 1.0, 5, "wall")  # noqa: E731
     picks = recommend(made(exact, same, half), "image", [1e-9, 1e-5, 1e-3])
     assert picks[0].name is None
     assert picks[1].name == "exact"

@@ -71,7 +71,7 @@ def run(args: Fisher) -> None:
         for camera, name in zip(views, names, strict=True):
             rows.append(_view(args, given.gaussians, camera, settings, name, H, prior))
             bar.advance()
-    groups = {name: GroupRow.of(x) for name, x in H.items()}
+    groups = {name: GroupSummary.of(x) for name, x in H.items()}
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
     save_state(args.output / "information.safetensors", H, header)
     report = {
@@ -94,7 +94,7 @@ def run(args: Fisher) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class GroupRow:
+class GroupSummary:
     """What the known views say about a group of parameters: a summary of its information's entries."""
 
     shape: list[int]
@@ -103,7 +103,7 @@ class GroupRow:
     zero: int
 
     @classmethod
-    def of(cls, x: torch.Tensor) -> GroupRow:
+    def of(cls, x: torch.Tensor) -> GroupSummary:
         """Of the information of a group."""
         positive = x[x > 0]
         median = float(positive.median()) if positive.numel() else None
@@ -111,7 +111,7 @@ class GroupRow:
 
 
 @dataclasses.dataclass(frozen=True)
-class MapRow:
+class MapSummary:
     """A map in three numbers."""
 
     sum: float
@@ -120,7 +120,7 @@ class MapRow:
 
 
 @dataclasses.dataclass(frozen=True)
-class PoseRow:
+class PoseSummary:
     """What a view says about its own pose: a 6x6 matrix, and its eigenvalues, the least first."""
 
     information: list[list[float]]
@@ -128,7 +128,7 @@ class PoseRow:
 
 
 @dataclasses.dataclass(frozen=True)
-class ViewRow:
+class MappedView:
     """What a view shows.
 
     Attributes:
@@ -143,9 +143,9 @@ class ViewRow:
     camera: Camera
     files: list[str]
     gain: dict[str, float]
-    variance: MapRow
-    share: MapRow
-    pose: PoseRow | None
+    variance: MapSummary
+    share: MapSummary
+    pose: PoseSummary | None
 
     def to_json(self) -> dict[str, Any]:
         """As fisher.json holds it."""
@@ -174,7 +174,7 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
 
 def _view(
     args: Fisher, g: Gaussians, camera: Camera, settings: RenderSettings, name: str, H: Information, prior: Prior
-) -> ViewRow:
+) -> MappedView:
     """Maps of one view, and what it says."""
     Hc = fisher.diagonal(g, camera, settings, args.method)
     # Maps are of the image's colors; features have an image of their own.
@@ -184,16 +184,16 @@ def _view(
         values = fisher.variance_map(g, camera, weights, settings).numpy()
         files.append(f"{name}.{kind}.png")
         pictures.write_png(args.output / files[-1], pictures.map_picture(values))
-        maps.append(MapRow(float(values.sum(dtype=np.float64)), float(values.mean()), float(values.max())))
+        maps.append(MapSummary(float(values.sum(dtype=np.float64)), float(values.mean()), float(values.max())))
     pose = None
     if args.pose:
         found = fisher.pose_information(g, camera, settings)
-        pose = PoseRow(found.tolist(), torch.linalg.eigvalsh(found).tolist())
+        pose = PoseSummary(found.tolist(), torch.linalg.eigvalsh(found).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
-    return ViewRow(camera.name, camera, files, gain, *maps, pose)
+    return MappedView(camera.name, camera, files, gain, *maps, pose)
 
 
-def _print(args: Fisher, known: Known, groups: dict[str, GroupRow], views: list[ViewRow], source: str) -> None:
+def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
     """What was found, as tables on stdout."""
     rows = []
     for name, row in groups.items():

@@ -15,9 +15,9 @@ the largest unit); of information, the larger of L1 and median.
 
 Times are medians over rounds in which all settings take turns on one view, everything included; ratios are to `exact`
 in the same round. Errors, and a first look at all times, are of reduced views; the leading settings are timed again on
-views as large as they are drawn (tradeoff_full.py), and advice follows from these (tradeoff_advice.py). With one thread
-it is the processor's time, else the clock's. What would take minutes (Mitsuba's
-traversal without cut-offs, the oracle) is measured on a sample of rays, once, and its time scaled to the image.
+views as large as they are drawn (lab/tradeoff_full.py), and advice follows from these (lab/tradeoff_advice.py). With
+one thread it is the processor's time, else the clock's. What would take minutes (Mitsuba's traversal without cut-offs,
+the oracle) is measured on a sample of rays, once, and its time scaled to the image.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import claim
 from drgs.lab.tradeoff import measure
-from drgs.lab.tradeoff_advice import USES, Pick, recommend
+from drgs.lab.tradeoff_advice import USES, Advice, recommend
 from drgs.lab.tradeoff_full import FullSize, measure_full
 from drgs.lab.tradeoff_plot import plot
-from drgs.lab.tradeoff_rows import CLOCKS, VARIANTS, Interval, Measured, Row
+from drgs.lab.tradeoff_rows import CLOCKS, VARIANTS, Interval, Measured, TradeoffRow
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -131,7 +131,7 @@ class _Report:
     seed: int
     budgets: Sequence[float]
     measured: Measured
-    recommended: list[Pick]
+    recommended: list[Advice]
     date: str
     env: dict[str, Any]
 
@@ -211,7 +211,7 @@ def _page(report: _Report, drawn: bool) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: TradeoffRow) -> list[str]:
     """A row of the page behind name and kind."""
     image, slope, information = row.image, row.gradient, row.information
     return [
@@ -292,7 +292,7 @@ def _size(found: FullSize) -> str:
     return text if found.size == found.drawn else text + " (of {}x{}: --seconds)".format(*found.drawn)
 
 
-def _span(times: Interval | Pick) -> str:
+def _span(times: Interval | Advice) -> str:
     """A ratio and its interval."""
     digits = 3 if times.ratio < 0.1 else 2
     if times.low == times.high:
@@ -304,7 +304,7 @@ def _seconds(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds >= 1 else _milliseconds(seconds)
 
 
-def _advice(pick: Pick) -> str:
+def _advice(pick: Advice) -> str:
     where = f"{pick.use}, {pick.budget:g}: "
     if pick.name is None:
         return where + pick.reason
@@ -312,7 +312,7 @@ def _advice(pick: Pick) -> str:
     return f"{where}{pick.flags}{why}, error {pick.error:.1e}"
 
 
-def _time(row: Row, clock: str) -> str:
+def _time(row: TradeoffRow, clock: str) -> str:
     ratio = row.ratio[clock]
     if ratio is None:
         return "-"

@@ -17,13 +17,13 @@ from drgs.integrator import render, render_rays
 from drgs.lab.tradeoff_advice import interval
 from drgs.lab.tradeoff_rows import (
     CLOCKS,
-    Errors,
     GradientError,
     ImageError,
     InformationError,
     Measured,
-    Row,
+    TradeoffRow,
     Variant,
+    WorstErrors,
     one_line,
     rows_of,
 )
@@ -111,7 +111,7 @@ def placed(gaussians: Gaussians) -> Gaussians:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Seen:
+class _Answer:
     """What a setting makes of a view.
 
     Attributes:
@@ -143,7 +143,7 @@ class _Stage:
         self.cotangents = [
             (torch.randint(0, 2, size, generator=generator) * 2 - 1).float().to(device) for size in sizes
         ]
-        self.truth: dict[int, _Seen] = {}
+        self.truth: dict[int, _Answer] = {}
         self.shown, self.sampled = False, 0
 
     def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
@@ -188,7 +188,7 @@ class _Stage:
 class _Turn:
     """One row's measurements, view by view and round by round."""
 
-    def __init__(self, row: Row, stage: _Stage):
+    def __init__(self, row: TradeoffRow, stage: _Stage):
         self.row, self.stage = row, stage
         self.settings = row.settings
         self.seconds = {name: {} for name in CLOCKS}
@@ -236,10 +236,10 @@ class _Turn:
         if number < len(stage.cameras):
             if not all(bool(torch.isfinite(x).all()) for x in (image, *slopes.values(), *(parts or {}).values())):
                 raise ValueError(f"{self.row.name}: must be finite, view {camera.name or view} has NaN or Inf")
-            seen = _Seen(image, slopes, parts)
+            seen = _Answer(image, slopes, parts)
             self._compare(stage.truth.setdefault(view, seen), seen)
 
-    def _compare(self, truth: _Seen, seen: _Seen) -> None:
+    def _compare(self, truth: _Answer, seen: _Answer) -> None:
         """Add one view's differences from the truth: sizes of pixels', sums by group, medians of entries."""
         self.pixels.append((seen.image - truth.image).abs().double().reshape(-1).numpy())
         for name, x in seen.slopes.items():
@@ -272,12 +272,12 @@ class _Turn:
         self.row.first_call = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
 
 
-def _sampled(rows: list[Row], stage: _Stage, truth: _Turn, seed: int) -> Errors:
+def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) -> WorstErrors:
     """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
     camera, count = stage.cameras[stage.sampled], len(stage.gaussians)
     pixels = camera.width * camera.height
     places = torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
-    own = Errors()
+    own = WorstErrors()
     for row in rows:
         if row.skipped is not None or row.by == "view":
             continue
@@ -293,7 +293,7 @@ def _sampled(rows: list[Row], stage: _Stage, truth: _Turn, seed: int) -> Errors:
     return own
 
 
-def _by_rays(row: Row, stage: _Stage, truth: _Turn, chosen: torch.Tensor) -> Errors:
+def _by_rays(row: TradeoffRow, stage: _Stage, truth: _Turn, chosen: torch.Tensor) -> WorstErrors:
     """One row on some pixels of a view: errors against the truth's image, time scaled to all of them."""
     camera, oracle = stage.cameras[stage.sampled], row.by == "oracle"
     whole = stage.cotangents[stage.sampled]
@@ -331,7 +331,7 @@ def _by_rays(row: Row, stage: _Stage, truth: _Turn, chosen: torch.Tensor) -> Err
         row.notes |= {"ties": int((~good).sum()), "max with ties": float(off.max())}
     own = row.gradient.worst
     # |x^2 - y^2| = |x - y| |x + y|, summed: at most 2 e + e^2 of sum y^2 where x - y is e of y in the L2 norm.
-    return Errors(row.image.max, own, own and 2 * own + own**2)
+    return WorstErrors(row.image.max, own, own and 2 * own + own**2)
 
 
 def _tracer(

@@ -13,9 +13,9 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from drgs.lab.tradeoff_rows import Interval, Measured, Row
+from drgs.lab.tradeoff_rows import Interval, Measured, TradeoffRow
 
-__all__ = ["USES", "Pick", "interval", "leaders", "recommend"]
+__all__ = ["USES", "Advice", "interval", "leaders", "recommend"]
 
 USES = {
     "image": ("forward", ("image",)),
@@ -29,7 +29,7 @@ _SURE = 0.05  # two-sided; of the interval, by the sign test
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Pick:
+class Advice:
     """What is recommended for a use and a budget.
 
     Attributes:
@@ -91,7 +91,7 @@ def leaders(measured: Measured, clock: str, budgets: Sequence[float]) -> list[st
     return list(dict.fromkeys([*fast, *names]))
 
 
-def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Pick]:
+def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Advice]:
     """For each budget the fastest setting with a gain, the most exact one of those as fast, or why there is none.
 
     Args:
@@ -111,7 +111,7 @@ def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Pi
         timed = [(row, error, row.full.get(clock) if full else row.times[clock]) for row, error in within]
         faster = [(row, error, times) for row, error, times in timed if times and times.high < sure]
         exact = next((entry for entry in timed if entry[0] is measured.truth), None)
-        pick = Pick(use=use, budget=budget, clock=clock)
+        pick = Advice(use=use, budget=budget, clock=clock)
         if faster or exact:
             if faster:
                 least = min(faster, key=lambda entry: entry[2].ratio)
@@ -139,7 +139,7 @@ def _why_none(measured: Measured, use: str) -> str:
     return f"no setting is within it, the least error is {error:.1e} ({row.name})"
 
 
-def _within(measured: Measured, use: str, budget: float) -> list[tuple[Row, float]]:
+def _within(measured: Measured, use: str, budget: float) -> list[tuple[TradeoffRow, float]]:
     """Candidates whose errors are within the budget, with the largest of them."""
     clock, kinds = USES[use]
     rows = [row for row in measured.rows if row.skipped is None and row.share == 1 and row.by == "view"]

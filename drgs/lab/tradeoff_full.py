@@ -21,7 +21,7 @@ from drgs.data.sizes import at_most
 from drgs.integrator import render
 from drgs.lab.tradeoff import clocked, placed
 from drgs.lab.tradeoff_advice import interval, leaders
-from drgs.lab.tradeoff_rows import CLOCKS, FullTime, Interval, Measured, Row
+from drgs.lab.tradeoff_rows import CLOCKS, FullTime, Interval, Measured, TradeoffRow
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -126,7 +126,7 @@ class _Work:
         self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
         self.moving = gaussians.replace(**self.leaves)
 
-    def __call__(self, camera: Camera, row: Row) -> float:
+    def __call__(self, camera: Camera, row: TradeoffRow) -> float:
         """Seconds that a row's settings take."""
         return clocked(lambda: getattr(self, "_" + self.clock)(camera, row.settings))[1]
 
@@ -147,7 +147,7 @@ class _Work:
 def _sized(
     work: _Work,
     cameras: list[Camera],
-    exact: Row,
+    exact: TradeoffRow,
     pixels: float,
     seconds: float,
     units: float,

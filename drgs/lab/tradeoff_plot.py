@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.guards.outputs import replacing
-from drgs.lab.tradeoff_rows import Measured, Row
+from drgs.lab.tradeoff_rows import Measured, TradeoffRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["plot"]
 
-Point = tuple[float, float, Row]
+Point = tuple[float, float, TradeoffRow]
 """Ratio of times, error, and whose they are."""
 
 _PANELS = (

@@ -14,7 +14,7 @@ from drgs.settings import RenderSettings
 __all__ = [
     "CLOCKS",
     "VARIANTS",
-    "Errors",
+    "WorstErrors",
     "FullTime",
     "GradientError",
     "GroupInformation",
@@ -22,7 +22,7 @@ __all__ = [
     "InformationError",
     "Interval",
     "Measured",
-    "Row",
+    "TradeoffRow",
     "Variant",
     "one_line",
     "rows_of",
@@ -219,7 +219,7 @@ def _compared(sizes: dict[str, float]) -> list[str]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Errors:
+class WorstErrors:
     """What a budget is compared with, by kind; None where there is no number."""
 
     image: float | None = None
@@ -250,7 +250,7 @@ class FullTime(Interval):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Row:
+class TradeoffRow:
     """A variant, and what was measured of it, in the order of tradeoff.json.
 
     Attributes:
@@ -283,13 +283,13 @@ class Row:
     times: dict[str, Interval | None] | None = None
     first_call: float | None = None
     full: dict[str, FullTime] = dataclasses.field(default_factory=dict)
-    errors: Errors = Errors()
+    errors: WorstErrors = WorstErrors()
     flags: str | None = None
 
-    def bound(self, own: Errors) -> Errors:
+    def bound(self, own: WorstErrors) -> WorstErrors:
         """`errors`, where the truth's own are known."""
         if self.skipped is not None or self.by == "oracle":
-            return Errors()
+            return WorstErrors()
         found = {}
         if self.image:
             found["image"] = max(self.image.rms, self.image.p999)
@@ -297,7 +297,7 @@ class Row:
             found["gradient"] = self.gradient.worst
         if self.information and self.information.group:
             found["information"] = max(self.information.l1, self.information.median)
-        return Errors(**{kind: x + (getattr(own, kind) or 0.0) for kind, x in found.items()})
+        return WorstErrors(**{kind: x + (getattr(own, kind) or 0.0) for kind, x in found.items()})
 
     def to_json(self) -> dict[str, Any]:
         """As tradeoff.json holds it."""
@@ -313,22 +313,22 @@ class Measured:
 
     Attributes:
         rows: In the order of the variants; the first one is the truth.
-        own: Errors of the truth against the oracle.
+        own: Those of the truth against the oracle.
         scatter: Clock -> the truth's times against itself.
         pixels: Of one view, on average.
         rounds: Of timing.
         clock: `wall` or `processor`.
     """
 
-    rows: list[Row]
-    own: Errors
+    rows: list[TradeoffRow]
+    own: WorstErrors
     scatter: dict[str, Interval | None]
     pixels: float
     rounds: int
     clock: str
 
     @property
-    def truth(self) -> Row:
+    def truth(self) -> TradeoffRow:
         """What the others are compared with."""
         return self.rows[0]
 
@@ -337,11 +337,11 @@ class Measured:
         return dataclasses.asdict(self) | {"rows": [row.to_json() for row in self.rows]}
 
 
-def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[Row]:
+def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[TradeoffRow]:
     """Rows without numbers; those that cannot or need not be measured say why."""
     rows, seen = [], {}
     for variant in variants:
-        row = Row(name=variant.name, kind=variant.kind, share=variant.share, by=variant.by)
+        row = TradeoffRow(name=variant.name, kind=variant.kind, share=variant.share, by=variant.by)
         try:
             row.settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
         except (ValueError, NotImplementedError) as error:
