@@ -27,7 +27,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.doors import camera_list, check_scene, check_view, gaussians_at
+from drgs.guards.doors import camera_list, check_any_scene, check_scene, check_view, gaussians_at
 from drgs.information.groups import GROUPS, Group, Information, groups_of, scene_groups
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.replay import Replay, by_probes
@@ -110,6 +110,7 @@ def diagonal(
         gaussians, cameras = scene.gaussians, scene.cameras
         backgrounds, channels = scene.backgrounds, scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
+    check_any_scene("fisher.diagonal", gaussians)
     cameras = _cameras("fisher.diagonal", cameras)
     seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
     check_scene("fisher.diagonal", seen, settings)

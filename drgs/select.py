@@ -29,7 +29,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import camera_list, check_scene
+from drgs.guards.doors import camera_list, check_any_scene
 from drgs.information.cache import Cache
 from drgs.information.greedy import ViewInformation, greedy
 from drgs.information.pool import Pick, Pool, Scoring, Selection
@@ -84,8 +84,7 @@ def select(
             or infinite.
     """
     started = time.perf_counter()
-    if not isinstance(gaussians, Scene):
-        check_scene("select", gaussians, None)  # says what else it is
+    check_any_scene("select", gaussians)
     candidates, train = camera_list("select", "candidates", candidates), camera_list("select", "train", train)
     if not candidates:
         raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")

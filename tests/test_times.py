@@ -18,6 +18,7 @@ from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.frames import load_frames
 from drgs.guards.arguments import ArgumentError
 from drgs.integrator import render, render_jvp
+from drgs.select import select
 
 
 class Drift:
@@ -163,6 +164,17 @@ def test_gaussians_are_their_own_scene(rng):
 
     with pytest.raises(ArgumentError, match=r"render: scene\.at\(time\) must be a Gaussians, got a Tensor of shape"):
         render(Wrong(g, g.means), VIEW)
+
+    class Field(torch.nn.Module):
+        def at(self, time):
+            return g
+
+    told = (
+        r"scene\.parameters\(\) must be a Mapping, got a value of type generator; .*dict\(self\.named_parameters\(\)\)"
+    )
+    for refused in (lambda: render(Field(), VIEW), lambda: select(Field(), [VIEW], [VIEW], 1)):
+        with pytest.raises(ArgumentError, match=told):
+            refused()
 
 
 def test_gaussians_go_to_a_device(rng):

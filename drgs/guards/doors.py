@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from drgs.settings import RenderSettings
 
 __all__ = [
     "camera_list",
+    "check_any_scene",
     "cameras_of_one_size",
     "check_oracle",
     "check_path",
@@ -34,10 +35,19 @@ def check_scene(where: str, gaussians: Any, settings: Any) -> None:
         must_be(where, "settings", settings, RenderSettings, _SETTINGS)
 
 
+def check_any_scene(where: str, scene: Any) -> None:
+    """Raise `ArgumentError` unless this is a `Scene`, which names its parameters (a torch Module does not)."""
+    if not isinstance(scene, Scene):
+        must_be(where, "gaussians", scene, Gaussians, _SCENE)
+    hint = "tensors by name, of a torch.nn.Module dict(self.named_parameters())"
+    must_be(where, "scene.parameters()", scene.parameters(), Mapping, hint)
+
+
 def gaussians_at(where: str, scene: Any, camera: Any) -> Any:
     """The Gaussians of a scene at the time of a camera; anything else as it is, for `check_view` to refuse."""
     if isinstance(scene, Gaussians) or not (isinstance(scene, Scene) and isinstance(camera, Camera)):
         return scene
+    check_any_scene(where, scene)
     gaussians = scene.at(camera.time)
     must_be(where, "scene.at(time)", gaussians, Gaussians, "a scene has Gaussians at any time")
     return gaussians
