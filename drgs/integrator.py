@@ -113,6 +113,7 @@ def render_jvp(
     check_view("render_jvp", seen, camera, settings)
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
+    # The tangents are given: a graph of torch would lead nowhere.
     call = Call(seen.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene)
     return push_forward(call, dict(tangents))
 
@@ -218,8 +219,9 @@ class _Reverse(torch.autograd.Function):
         inputs, images = graph or _traced(ctx.call, ctx.names, values, ctx.needed)[0]
         for image, g in zip(images, cotangents, strict=True):
             dr.set_grad(image, to_drjit(ctx.call.lib, g).array)
-        slopes: Iterator[Any] = iter(dr.backward_to([x for x in inputs if x is not None]))
-        return None, None, *(None if x is None else next(slopes).torch() for x in inputs)
+        needed = [k for k, x in enumerate(inputs) if x is not None]
+        slopes: dict[int, Any] = dict(zip(needed, dr.backward_to([inputs[k] for k in needed]), strict=True))
+        return None, None, *(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
 
 
 def _traced(

@@ -73,7 +73,7 @@ def activate(g, s: RenderSettings) -> SimpleNamespace:
     rotation = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
     extent = torch.full((n,), s.extent or 0.0, dtype=torch.float64)
     if s.extent is None:
-        # The N tails beyond these radii add up to at most N * alpha exp(-extent^2 / 2) = 1e-5.
+        # The N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5. No derivative: a cut-off.
         extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
     return SimpleNamespace(
         means=means,
@@ -96,7 +96,7 @@ def intrinsics(cam) -> tuple[torch.Tensor, torch.Tensor]:
     Raises:
         ValueError: If the last row of K is not 0 0 1: that is no camera with its axis along z.
     """
-    K = float64(cam.K).detach()
+    K = float64(cam.K).detach()  # intrinsics are not differentiated
     if tuple(K.shape) != (3, 3) or K[2].tolist() != [0, 0, 1]:
         raise ValueError(f"reference: K must be (3, 3) with last row 0 0 1, got {K.tolist()}; see drgs.Camera")
     return K[:2, :2], K[:2, 2]
@@ -118,7 +118,7 @@ def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
 
 def cull_near(scene: SimpleNamespace, rotation, center, s: RenderSettings, tolerance: float) -> SimpleNamespace:
     """Drops means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
-    z = ((scene.means - center) @ rotation[2]).detach()
+    z = ((scene.means - center) @ rotation[2]).detach()  # culling has no derivative
     if s.near > 0:
         keep = z > s.near * (1 - tolerance)
         scene.near_margin = z / s.near - 1
@@ -208,6 +208,7 @@ def within(scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, d
 
     Compares each bounding sphere with the cone around the rays; rays without a common origin keep all.
     """
+    # What is left out has no derivative; 1e-300 keeps 0 / 0 out of directions that do not matter.
     n, o, d = len(scene.means), origins.detach(), directions.detach()
     if not len(d) or not bool((o == o[:1]).all()):
         return torch.ones(n, dtype=torch.bool)
@@ -215,7 +216,7 @@ def within(scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, d
     axis = axis / axis.norm().clamp(min=1e-300)
     # The chord keeps the digits of small angles that a cosine loses.
     half = 2 * torch.asin(((d - axis).norm(dim=1).max() / 2).clamp(max=1))
-    away = scene.means.detach() - o[0]
+    away = scene.means.detach() - o[0]  # as above, down to the margin of 1e-9 radians for rounding
     angle = torch.atan2(torch.linalg.cross(away, axis.expand_as(away)).norm(dim=1), (away @ axis).abs())
     radius = reach * scene.axes.detach().norm(dim=1).amax(1)
     spread = torch.asin((radius / away.norm(dim=1).clamp(min=1e-300)).clamp(max=1))

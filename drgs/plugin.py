@@ -61,19 +61,21 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
         if mode == dr.ADMode.Primal:
             L, alpha = self._trace(scene, ray)
             return L, active & (alpha > 0), [], None
+        # Mitsuba suspends AD around `sample`; this one differentiates by it.
         with dr.resume_grad():
             L, alpha = self._trace(scene, ray)
             if mode == dr.ADMode.Backward:
-                dr.backward_from(dr.sum(dr.dot(L, dr.detach(δL))))
+                dr.backward_from(dr.sum(dr.dot(L, dr.detach(δL))))  # δL is a number, the cotangent
                 change = δL
             else:
                 change = dr.forward_to(L)
-        return change, active & (dr.detach(alpha) > 0), [], None
+        return change, active & (dr.detach(alpha) > 0), [], None  # a mask has no derivative
 
     def _trace(self, scene, ray):
         """(Color3f, alpha) of every ray."""
         lib, s = runtime.dr_types(), self.settings
         p, coefficients = _parameters(lib, scene)
+        # Sensors are not differentiated.
         o, d = (list(dr.detach(v)) for v in (ray.o, dr.normalize(ray.d)))
         n = dr.width(ray)
         o, d = ([lib.Float(x) + dr.zeros(lib.Float, n) for x in v] for v in (o, d))
@@ -135,7 +137,7 @@ def _parameters(lib, scene):
     p["log_scales"] = dr.log(dr.gather(lib.Float, data, row + k + 3))
     row, k = columns(4)
     p["quats"] = dr.gather(lib.Float, data, row + 6 + (k + 3) % 4)  # xyzw to wxyz
-    opacity = dr.clip(opacity, 1e-30, 1 - 6e-8)  # the logit of 0 and 1 is infinite
+    opacity = dr.clip(opacity, 1e-30, 1 - 6e-8)  # the logit of 0 and 1 is infinite; 6e-8: the last float32 below 1
     p["logit_opacities"] = dr.log(opacity) - dr.log(1 - opacity)
     p["sh"] = sh
     return p, dr.width(sh) // (3 * count)

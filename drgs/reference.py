@@ -158,6 +158,7 @@ def _project(
     diagonal = rows.square().sum(-1) + s.dilation
     if s.culling == "extent":
         return mean2d, rows, diagonal, None
+    # Culling has no derivative.
     m, cov, alpha = mean2d.detach(), diagonal.detach(), torch.sigmoid(scene.logits.detach())
     bounds = []
     for slack in (-tolerance, 0.0, tolerance):
@@ -192,6 +193,7 @@ def _in_window(
     low = torch.tensor(window[:2], dtype=torch.float64) + 0.5
     high = low + torch.tensor(window[2:], dtype=torch.float64) - 1
     if bounds is None:
+        # What is left out has no derivative.
         reach = (scene.extent[:, None] * diagonal.detach().sqrt()) * (1 + 2 * tolerance)
         keep = ((mean2d.detach() + reach >= low) & (mean2d.detach() - reach <= high)).all(1)
     else:
@@ -220,6 +222,7 @@ def _responses(
     away, form = scene.means - o[:, None, :], _FORMS[s.response]
     rho2, t, length = form.meet(scene, s, rotation, away, d, pixels)
     a, rest = form.opacity(scene, rho2, t, length)
+    # Where it is clamped, and how near to that, are numbers; the value of a clamp that the gradient passes is one, too.
     over, to_max = (a > s.alpha_max).detach(), (a / s.alpha_max - 1).abs().detach()
     top, left = torch.full_like(a, s.alpha_max), torch.full_like(a, 1 - s.alpha_max)
     if s.alpha_max_gradient == "pass":

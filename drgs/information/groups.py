@@ -78,7 +78,7 @@ def _turned(slope: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
 
 def _opacity_slope(inputs: dict) -> torch.Tensor:
     opacity = inputs["logit_opacities"].cpu().double().sigmoid()
-    return (opacity * (1 - opacity)).clamp_min(1e-300)
+    return (opacity * (1 - opacity)).clamp_min(1e-300)  # divided by: 0 where the sigmoid rounds to 1
 
 
 # Colors are linear: dC_c / d sh_kc = w Y_k, 0 where the color is clamped.

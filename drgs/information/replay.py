@@ -28,6 +28,7 @@ class Replay:
     """A view rendered once, to be replayed for information."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True):
+        # Without a graph of torch: information is a number, and its derivatives are taken here.
         self.call = call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset())
         self.lib, self.settings, self.count = call.lib, settings, len(gaussians)
         lib = self.lib
@@ -107,7 +108,7 @@ class Replay:
             _, arguments = call.prepare(inputs)
             record = arguments.record
             dr.forward_to(record, flags=dr.ADFlag.ClearEdges)
-            moved.append([dr.detach(dr.grad(r)) for r in record])
+            moved.append([dr.detach(dr.grad(r)) for r in record])  # numbers, free of this graph
             dr.disable_grad(inputs[name])
         return moved
 
@@ -217,6 +218,7 @@ def by_probes(
     other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
     groups = {name: group for name, group in groups.items() if name not in other}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
+    # Without a graph of torch, as in `Replay`.
     call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset(), scene=scene)
     lib, generator = call.lib, torch.Generator().manual_seed(seed)
     inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}

@@ -201,7 +201,8 @@ def _grown(radii, means, distance):
     widest = radii.max(0)
     size = np.linalg.norm((means + widest).max(1) - (means - widest).min(1))
     reach = np.minimum(distance, size)
-    # Grazing rays are lost to rounding unless the proxy is larger than the Gaussian by as much.
+    # Grazing rays are lost to rounding unless the proxy is larger than the Gaussian by as much; 1e-4 is for the rest of
+    # what float32 does to a hit.
     graze = _GRAZE * (reach / np.maximum(radii.min(0), _THIN * reach)) ** 2
     return np.maximum(radii * (1 + 1e-4 + graze), _THIN * reach)
 
@@ -255,7 +256,7 @@ class _ProxyStream:
         near = lib.Float(-p.back)
         for o, d, low, high in zip(origin, self.d, p.low, p.high, strict=True):
             along = dr.minimum((low - o) / d, (high - o) / d)
-            along -= 1e-6 * (abs(along) + p.size)
+            along -= 1e-6 * (abs(along) + p.size)  # earlier by more than rounding
             # A ray within the plane of a side divides 0 by 0.
             near = dr.maximum(near, dr.select(abs(along) < 1e30, along, near))
         return near
@@ -297,7 +298,7 @@ class _ProxyStream:
         )
         member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
         step = dr.select(again, 2 * step, dr.select(fresh, self.step, step))
-        # Far along the ray the step is less than one unit in the last place.
+        # Far along the ray the step is less than one unit in the last place: 1.2e-7.
         forward = dr.maximum(step, 1.2e-7 * abs(entry))
         at = dr.select(found, entry + forward, at)
         last = dr.select(fresh, primitive, last)
@@ -337,7 +338,7 @@ def _warn_of_rounding(ellipsoids, alive, origins):
     to = ellipsoids[:3] - origins.mean(1, keepdims=True)
     a, b, c = ellipsoids[7:]
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
-    ratio = (np.sqrt((to * to).sum(0)) / np.maximum(middle, 1e-300))[alive]
+    ratio = (np.sqrt((to * to).sum(0)) / np.maximum(middle, 1e-300))[alive]  # a scale may underflow to 0
     if (share := float((ratio > _FAR).sum()) / max(len(ratio), 1)) > 0.01:
         warnings.warn(
             f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR:g} of their distance in two axes, got "

@@ -4,10 +4,16 @@
     s_i   derivative of the loss with respect to w_i: cotangent . (color, features, 1, depth)
     b_i   what lies behind hit i, per unit of transmittance
 
-dL/da_i = T_i (s_i - b_i) = T_i s_i - R_i / (1 - a_i), where R_i = sum_{j > i} w_j s_j + T_end (cotangent . background)
-is what is left of the whole sum behind hit i. In float32 this difference loses all digits as a -> 1 or T -> 0. Sums are
-therefore kept in float64 in the primal pass, and the adjoint replays the very same float32 weights: the difference is
-then exact to 1e-16 of the sum, which leaves 1e-9 even at 1 - a = 1e-7 (docs/numerics.md has the measured errors).
+The image is C = sum_i w_i c_i + T_end background with w_i = a_i T_i, T_i = prod_{j<i} (1 - a_j) (Kerbl et al. 2023), so
+that dw_i/da_i = T_i, and every w_j behind i, as T_end, has the factor 1 - a_i: dw_j/da_i = -w_j / (1 - a_i). Hence
+
+    dL/da_i = T_i (s_i - b_i) = T_i s_i - R_i / (1 - a_i),  R_i = sum_{j > i} w_j s_j + T_end (cotangent . background)
+
+where R_i is what is left of the whole sum behind hit i. Replaying the loop instead of storing its hits is path replay
+backpropagation (Vicini et al. 2021), which has R_i as the whole sum minus what the ray has passed. In float32 this
+difference loses all digits as a -> 1 or T -> 0. Sums are therefore kept in float64 in the primal pass, and the adjoint
+replays the very same float32 weights: the difference is then exact to 1e-16 of the sum, which leaves 1e-9 even at
+1 - a = 1e-7 (docs/numerics.md has the measured errors).
 """
 
 from __future__ import annotations
@@ -82,10 +88,11 @@ class Adjoint:
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
     def _take(self, index, rays, states, places, active):
-        """The same, where the Gaussian is hit: its part of every gradient, and the states of the rays behind it."""
+        """One hit of each ray: its local derivative by AD, weighted with dL/da and with w times the cotangents."""
         m, lib, out = self.m, self.m.lib, []
         D = lib.Float64
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+        # A graph of this hit only, from leaves of its own: the walk has suspended AD.
         with dr.resume_grad():
             fixed = {
                 name: [dr.detach(x) for x in xs] for name, xs in self.channels.load(lib, index, rays[0], going).items()
@@ -93,16 +100,17 @@ class Adjoint:
             dr.enable_grad(fixed)
             total, hits, carried = lib.Float(0), lib.Bool(False), []
             for ray, st, g, final, place in zip(rays, states, self.cotangents, self.finals, places, strict=True):
-                ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])
+                ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])  # leaves, too
                 dr.enable_grad(ray.carried)
                 carried.append(ray.carried)
                 a, depth, ok = m.hit(fixed["record"], ray, active & (st["alive"] != 0))
                 values = self.channels.values(m, fixed, ray)
+                # Weights of the local derivative are numbers.
                 a0, depth0, T = dr.detach(a), dr.detach(depth), st["T"]
                 w = dr.select(ok, T * a0, 0)
                 s = dr.fma(D(g["depth"]), D(depth0), D(g["alpha"]))
                 for v, c in zip(values, g["sum"], strict=True):
-                    s = dr.fma(D(dr.detach(v)), D(c), s)
+                    s = dr.fma(D(dr.detach(v)), D(c), s)  # a number, likewise
                 rest = st["rest"] - D(w) * s
                 left = 1 - a0
                 # Behind an a that rounds to 1 nothing was composited: there is no rest to share out.
@@ -135,6 +143,8 @@ class Adjoint:
 class Tangent:
     """Forward mode: K tangents carried through one front-to-back traversal.
 
+    The product rule along the ray: dw = dT a + T da, then dT <- dT (1 - a) - T da, and d sum w v gets dw v + w dv.
+
     Args:
         records: Tangents of the records, from `pack`: slot by slot, the K columns of each side by side.
         slots: Entries of a record that they hold.
@@ -160,6 +170,7 @@ class Tangent:
         """As Primal.shade, with the tangents."""
         m, lib = self.m, self.m.lib
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+        # Nothing of the loop is recorded; `_slopes` and `_moved_values` differentiate on their own.
         loaded = dr.detach(self.channels.load(lib, index, rays[0], going))
         speeds = self._load(index, rays[0], going)
         primal = [{k: v for k, v in st.items() if k != "d"} for st in states]
@@ -203,6 +214,7 @@ class Tangent:
 
     def _slopes(self, record, ray, live, which: int):
         """Gradient of a hit's opacity (0) or depth (1): {slot: value}, and of what the ray carries."""
+        # A graph of this hit only, from leaves of its own: the walk has suspended AD.
         with dr.resume_grad():
             record = [dr.detach(x) for x in record]
             ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])
@@ -215,9 +227,10 @@ class Tangent:
         if not (self.channels.color and ray.basis):
             color = [speed["record"][self.m.rgb + c] for c in range(3)] if self.channels.color else []
             return color + speed.get("features", [])
+        # A graph of this color only, from leaves of its own.
         with dr.resume_grad():
             moved = [dr.detach(x) for x in loaded["sh"]]
-            basis = [dr.detach(x) for x in ray.carried[: ray.basis]]
+            basis = [dr.detach(x) for x in ray.carried[: ray.basis]]  # leaves, too
             dr.enable_grad(moved, basis)
             for x, v in zip(moved + basis, speed["sh"] + carried[: ray.basis], strict=True):
                 dr.set_grad(x, v)

@@ -72,9 +72,9 @@ class HitModel:
         ok = active & (dr.detach(rho2) <= dr.detach(record[self.extent2]))
         a = self.response.opacity(record[self.strength] * dr.exp(-0.5 * rho2), u)
         if self.response.front_only:
-            ok &= dr.detach(key) > 0
+            ok &= dr.detach(key) > 0  # a cut-off, too
         if self.s.alpha_min > 0:
-            ok &= dr.detach(a) >= self.alpha_min
+            ok &= dr.detach(a) >= self.alpha_min  # likewise
         if self.s.alpha_max < 1:
             clamped = dr.minimum(a, self.alpha_max)
             # INRIA's gradient passes through the clamp; gsplat's is 0 there.

@@ -17,7 +17,7 @@ def checked_pose(camera: Camera) -> torch.Tensor:
     w2c = camera.w2c
     if not isinstance(w2c, torch.Tensor):
         return torch.tensor(w2c).to(torch.float64)[:3]
-    # The camera has checked it, but an optimizer may have moved it since.
+    # The camera has checked it, but an optimizer may have moved it since. A check has no derivative.
     bad = ~torch.isfinite(w2c.detach())
     if bool(bad.any()):
         at = bad.nonzero()[0].tolist()

@@ -111,10 +111,10 @@ class Activated:
 
     def listed_extent(self):
         """Radius beyond which no hit counts: the extent, or less where alpha_min cuts earlier; detached, a cut-off."""
-        extent = dr.detach(self.extent)
+        extent = dr.detach(self.extent)  # a cut-off
         if self.settings.alpha_min > 0 and self.response.at_most_alpha:
             ratio = dr.maximum(dr.detach(self.opacity) / self.settings.alpha_min, 1)
-            # The factor keeps a hit that float32 rounds to the right side of alpha_min.
+            # A cut-off, too. The factor keeps a hit that float32 rounds to the right side of alpha_min.
             extent = dr.minimum(extent, dr.sqrt(2 * dr.log(ratio)) * 1.001 + 1e-3)
         return extent
 
@@ -193,7 +193,7 @@ def project_world(lib, p, w2c, settings: RenderSettings, coefficients: int):
     # The extent is a cut-off, keys order hits: both are constants of the derivative.
     record += [Float(g.strength), Float(dr.detach(g.extent * g.extent)), *g.rgb(coefficients)]
     distance, z = dr.detach(g.distance()), dr.detach(g.center[2])
-    alive = dr.detach(g.extent) > 0
+    alive = dr.detach(g.extent) > 0  # a mask has none
     if settings.near > 0:
         alive &= z > settings.near
     key = z if settings.depth_key == "z" else distance

@@ -67,9 +67,9 @@ def _column(call: Call, given: dict) -> dict:
         column["quats"] = column.get("quats", 0) + 0.5 * quaternion_product(given["rotations"].to(call.home), q)
     if "camera" in given:
         twist = given["camera"]
-        w2c = checked_pose(call.camera).detach()  # where the derivative is taken
+        w2c = checked_pose(call.camera).detach()  # numbers: where the derivative is taken
         change = twisted(w2c, twist)
-        # The inputs are of a re-centered world: w2c there is that of x + origin.
+        # Numbers as well. The inputs are of a re-centered world: w2c there is that of x + origin.
         w2c_there = call.inputs["w2c"].cpu().detach().reshape(3, 4)
         origin = torch.linalg.solve(w2c[:3, :3], w2c_there[:, 3] - w2c[:3, 3])
         column["w2c"] = shifted(change, origin).to(call.home)

@@ -229,6 +229,7 @@ def _emit(lib, keys, gaussian, amount, offset, box, columns, bits, tiles, large,
     depth_bits = 64 - tile_bits - index_bits
 
     def body(k, x, y):
+        """Write one pair, and step to the next tile of the box, row by row."""
         tile = lib.UInt32(y * columns + x)
         dx, dy = tiles.center(x, y)
         if by_depth:
@@ -241,7 +242,7 @@ def _emit(lib, keys, gaussian, amount, offset, box, columns, bits, tiles, large,
         wrap = x >= x1
         return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)
 
-    with dr.suspend_grad():
+    with dr.suspend_grad():  # lists have no derivative
         dr.while_loop(
             (dr.zeros(lib.UInt32, dr.width(gaussian)), lib.Int32(x0), lib.Int32(y0)), lambda k, x, y: k < amount, body
         )
@@ -257,7 +258,7 @@ def _suffix_minimum(lib, values, start, end):
         dr.scatter(out, low, i - 1)
         return i - 1, low
 
-    with dr.suspend_grad():
+    with dr.suspend_grad():  # bounds have no derivative
         dr.while_loop((lib.UInt32(end), dr.full(lib.Float, _FAR, dr.width(end))), lambda i, low: i > start, body)
     dr.eval(out)
     return out

@@ -185,6 +185,7 @@ class Part:
             return keys, index, [dr.select(out, key, last[0]), dr.select(out, at, last[1])], state
 
         def body(s, go, keys, index, last, failed, state):
+            """Meet the next candidate; `last` left the buffer last, `failed` is 1 where a hit came too late."""
             candidate, valid, bound, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, self.rays[0], valid)
             if check:

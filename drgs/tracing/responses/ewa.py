@@ -41,7 +41,8 @@ class Ewa:
         """The triangular factor of Sigma'^-1 and where it is centered, the depth, and what each culling leaves."""
         fx, skew, cx, fy, cy = screen.pinhole
         Float64, s, c = type(fx), g.settings, g.center
-        # Means at or behind the camera plane are culled; a positive depth keeps their (unused) numbers finite.
+        # Means at or behind the camera plane are culled, by a mask, which has no derivative; a positive depth keeps
+        # their (unused) numbers finite.
         alive = dr.detach(c[2]) > 0
         z = dr.select(alive, c[2], 1)
         iz = dr.rcp(z)

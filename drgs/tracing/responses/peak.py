@@ -247,11 +247,11 @@ def _frame(n):
     rho^2 does not depend on which pair it is, so that masks and choices in here need no derivative.
     """
     squared = dot(n, n)
-    usable = dr.detach(squared) > 0
+    usable = dr.detach(squared) > 0  # a mask
     scale = dr.select(usable, dr.rsqrt(dr.select(usable, squared, 1)), 0)
     x, y, z = _scaled(n, scale)
     z = dr.select(usable, z, 1)
-    # The axis that n is least along gives u its direction.
+    # The axis that n is least along gives u its direction: a choice, again.
     ax, ay, az = (abs(dr.detach(v)) for v in (x, y, z))
     first, second = (ax <= ay) & (ax <= az), ay <= az
     e = [dr.select(first, 1.0, 0.0), dr.select(~first & second, 1.0, 0.0), dr.select(~first & ~second, 1.0, 0.0)]
@@ -284,7 +284,7 @@ def _silhouette(g, screen):
     """
     fx, skew, cx, fy, cy = screen.pinhole
     f, extent = g.from_local, g.listed_extent()
-    c = dr.detach(g.center)
+    c = dr.detach(g.center)  # for bounds, as sigma
     e2 = extent * extent
 
     def sigma(a, b):
