@@ -64,7 +64,7 @@ def check_fields(
         record: An instance of a dataclass.
         ranges: Field -> (lowest, highest), both allowed; of tuples, each of their numbers.
     """
-    for name, hint in _hints(type(record)).items():
+    for name, hint in _hints(type(record)).items():  # type: ignore[arg-type]  # a class is hashable
         value = getattr(record, name)
         if typing.get_origin(hint) is typing.Literal:
             choices = typing.get_args(hint)

@@ -46,29 +46,32 @@ class _Handlers:
     """The signals of this process while a command, or the loop of a fit, runs."""
 
     def __init__(self, leave: Callable[[int], None] | None):
-        self.leave, self.signum = leave, None
-        self.first = self.heard = None  # when the first signal came, by the main thread and by the second one
+        self.leave = leave
+        self.signum: int | None = None
+        # When the first signal came, by the main thread and by the second one.
+        self.first: float | None = None
+        self.heard: float | None = None
         self.waits = self.is_native = self.is_answered = False
 
-    def on_signal(self, signum: int, _frame) -> None:
+    def on_signal(self, signum: int, _frame: object) -> None:
         """Python's handler, in the main thread."""
         self.is_answered, now = True, time.monotonic()
         is_first = self.first is None
-        if is_first:
+        if self.first is None:
             self.first, self.signum = now, signum
         is_again = now - self.first >= _SAME
         if not (is_again or is_first and not self.waits):
             return
-        if self.is_native and self.leave is None:
+        if self.leave is None and self.is_native:
             return  # raised by `in_native_code`, once no native frame is in the way
-        if self.is_native or is_again and self.leave is not None:
+        if self.leave is not None and (self.is_native or is_again):
             self.leave(signum)
         raise self.error()
 
-    def watch(self, pipe: int) -> None:
-        """In a second thread: hears of a signal when it comes."""
-        while (numbers := os.read(pipe, 64)) and 0 not in numbers:
-            numbers = [number for number in numbers if number in _SIGNALS]
+    def watch(self, pipe: int, leave: Callable[[int], None]) -> None:
+        """In a second thread: hears of a signal when it comes, and leaves if the main thread does not answer."""
+        while (found := os.read(pipe, 64)) and 0 not in found:
+            numbers = [number for number in found if number in _SIGNALS]
             if not numbers:
                 continue
             began = time.monotonic()
@@ -78,12 +81,12 @@ class _Handlers:
                 if self.waits and not is_again:
                     break
                 if time.monotonic() - began > _ANSWER:
-                    self.leave(numbers[-1])
+                    leave(numbers[-1])
                 time.sleep(0.02)
 
     def error(self, text: str = "") -> KeyboardInterrupt:
         """What is raised for the signal that came."""
-        if self.signum == signal.SIGINT:
+        if self.signum is None or self.signum == signal.SIGINT:
             return KeyboardInterrupt(*([text] if text else []))
         return Terminated(self.signum, text)
 
@@ -115,7 +118,7 @@ def handled(clean: Callable[[], None], say: Callable[[KeyboardInterrupt], str]) 
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        watcher = threading.Thread(target=handlers.watch, args=(reader,), daemon=True)
+        watcher = threading.Thread(target=handlers.watch, args=(reader, leave), daemon=True)
         watcher.start()
         try:
             yield

@@ -47,14 +47,15 @@ class Claim:
 
     def __init__(self, path: Path, command: str):
         self.path, self.command = path, command
-        self._thread, self._depth, self._inputs = threading.get_ident(), 1, []
-        self._new = []  # folders that were made for it, from the outside in
+        self._thread, self._depth = threading.get_ident(), 1
+        self._inputs: list[Path] = []
+        self._new: list[Path] = []  # folders that were made for it, from the outside in
         self._made: dict[str, dict[str, str]] = {}  # name -> hash -> command
 
     def __enter__(self) -> Claim:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.release()
 
     def check(self, names: Iterable[str]) -> None:

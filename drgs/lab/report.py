@@ -126,7 +126,8 @@ def _table(markdown: str) -> str:
     """Tables and paragraphs of Markdown as HTML."""
     from markupsafe import escape
 
-    parts, head = [], True
+    parts: list[str] = []
+    head = True
     for line in markdown.splitlines():
         cells = re.split(r"(?<!\\)\|", line.strip().removeprefix("|").removesuffix("|"))
         cells = [str(escape(cell.strip().replace("`", "").replace("\\|", "|"))) for cell in cells]
