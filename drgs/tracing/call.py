@@ -22,7 +22,7 @@ from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.pose import checked_pose, local_directions, shifted
 from drgs.tracing.tiles import TileTraversal
 
-__all__ = ["OF_VIEW", "Call", "Carried", "Output", "numbers"]
+__all__ = ["OF_VIEW", "Call", "Arguments", "Output", "numbers"]
 
 OF_VIEW = ("w2c", "ray_origins", "ray_directions")  # inputs that follow from the pose
 
@@ -53,7 +53,7 @@ class Output:
     certificate: dict | list[dict] = dataclasses.field(default_factory=dict)
 
 
-class Carried(NamedTuple):
+class Arguments(NamedTuple):
     """What a `Compositor` composites: the arguments of its `forward`, attached to the graph of a call's inputs."""
 
     record: list
@@ -161,7 +161,7 @@ class Call:
         self.extra, self.certificate = compositor.extra, compositor.certificate
         return images
 
-    def prepare(self, inputs: dict) -> tuple[Compositor, Carried]:
+    def prepare(self, inputs: dict) -> tuple[Compositor, Arguments]:
         """The `Compositor` of the view, and what it composites."""
         lib, s = self.lib, self.settings
         p = {name: x.array for name, x in self.fields(inputs).items()}
@@ -181,7 +181,7 @@ class Call:
         compositor = Compositor(lib, s, traversal, self.want, self.width, basis)
         sh = lib.Float(p["sh"]) if along_ray else None
         features = lib.Float(p["features"]) if self.width else None
-        return compositor, Carried(projected.record, sh, features, carried)
+        return compositor, Arguments(projected.record, sh, features, carried)
 
     def fields(self, inputs: dict) -> dict:
         """Raw fields of the Gaussians by name, and what is known of the view: the inputs, through the field if any."""
