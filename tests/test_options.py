@@ -1,6 +1,7 @@
 """Options of the command line offer what there is, and default to what a call from Python would do."""
 
 import dataclasses
+import importlib
 import inspect
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import typing
 
 import pytest
 
-from drgs import fisher, gain, runtime, select
+from drgs import cli, fisher, gain, runtime, select
 from drgs.commands import options, orbits
 from drgs.data import sfm
 from drgs.fitting.config import ActiveConfig, FitConfig
@@ -65,6 +66,14 @@ def test_choices_are_what_there_is():
     assert options.Sfm.camera_model == parameters["camera_model"].default
     assert options.Sfm.matcher == parameters["matching"].default
     assert options.Sfm.seed == parameters["seed"].default
+
+
+@pytest.mark.parametrize("name", cli._OPTIONS)
+def test_a_command_is_a_module(name):
+    """All have one shape: `run(args)` in the module of the command's name, with the command's options."""
+    run = importlib.import_module(f"drgs.commands.{name}").run
+    (args,) = inspect.signature(run).parameters.values()
+    assert (args.name, args.annotation) == ("args", cli._OPTIONS[name].__name__)
 
 
 def test_options_import_nothing_heavy():
