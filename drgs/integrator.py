@@ -3,8 +3,8 @@
 One call (tracing/call.py) projects the Gaussians (projection.py), lists or traces them (tiles.py, bvh.py), composites
 them in order (walk.py, kernels.py) and returns torch tensors. Compositing is one Dr.Jit operation with its own adjoint
 and forward mode (composite.py); what a Gaussian needs once a view is differentiated by Dr.Jit's AD. Two
-`autograd.Function`s bridge torch: `_Reverse` keeps the graph of a call for its backward pass, `_Bridge` serves
-`torch.func` and forward-mode AD. All may be called from any number of Python threads (runtime.alone).
+`autograd.Function`s are the bridge to torch (bridge.py). All may be called from any number of Python threads
+(runtime.alone).
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
-from types import ModuleType
 from typing import Any
 
-import drjit as dr
 import numpy as np
 import torch
 
@@ -25,7 +23,7 @@ from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
-from drgs.tracing.bridge import to_drjit
+from drgs.tracing.bridge import differentiable
 from drgs.tracing.call import Call, Output
 from drgs.tracing.tangents import push_forward
 
@@ -74,7 +72,7 @@ def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wan
     check_view("render", seen, camera, settings)
     call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted)
     with _own_errors():
-        return call.output(_differentiable(call))
+        return call.output(differentiable(call))
 
 
 def _batch(views: list[Output]) -> Output:
@@ -141,7 +139,7 @@ def render_rays(
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
     call = Call(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
     with _own_errors():
-        return call.output(_differentiable(call))
+        return call.output(differentiable(call))
 
 
 def _wanted(outputs: Iterable[str]) -> frozenset[str]:
@@ -168,116 +166,3 @@ def _own_errors() -> Iterator[None]:
         if cause is None:
             raise
         raise cause from None
-
-
-def _differentiable(call: Call) -> dict:
-    """Run `call.trace` on its torch inputs, through whichever bridge their derivative needs."""
-    values = call.inputs.values()
-    if call.count == 0:
-        return call.nothing()
-    if _forward_ad(values):
-        names = list(call.inputs)
-        results = _Bridge.apply(call, names, *values)
-        return dict(zip(call.result_names, results, strict=True))
-    if torch.is_grad_enabled() and any(x.requires_grad for x in values):
-        results = _Reverse.apply(call, list(call.inputs), *values)
-        return dict(zip(call.result_names, results, strict=True))
-    images = call.trace(**{name: to_drjit(call.lib, x) for name, x in call.inputs.items()})
-    return {name: x.torch() for name, x in images.items()}
-
-
-def _forward_ad(values: Iterable[torch.Tensor]) -> bool:
-    """Whether a tensor is a dual number or belongs to a `torch.func` transform."""
-    return any(
-        torch._C._functorch.is_functorch_wrapped_tensor(x)
-        or torch.autograd.forward_ad.unpack_dual(x).tangent is not None
-        for x in values
-    )
-
-
-class _Reverse(torch.autograd.Function):
-    """Reverse mode through the graph that Dr.Jit keeps of a call.
-
-    Not `dr.wrap`, whose description of its outputs is one global of all threads.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, call: Call, names: list[str], *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
-        ctx.call, ctx.names, ctx.needed = call, names, ctx.needs_input_grad[2:]
-        ctx.graph, images = _traced(call, names, values, ctx.needed)
-        call.result_names = list(images)
-        return tuple(x.torch() for x in images.values())
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    @runtime.alone
-    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        values, graph = ctx.saved_tensors, ctx.graph
-        # A traversal takes the edges of the graph with it; through what is left, another would find the old gradients.
-        ctx.graph = None
-        inputs, images = graph or _traced(ctx.call, ctx.names, values, ctx.needed)[0]
-        for image, g in zip(images, cotangents, strict=True):
-            dr.set_grad(image, to_drjit(ctx.call.lib, g).array)
-        needed = [k for k, x in enumerate(inputs) if x is not None]
-        slopes: dict[int, Any] = dict(zip(needed, dr.backward_to([inputs[k] for k in needed]), strict=True))
-        return None, None, *(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
-
-
-def _traced(
-    call: Call, names: list[str], values: Iterable[torch.Tensor], needed: Iterable[bool]
-) -> tuple[tuple[list, list], dict[str, Any]]:
-    """The ends of a graph, inputs (None where no gradient is needed) and images, and the images by name."""
-    inputs = {n: to_drjit(call.lib, x) for n, x in zip(names, values, strict=True)}
-    ends = [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
-    dr.enable_grad([x for x in ends if x is not None])
-    images = call.trace(**inputs)
-    return (ends, list(images.values())), images
-
-
-class _Bridge(torch.autograd.Function):
-    """Every mode, for `torch.func` and dual numbers: each derivative computes the view again."""
-
-    @staticmethod
-    def forward(call: Call, names: list[str], *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        images = call.trace(**{n: _plain(call.lib, x) for n, x in zip(names, values, strict=True)})
-        call.result_names = list(images)
-        return tuple(x.torch().clone() for x in images.values())
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
-        ctx.call, ctx.names, *values = inputs
-        ctx.save_for_backward(*values)
-        ctx.save_for_forward(*values)
-
-    @staticmethod
-    @runtime.alone
-    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        call, lib = ctx.call, ctx.call.lib
-        inputs = {n: _plain(lib, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
-        dr.enable_grad(inputs)
-        images = call.trace(**inputs)
-        for name, g in zip(call.result_names, cotangents, strict=True):
-            dr.set_grad(images[name], _plain(lib, g).array)
-        dr.enqueue(dr.ADMode.Backward, images)
-        dr.traverse(dr.ADMode.Backward)
-        return None, None, *(dr.grad(x).torch().clone() for x in inputs.values())
-
-    @staticmethod
-    @runtime.alone
-    def jvp(ctx: Any, _scene: None, _names: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
-        call, lib = ctx.call, ctx.call.lib
-        inputs = {n: _plain(lib, x) for n, x in zip(ctx.names, ctx.saved_tensors, strict=True)}
-        dr.enable_grad(inputs)
-        images = call.trace(**inputs)
-        for x, v in zip(inputs.values(), tangents, strict=True):
-            if v is not None:
-                dr.set_grad(x, _plain(lib, v))
-        dr.enqueue(dr.ADMode.Forward, inputs)
-        dr.traverse(dr.ADMode.Forward)
-        return tuple(dr.grad(images[name]).torch().clone() for name in call.result_names)
-
-
-def _plain(lib: ModuleType, x: torch.Tensor) -> Any:
-    """As a Dr.Jit tensor: the values below any `torch.func` wrapper."""
-    return runtime.unwrapped(x, lambda values: to_drjit(lib, values))

@@ -1,76 +1,128 @@
-"""From torch to Dr.Jit: tensors, and the torch function that a scene's Gaussians may come from.
+"""Between torch and Dr.Jit: tensors, and a call of the renderer as a function that torch differentiates.
 
-A scene that moves may compute its Gaussians in torch, by a network. In reverse mode torch's own graph leads through it,
-from `Scene.at` to the renderer's inputs. Forward mode and the probes of Fisher information are driven from Dr.Jit:
-there `Field` is one more operation in front of the projection (`Call.prepare`), so that tangents and gradients of the
-scene's parameters pass through it as those of Gaussians do. Not `dr.wrap`, whose description of its outputs is one
-global of all threads.
+Not `dr.wrap`, whose description of its outputs is one global of all threads, and which `torch.func` does not know.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import torch
 
+from drgs import runtime
+
 if TYPE_CHECKING:
-    from drgs.ellipsoids import DeformableScene
+    from drgs.tracing.call import Call
 
-__all__ = ["Field", "to_drjit"]
+__all__ = ["differentiable", "to_drjit"]
 
 
-def to_drjit(lib, x):
-    """A torch tensor as a Dr.Jit tensor of its precision; without its graph, which the bridge to torch keeps."""
+def to_drjit(lib: ModuleType, x: torch.Tensor) -> Any:
+    """A torch tensor as a Dr.Jit tensor of its precision; without its graph, which the functions below keep."""
     return (lib.TensorXf64 if x.dtype == torch.float64 else lib.TensorXf)(x.detach().contiguous())
 
 
-class Field:
-    """The raw fields of a scene's Gaussians at one time, as a function of the scene's parameters.
-
-    Args:
-        time: Of the view.
-        names: Of the fields that are wanted.
-        shift: (3,) that is taken from the means: the call's own origin; None for no shift.
-    """
-
-    def __init__(self, scene: DeformableScene, time: float | None, names: Iterable[str], shift=None):
-        self.scene, self.time, self.names, self.shift = scene, time, tuple(names), shift
-
-    def __call__(self, lib, parameters: dict) -> dict:
-        """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes."""
-        return dr.custom(_Deform, self, lib, parameters)
-
-    def values(self, parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """The same in torch."""
-        fields = self.scene.deform(parameters, self.time).parameters()
-        if self.shift is not None:
-            fields["means"] = fields["means"] - self.shift
-        return {name: fields[name] for name in self.names}
+def differentiable(call: Call) -> dict[str, torch.Tensor]:
+    """Run `call.trace` on its torch inputs, through whichever bridge their derivative needs."""
+    values = call.inputs.values()
+    if call.count == 0:
+        return call.nothing()
+    if _forward_ad(values):
+        return dict(zip(call.image_names, _Functional.apply(call, *values), strict=True))
+    if torch.is_grad_enabled() and any(x.requires_grad for x in values):
+        return dict(zip(call.image_names, _Reverse.apply(call, *values), strict=True))
+    images = call.trace(**{name: to_drjit(call.lib, x) for name, x in call.inputs.items()})
+    return {name: x.torch() for name, x in images.items()}
 
 
-class _Deform(dr.CustomOp):
-    """`dr.custom(_Deform, field, lib, parameters)`; its derivatives evaluate the field once more in torch."""
+def _forward_ad(values: Iterable[torch.Tensor]) -> bool:
+    """Whether a tensor is a dual number or belongs to a `torch.func` transform."""
+    return any(
+        torch._C._functorch.is_functorch_wrapped_tensor(x)
+        or torch.autograd.forward_ad.unpack_dual(x).tangent is not None
+        for x in values
+    )
 
-    def eval(self, field, lib, parameters):
-        """Dr.Jit's name for it."""
-        self.field, self.lib = field, lib
-        # Clones, as Dr.Jit and torch would share the memory.
-        self.given = {name: x.torch().clone() for name, x in parameters.items()}
-        with torch.no_grad():  # what torch would record is asked for in `forward` and `backward`
-            return self._back(field.values(self.given))
 
-    def forward(self):
-        """Dr.Jit forward mode: torch's, along the parameters' tangents."""
-        tangents = {name: x.torch() for name, x in self.grad_in("parameters").items()}
-        self.set_grad_out(self._back(torch.func.jvp(self.field.values, (self.given,), (tangents,))[1]))
+class _Reverse(torch.autograd.Function):
+    """Reverse mode through the graph that Dr.Jit keeps of a call."""
 
-    def backward(self):
-        """Dr.Jit reverse mode: torch's, from the fields' cotangents."""
-        _, pull = torch.func.vjp(self.field.values, self.given)
-        slopes = pull({name: x.torch() for name, x in self.grad_out().items()})[0]
-        self.set_grad_in("parameters", self._back(slopes))
+    @staticmethod
+    def forward(ctx: Any, call: Call, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
+        ctx.call, ctx.needed = call, ctx.needs_input_grad[1:]
+        ctx.graph = _traced(call, values, ctx.needed)
+        return tuple(x.torch() for x in ctx.graph[1])
 
-    def _back(self, tensors: dict) -> dict:
-        return {name: to_drjit(self.lib, x) for name, x in tensors.items()}
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    @runtime.alone
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        values, graph = ctx.saved_tensors, ctx.graph
+        # A traversal takes the edges of the graph with it; through what is left, another would find the old gradients.
+        ctx.graph = None
+        inputs, images = graph or _traced(ctx.call, values, ctx.needed)
+        for image, g in zip(images, cotangents, strict=True):
+            dr.set_grad(image, to_drjit(ctx.call.lib, g).array)
+        needed = [k for k, x in enumerate(inputs) if x is not None]
+        slopes: dict[int, Any] = dict(zip(needed, dr.backward_to([inputs[k] for k in needed]), strict=True))
+        return None, *(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
+
+
+def _traced(call: Call, values: Iterable[torch.Tensor], needed: Iterable[bool]) -> tuple[list, list]:
+    """The ends of a graph: inputs, None where no gradient is needed, and images in the order of `call.image_names`."""
+    inputs = {n: to_drjit(call.lib, x) for n, x in zip(call.inputs, values, strict=True)}
+    ends = [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
+    dr.enable_grad([x for x in ends if x is not None])
+    images = call.trace(**inputs)
+    return ends, [images[name] for name in call.image_names]
+
+
+class _Functional(torch.autograd.Function):
+    """Every mode, for `torch.func` and dual numbers: each derivative computes the view again."""
+
+    @staticmethod
+    def forward(call: Call, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        images = call.trace(**{n: _plain(call.lib, x) for n, x in zip(call.inputs, values, strict=True)})
+        return tuple(images[name].torch().clone() for name in call.image_names)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        ctx.call, *values = inputs
+        ctx.save_for_backward(*values)
+        ctx.save_for_forward(*values)
+
+    @staticmethod
+    @runtime.alone
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        call, lib = ctx.call, ctx.call.lib
+        inputs = {n: _plain(lib, x) for n, x in zip(call.inputs, ctx.saved_tensors, strict=True)}
+        dr.enable_grad(inputs)
+        images = call.trace(**inputs)
+        for name, g in zip(call.image_names, cotangents, strict=True):
+            dr.set_grad(images[name], _plain(lib, g).array)
+        dr.enqueue(dr.ADMode.Backward, images)
+        dr.traverse(dr.ADMode.Backward)
+        return None, *(dr.grad(x).torch().clone() for x in inputs.values())
+
+    @staticmethod
+    @runtime.alone
+    def jvp(ctx: Any, _call: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+        call, lib = ctx.call, ctx.call.lib
+        inputs = {n: _plain(lib, x) for n, x in zip(call.inputs, ctx.saved_tensors, strict=True)}
+        dr.enable_grad(inputs)
+        images = call.trace(**inputs)
+        for x, v in zip(inputs.values(), tangents, strict=True):
+            if v is not None:
+                dr.set_grad(x, _plain(lib, v))
+        dr.enqueue(dr.ADMode.Forward, inputs)
+        dr.traverse(dr.ADMode.Forward)
+        return tuple(dr.grad(images[name]).torch().clone() for name in call.image_names)
+
+
+def _plain(lib: ModuleType, x: torch.Tensor) -> Any:
+    """As a Dr.Jit tensor: the values below any `torch.func` wrapper."""
+    return runtime.unwrapped(x, lambda values: to_drjit(lib, values))

@@ -16,8 +16,8 @@ from drgs.guards import memory
 from drgs.guards.arguments import ArgumentError, kind_of
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
-from drgs.tracing.bridge import Field
 from drgs.tracing.composite import Composite, Compositor
+from drgs.tracing.field import Field
 from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.pose import checked_pose, local_directions, shifted
 from drgs.tracing.tiles import TileTraversal
@@ -151,6 +151,11 @@ class Call:
 
     def _move(self, x):
         return x.to(self.home).contiguous()
+
+    @property
+    def image_names(self) -> list[str]:
+        """Of the images that `trace` returns."""
+        return ["rgb", "alpha", *(["depth"] if "depth" in self.want else []), *(["features"] if self.width else [])]
 
     # -- Dr.Jit side ------------------------------------------------------------------------------------------------
 
