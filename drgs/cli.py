@@ -23,7 +23,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
-from drgs.commands.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Select, Sfm, Stress, Tradeoff
+from drgs.commands.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Scene, Select, Sfm, Stress, Tradeoff
 from drgs.display.progress import Bar
 from drgs.guards import interrupts
 
@@ -42,6 +42,7 @@ _OPTIONS = {
     "tradeoff": Tradeoff,
     "stress": Stress,
     "sfm": Sfm,
+    "scene": Scene,
     "demo": Demo,
 }
 

@@ -7,17 +7,16 @@ that point outward. Cameras here are OpenCV's: +x right, +y down, +z forward, pi
 
 from __future__ import annotations
 
-import hashlib
 import json
 
 import numpy as np
 
-from drgs.guards.outputs import claim
-from drgs.guards.unfinished import temporary_folder
+from scenes.output import DEPTH_UNIT, write_depth, write_png
 
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",
-    "box", "shape", "dome", "sensor", "aim", "z_depth", "encode_srgb", "write_views", "publish",
+    "box", "material", "shape", "dome", "sensor", "aim", "z_depth", "first_hits", "encode_srgb", "strata",
+    "write_views",
 ]  # fmt: skip
 
 
@@ -156,17 +155,10 @@ def box(size, center, turn):
 
 
 # -------------------------------------------------------------------------------- Mitsuba
-def shape(name, mesh, bsdf, paint=None, two_sided=False):
-    """A Mitsuba mesh.
-
-    Args:
-        bsdf: dict of a `diffuse`, `roughplastic` or conductor plugin.
-        paint: picture (h, w, 3) or one color (3,) for its (diffuse) reflectance, or None.
-        two_sided: whether its back is painted as well; costs time, so only for open sheets.
-    """
+def material(bsdf, paint, two_sided=False):
+    """A Mitsuba BSDF of what `shape` takes; it can be shared, which saves the tables of a `roughplastic`."""
     import mitsuba as mi
 
-    points, faces, uv, normals = mesh
     if paint is not None:
         paint = np.asarray(paint) if np.ndim(paint) == 3 else np.full((2, 2, 3), paint)
         paint = np.clip(paint + 0.5, 0, 255).astype(np.uint8)
@@ -174,8 +166,28 @@ def shape(name, mesh, bsdf, paint=None, two_sided=False):
         bsdf = {**bsdf, key: {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(paint))}}
     if two_sided:
         bsdf = {"type": "twosided", "bsdf": bsdf}
+    return mi.load_dict(bsdf)
+
+
+def shape(name, mesh, bsdf, paint=None, two_sided=False, glow=None):
+    """A Mitsuba mesh.
+
+    Args:
+        bsdf: dict of a `diffuse`, `roughplastic` or conductor plugin, or a `material` that was made of it.
+        paint: picture (h, w, 3) or one color (3,) for its (diffuse) reflectance, or None.
+        two_sided: whether its back is painted as well; costs time, so only for open sheets.
+        glow: (what it radiates from its front: linear radiance (3,) or a factor on its picture, decoded;
+            its share of the light paths).
+    """
+    import mitsuba as mi
+
+    points, faces, uv, normals = mesh
     props = mi.Properties()
-    props["mesh_bsdf"] = mi.load_dict(bsdf)
+    if glow is not None:
+        value, weight = glow
+        radiance = {"type": "rgb", "value": list(value)} if np.ndim(value) else _lit(paint, value)
+        props["mesh_emitter"] = mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": weight})
+    props["mesh_bsdf"] = material(bsdf, paint, two_sided) if isinstance(bsdf, dict) else bsdf
     has = {"has_vertex_normals": True, "has_vertex_texcoords": True}
     out = mi.Mesh(name, len(points), len(faces), props=props, **has)
     params = mi.traverse(out)
@@ -185,6 +197,16 @@ def shape(name, mesh, bsdf, paint=None, two_sided=False):
     params["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
     params.update()
     return out
+
+
+def _lit(paint, factor):
+    """A texture of the linear radiance that a picture stands for, times a factor."""
+    import mitsuba as mi
+
+    srgb = np.clip(paint / 255.0, 0, 1)
+    linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4) * factor
+    bitmap = mi.Bitmap(np.ascontiguousarray(linear, np.float32))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
 
 def sensor(K, width, height):
@@ -218,6 +240,11 @@ def aim(sensor, c2w):
 
 def z_depth(scene, K, c2w, width, height):
     """Depth (height, width) along the optical axis at the pixel centers; 0 where nothing is hit."""
+    return first_hits(scene, K, c2w, width, height)[0]
+
+
+def first_hits(scene, K, c2w, width, height):
+    """(depth, shape), each (height, width): `z_depth`, and the number that Dr.Jit has for the shape, 0 for none."""
     import drjit as dr
     import mitsuba as mi
 
@@ -226,8 +253,9 @@ def z_depth(scene, K, c2w, width, height):
     d = (d.reshape(-1, 3) @ c2w[:3, :3].T).astype(np.float32)  # unnormalized: its t is the z-depth
     origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in c2w[:3, 3]))
     ray = mi.Ray3f(origin, mi.Vector3f(*(mi.Float(d[:, k].copy()) for k in range(3))))
-    t = scene.ray_intersect_preliminary(ray, coherent=True).t.numpy()
-    return np.where(np.isfinite(t), t, 0).reshape(height, width)
+    hit = scene.ray_intersect_preliminary(ray, coherent=True)
+    t, number = hit.t.numpy(), dr.reinterpret_array(mi.UInt32, hit.shape).numpy()
+    return np.where(np.isfinite(t), t, 0).reshape(height, width), number.reshape(height, width)
 
 
 def dome(views, seed, center, distance, arc, elevations):
@@ -269,7 +297,10 @@ def encode_srgb(linear):
 
 
 # ------------------------------------------------------------------------------- data set
-_DEPTH_UNIT = 1e-4  # meters a 16-bit step: reaches 6.5 m, finer than a pixel's footprint indoors
+def strata(spp):
+    """`spp`, rounded up to what the sampler of `sensor` can divide a pixel into."""
+    side = int(np.ceil(np.sqrt(spp)))
+    return side * (side - (side * (side - 1) >= spp))
 
 
 def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, exposure, seed=0, progress=None):
@@ -286,21 +317,20 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
     """
     import mitsuba as mi
 
-    side = int(np.ceil(np.sqrt(spp)))
-    spp = side * (side - (side * (side - 1) >= spp))  # strata of the multijitter sampler
+    spp = strata(spp)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 3})
     camera = sensor(K, width, height)
     frames = []
     for sub in ("images", "depth"):
-        (folder / sub).mkdir()
+        (folder / sub).mkdir(exist_ok=True)
     for i, c2w in enumerate(poses):
-        aim(camera, c2w)
-        image = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i)
-        image = encode_srgb(np.asarray(image) * exposure)
-        depth = np.rint(z_depth(scene, K, c2w, width, height) / _DEPTH_UNIT)
         name = f"{i:03d}.png"
-        _write_png(folder / "images" / name, image[..., ::-1])
-        _write_png(folder / "depth" / name, np.minimum(depth, 65535).astype(np.uint16))
+        if not (folder / "images" / name).exists():  # written last: with it, the view is finished
+            aim(camera, c2w)
+            image = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i)
+            image = encode_srgb(np.asarray(image) * exposure)
+            write_depth(folder / "depth" / name, z_depth(scene, K, c2w, width, height))
+            write_png(folder / "images" / name, image[..., ::-1])
         frames.append(
             {
                 "file_path": f"images/{name}",
@@ -313,52 +343,7 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
     transforms = {
         "camera_model": "OPENCV",
         "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height,
-        "depth_unit_scale_factor": _DEPTH_UNIT,
+        "depth_unit_scale_factor": DEPTH_UNIT,
         "frames": frames,
     }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n")
-
-
-def publish(out_dir, parameters, fill, where):
-    """Makes a folder whose params.json comes last: with it, the folder is complete, whenever the process dies.
-
-    Args:
-        out_dir: Path to make. A folder published with the same parameters is kept, one published
-            with others is replaced, and one that holds anything else is refused.
-        parameters: JSON-serializable dict that determines the content.
-        fill: Called with a hidden folder in `out_dir` to write the content into.
-        where: Who asks, for the error.
-
-    Returns:
-        `out_dir`.
-
-    Raises:
-        ValueError: If `out_dir` holds something that was not published here, or was changed since.
-    """
-    digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()
-    stamp = out_dir / "params.json"
-    if stamp.is_file() and digest in stamp.read_text():
-        return out_dir
-    with claim(out_dir, where) as output:
-        try:
-            output.check_all((where,))
-        except ValueError as error:
-            text = str(error).partition(":")[0]
-            raise ValueError(
-                f"{where}: the output must be a new folder or as it was made here, {text} is not; "
-                "name another or move it away"
-            ) from None
-        with temporary_folder("scene", output.path) as partial:
-            fill(partial)
-            (partial / "params.json").write_text(json.dumps({"sha256": digest, **parameters}, indent=1) + "\n")
-            output.clear((where,))
-            for path in sorted(partial.iterdir(), key=lambda path: path.name == "params.json"):
-                output.put(path, path.name)
-    return out_dir
-
-
-def _write_png(path, picture):
-    import cv2
-
-    if not cv2.imwrite(str(path), picture):
-        raise OSError(f"scenes: {path} must be writable, but it could not be written; free space")

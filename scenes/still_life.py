@@ -22,7 +22,7 @@ import numpy as np
 import scenes
 from drgs import runtime
 from drgs.display.progress import Bar
-from scenes import box, grid, join, mix, noise, ramp, revolve, spline, tube, turned
+from scenes import box, grid, join, mix, noise, output, ramp, revolve, spline, tube, turned
 
 __all__ = ["generate", "main"]
 
@@ -355,12 +355,7 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
     """
     where = "scenes.still_life"
     values = {"views": views, "width": width, "height": height, "spp": spp, "seed": seed}
-    lowest = {"views": 1, "width": 8, "height": 8, "spp": 1, "seed": 0}
-    for name, value in values.items():
-        if not isinstance(value, int) or not lowest[name] <= value <= 16384:
-            raise ValueError(
-                f"{where}: {name} must be an integer from {lowest[name]} to 16384, got {value!r}; choose another {name}"
-            )
+    output.check_numbers(values, where)
     parameters = {"scene": "still_life", "version": _VERSION, **values}
 
     def fill(folder):
@@ -369,7 +364,7 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
         settings = {"spp": spp, "max_depth": _MAX_DEPTH, "exposure": _EXPOSURE, "seed": seed}
         scenes.write_views(folder, _scene(seed), *cameras, **settings, progress=progress)
 
-    return scenes.publish(Path(out_dir), parameters, fill, where)
+    return output.publish(Path(out_dir), parameters, fill, where)
 
 
 def main(argv=None) -> int:

@@ -32,8 +32,9 @@ _SMALLER = {
     "stress": ["--match", "1 Gaussian"],
     "demo": ["--quick"],
 }
-# Structure from motion needs real texture and the demo takes half a minute: tests/test_sfm.py, tests/test_demo.py.
-_ELSEWHERE = ("sfm", "demo")
+# Structure from motion needs real texture, the demo half a minute, a room ten seconds: tests/test_sfm.py, test_demo.py,
+# test_room.py.
+_ELSEWHERE = ("sfm", "demo", "scene")
 
 
 def _blocks(language: str) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import scenes
-from scenes import still_life
+from scenes import output, still_life
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 3
 
@@ -162,22 +162,51 @@ def test_same_parameters_are_reused_and_others_replace(made, tmp_path, monkeypat
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
 
-def test_interrupted_run_leaves_nothing(tmp_path):
-    """Neither the folder nor its hidden neighbor stays."""
+def test_interrupted_run_goes_on(tmp_path, monkeypatch):
+    """Finished views stay in a hidden folder, are not traced again, and what comes out is what comes out at once."""
 
     def stop(done, total):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         still_life.generate(tmp_path / "set", 2, 16, 12, spp=1, progress=stop)
+    hidden = tmp_path / "set" / ".drgs.scene"
+    assert {path.name for path in (tmp_path / "set").iterdir()} == {".drgs.scene"}
+    assert [path.name for path in (hidden / "images").iterdir()] == ["000.png"]
+    aimed, aim = [], scenes.aim
+    monkeypatch.setattr(scenes, "aim", lambda *args: aimed.append(1) or aim(*args))
+    still_life.generate(tmp_path / "set", 2, 16, 12, spp=1)
+    assert len(aimed) == 1
+    assert not hidden.exists()
+    still_life.generate(tmp_path / "other", 2, 16, 12, spp=1)
+    for name in ("images/000.png", "images/001.png", "depth/001.png", "params.json", "transforms.json"):
+        assert (tmp_path / "set" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+
+
+def test_other_parameters_start_anew(tmp_path):
+    """What an interrupted call has left is used by the same call only; a failure before anything leaves nothing."""
+
+    def half(folder):
+        output.write_file(folder / "a", b"half")
+        raise OSError("no space")
+
+    def fail(folder):
+        raise OSError("no space")
+
+    with pytest.raises(OSError, match="no space"):
+        output.publish(tmp_path / "set", {"n": 1}, fail, "test")
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match="no space"):
+        output.publish(tmp_path / "set", {"n": 1}, half, "test")
+    output.publish(tmp_path / "set", {"n": 2}, lambda folder: output.write_file(folder / "b", b"whole"), "test")
+    assert sorted(p.name for p in (tmp_path / "set").iterdir()) == [".drgs.jsonl", "b", "params.json"]
 
 
 def test_leftovers_of_killed_runs_go(tmp_path):
     """What a killed process left is removed by the next run."""
     (tmp_path / "set" / ".drgs.scene.abcdefgh.tmp").mkdir(parents=True)
     (tmp_path / ".set.99999999.partial").mkdir()  # the user's
-    scenes.publish(tmp_path / "set", {}, lambda folder: (folder / "a").write_text("b"), "test")
+    output.publish(tmp_path / "set", {}, lambda folder: (folder / "a").write_text("b"), "test")
     assert sorted(p.name for p in tmp_path.iterdir()) == [".set.99999999.partial", "set"]
     assert sorted(p.name for p in (tmp_path / "set").iterdir()) == [".drgs.jsonl", "a", "params.json"]
 
@@ -186,7 +215,7 @@ def test_what_was_added_to_a_published_folder_stays(tmp_path):
     """Other parameters replace what was made here, and refuse to while something else is in the folder."""
 
     def publish(number):
-        scenes.publish(tmp_path / "set", {"n": number}, lambda folder: (folder / "a").write_text(str(number)), "test")
+        output.publish(tmp_path / "set", {"n": number}, lambda folder: (folder / "a").write_text(str(number)), "test")
 
     publish(1)
     (tmp_path / "set" / "run").mkdir()

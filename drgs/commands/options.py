@@ -25,6 +25,7 @@ __all__ = [
     "Fit",
     "Info",
     "Render",
+    "Scene",
     "Select",
     "Sfm",
     "Stress",
@@ -376,3 +377,23 @@ class Demo(_Common):
     """Folder for pictures and tables."""
     quick: bool = False
     """Half a minute with poor pictures, to see that everything runs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scene(_Common):
+    """Make a data set by path tracing: a furnished room with labels and teacher features, or a still life."""
+
+    name: Positional[Literal["room", "still_life"]]
+    """What to make; the room has classes, depth, sparse points and features of a simulated teacher."""
+    output: _Output
+    """Folder for the data set; an interrupted command is continued there."""
+    size: str = "320x240"
+    """WIDTHxHEIGHT of the images in pixels."""
+    views: int | None = None
+    """How many images; default 75 (room; every fifth is for testing) or 32 (still_life)."""
+    seed: int = 0
+    """Of shapes, textures, cameras, light paths and all errors that are made on purpose."""
+    spp: int | None = None
+    """Light paths a pixel; default 25 (room) or 30 (still_life)."""
+    teacher_size: str | None = None
+    """WIDTHxHEIGHT of the teacher's feature maps (room); default 80x60."""

@@ -1,0 +1,50 @@
+"""`drgs scene`: data sets whose geometry, labels and teacher are known, path traced on this machine."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from typing import TYPE_CHECKING
+
+from drgs.display.progress import Bar
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Scene
+
+__all__ = ["run"]
+
+
+def run(args: Scene) -> None:
+    """`drgs scene room -o DATA`."""
+    numbers = {"seed": args.seed} | _pair("--size", args.size, "width", "height")
+    numbers |= {name: value for name, value in (("views", args.views), ("spp", args.spp)) if value is not None}
+    if args.teacher_size is not None:
+        if args.name != "room":
+            raise ValueError("--teacher-size: is for `drgs scene room`, a still life has no teacher; leave it out")
+        numbers |= _pair("--teacher-size", args.teacher_size, "teacher_width", "teacher_height")
+    try:
+        maker = importlib.import_module(f"scenes.{args.name}")
+    except ImportError:
+        raise FileNotFoundError(
+            "scene: the package `scenes` must be installed, it is not; run `pip install -e .` in a checkout"
+        ) from None
+    with Bar("path tracing", show=not args.quiet) as bar:
+        folder = maker.generate(args.output, **numbers, progress=bar.update)
+    if args.quiet:
+        return
+    if args.name == "room":
+        right = json.loads((folder / "teacher.json").read_text())["pixel_accuracy"]
+        tested = len((folder / "test_views.txt").read_text().split())
+        print(f"{len(maker.CLASSES)} classes, {tested} test views, teacher right at {100 * right:.1f} % of the pixels")
+        print(f"next: drgs fit {folder} -o RUN --test-every {maker.TEST_EVERY}")
+    else:
+        print(f"next: drgs fit {folder} -o RUN")
+
+
+def _pair(option: str, text: str, *names: str) -> dict[str, int]:
+    """Name -> number of a WIDTHxHEIGHT."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found:
+        raise ValueError(f"{option}: must be WIDTHxHEIGHT, got {text!r}; say e.g. 320x240")
+    return {name: int(number) for name, number in zip(names, found.groups(), strict=True)}
