@@ -12,8 +12,8 @@ cell, and then errs, each time by a generator of the seed and the view:
 - Noise: smooth (4 cells), in the span of the embeddings, standard deviation 0.12 a class; and white in all 512
   dimensions, together 0.4 of the norm. The norm itself is about 4, as that of four summed scales, and varies by 10 %.
 
-At the defaults, seed 0 and 75 views, the largest cosine gives 81.9 % of the pixels their clean class back (single views
-71 to 89 %; `accuracy`); averaged over classes 75.9 %, mean IoU 0.614: walls 0.78, thin things (chairs, plants) 0.35 to 0.4.
+At the defaults, seed 0 and 75 views, the largest cosine gives 81.9 % of the pixels their clean class back (`accuracy`;
+single views 71 to 89 %), 75.9 % as the average over classes; mean IoU 0.614 (walls 0.78, thin chairs 0.35).
 """
 
 from __future__ import annotations

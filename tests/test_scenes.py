@@ -168,6 +168,8 @@ def test_interrupted_run_goes_on(tmp_path, monkeypatch):
     def stop(done, total):
         raise KeyboardInterrupt
 
+    built = still_life._scene(0)
+    monkeypatch.setattr(still_life, "_scene", lambda seed: built)
     with pytest.raises(KeyboardInterrupt):
         still_life.generate(tmp_path / "set", 2, 16, 12, spp=1, progress=stop)
     hidden = tmp_path / "set" / ".drgs.scene"
