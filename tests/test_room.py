@@ -197,6 +197,7 @@ def test_seeds(built, made, tmp_path, monkeypatch):
         assert np.array_equal(a[3], b[3])
     assert {part[0] for part in first} == {part[0] for part in other} == set(room.CLASSES)
     assert not np.array_equal(room.Layout(0).size, room.Layout(1).size)
+    assert len({(room.Layout(seed).sunny, room.Layout(seed).cozy) for seed in range(4)}) == 4  # every arrangement
     monkeypatch.setattr(room, "scene", lambda seed: built)
     room.generate(tmp_path / "set", **SMALL)  # at once, what `made` did in two calls
     files = sorted(path.relative_to(made) for path in made.rglob("*") if path.is_file() and path.name != ".drgs.jsonl")
