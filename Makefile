@@ -37,6 +37,7 @@ smoke: setup
 	$(BIN)/drgs crossval out/smoke/run --limit 1 --max-pixels 768 --no-ladder -o out/smoke/crossval
 	$(BIN)/drgs tradeoff out/smoke/run --limit 1 --max-pixels 768 --repeats 1 -o out/smoke/tradeoff
 	$(BIN)/drgs stress --match "1 Gaussian"
+	$(BIN)/drgs scene room -o out/smoke/room --size 64x48 --views 3 --spp 2
 
 lint: setup
 	$(BIN)/ruff check .
