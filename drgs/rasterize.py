@@ -143,13 +143,18 @@ def rasterization(
     )
     scales, opacities = inside("rasterization", scales, opacities)
     by_camera = colors.ndim == len(lead) + (3 if sh_degree is None else 4)
-    of = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
+    batches = math.prod(lead)
+    if not batches or not count:
+        raise ValueError(
+            f"rasterization: viewmats must hold at least one camera, got shape {tuple(viewmats.shape)}; skip the call"
+        )
+    of = lambda x: x.reshape(batches, *x.shape[len(lead) :])  # noqa: E731
     means_b, quats_b, scales_b, opacities_b, colors_b, viewmats_b, Ks_b = map(
         of, (means, quats, scales, opacities, colors, viewmats, Ks)
     )
     behind_b = None if backgrounds is None else of(backgrounds)
     made = []
-    for b in range(len(means_b)):
+    for b in range(batches):
         for c, camera in enumerate(cameras_of(viewmats_b[b], Ks_b[b], width, height)):
             shown = colors_b[b, c] if by_camera else colors_b[b]
             made.append(
@@ -170,7 +175,7 @@ def rasterization(
         name: torch.stack([v[2][name] for v in made]).reshape(*lead, count, *made[0][2][name].shape)
         for name in made[0][2]
     }
-    meta |= {"width": width, "height": height, "n_batches": math.prod(lead), "n_cameras": count}
+    meta |= {"width": width, "height": height, "n_batches": batches, "n_cameras": count}
     return images, alphas, meta
 
 
@@ -208,7 +213,7 @@ def _view(
         channels.append(color if background is None else color + (1 - alpha) * background)
     if out.depth is not None:
         depth = out.depth[..., None]
-        if settings.response != "ewa":
+        if not settings.planar:
             depth = depth * _z_of_rays(camera).to(depth)  # along the ray -> along the axis
         channels.append(depth if "ED" in mode else depth * alpha.clamp_min(EPS_ALPHA))
     kind = splats.means.dtype
@@ -287,7 +292,7 @@ def _settings(preset: str | RenderSettings, near: float, eps2d: float, mode: str
         black = black.replace(near=near)
     if preset == "gsplat" or eps2d != _DILATION:
         black = black.replace(dilation=eps2d)
-    if mode == "antialiased" and black.response != "ewa":
+    if mode == "antialiased" and not black.planar:
         raise NotImplementedError(
             "rasterization: rasterize_mode='antialiased' must have a preset with projected covariances, got "
             f"preset={preset!r}; use preset='gsplat' or 'inria', or rasterize_mode='classic'"

@@ -221,6 +221,8 @@ def check_shapes(
                 f"{where}: {name} must have shape {allowed} (N = {n} from means, C = {cameras} from viewmats"
                 f"{'' if name != 'colors' else f', sh_degree = {degree}'}), got {got}"
             )
+    if not colors.shape[-1]:
+        raise ValueError(f"{where}: colors must have at least one channel, got {tuple(colors.shape)}; give them one")
     if degree is not None and colors.shape[-2] < (degree + 1) ** 2:
         raise ValueError(
             f"{where}: colors must have at least {(degree + 1) ** 2} coefficients for sh_degree {degree}, got "

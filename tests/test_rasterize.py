@@ -246,6 +246,28 @@ def test_ends_of_the_ranges_have_finite_gradients():
     assert bool(gradients["colors"].abs().sum(1).gt(0).any())
 
 
+@pytest.mark.parametrize("lead", [(), (2,)])
+@pytest.mark.parametrize("channels", [None, 5])
+@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+def test_no_gaussians_are_the_background(mode, channels, lead):
+    """As a scene whose last Gaussian was pruned: the shapes of any other, alpha 0, gradients without entries."""
+    given = arguments(n=1, width=8, height=6, channels=channels, cameras=3)
+    for name in LEAVES:
+        x = given[name] if name in ("viewmats", "backgrounds") else given[name][:0]
+        given[name] = x.expand(*lead, *x.shape)
+    given["Ks"] = given["Ks"].expand(*lead, 3, 3, 3)
+    image, alpha, slopes, meta = drawn(drgs.rasterization, given, render_mode=mode)
+    behind = given["backgrounds"][..., None, None, :].expand(*lead, 3, 6, 8, channels or 3)
+    torch.testing.assert_close(image[..., : channels or 3], behind, rtol=0, atol=0)
+    assert image.shape[-1] == (channels or 3) + ("ED" in mode)
+    assert not image[..., channels or 3 :].any()
+    assert alpha.shape == (*lead, 3, 6, 8, 1)
+    assert not alpha.any()
+    assert {name: x.shape for name, x in slopes.items()} == {name: given[name].shape for name in LEAVES}
+    assert bool((slopes["backgrounds"] != 0).any())
+    assert meta["radii"].shape == (*lead, 3, 0, 2)
+
+
 def test_float32_in_float32_out_and_any_preset():
     """`exact` through the same call is `drgs.render`."""
     given = {k: v.float() if isinstance(v, torch.Tensor) else v for k, v in arguments().items()}
@@ -300,6 +322,22 @@ def test_forward_mode_is_the_transpose():
         ({"scales": torch.full((60, 3), -1.0)}, ValueError, r"scales must be in \[0, inf\).*got -1 at index \[0, 0\]"),
         ({"means": np.zeros((60, 3))}, ValueError, "means must be a torch tensor, got ndarray"),
         ({"backgrounds": torch.zeros(3)}, ValueError, r"backgrounds must have shape \(1, 3\)"),
+        (
+            {"colors": torch.zeros(60, 0), "sh_degree": None, "backgrounds": None},
+            ValueError,
+            r"colors must have at least one channel, got \(60, 0\)",
+        ),
+        (
+            {name: torch.zeros(0, *shape) for name, shape in (("viewmats", (4, 4)), ("Ks", (3, 3)))}
+            | {"backgrounds": None},
+            ValueError,
+            r"viewmats must hold at least one camera, got shape \(0, 4, 4\); skip",
+        ),
+        (
+            {name: x.expand(0, *x.shape) for name, x in arguments().items() if isinstance(x, torch.Tensor)},
+            ValueError,
+            r"viewmats must hold at least one camera, got shape \(0, 1, 4, 4\); skip",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(change, error, message):
