@@ -177,13 +177,38 @@ def test_parts_that_do_not_fit_are_refused(dataset):  # noqa: F811
         load(networks=[wide])
     with pytest.raises(ValueError, match="every tensor must have a learning rate, features has none"):
         load(rates=plain.rates)
-    for names in (("rng",), ("a", "a")):
+    for names in (("rng",), ("a", "a"), ("parameter.x",), ("adam.sh_dc",), ("a", "a.parameter")):
         with pytest.raises(ValueError, match="networks must have names of their own"):
             load(networks=[Network(name, Affine(), 1e-2) for name in names])
     trainer.parts = dataclasses.replace(whole, terms=[Near()])
     trainer._queue = torch.tensor([[frame.name for frame in trainer.frames].index("1")])
     with pytest.raises(ValueError, match="a view must have a term of the loss, 1 has none"):
         trainer.step()
+
+
+class Tied(torch.nn.Module):
+    """Two names of one tensor, as autoencoders have them."""
+
+    def __init__(self):
+        super().__init__()
+        self.there, self.back = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
+        self.back.weight = self.there.weight
+
+
+def test_tied_weights_are_saved_under_each_name(tmp_path):
+    """They come back equal, with the moments of the one parameter that they are, and still tied."""
+    first, second = (Network("tied", Tied(), 1e-2) for _ in range(2))
+    first.module.there(first.module.back(torch.ones(3, 2))).sum().backward()
+    first.optimizer.step()
+    save_state(tmp_path / "x", first.state(), {"networks": ["tied"]})
+    tensors, _ = load_state(tmp_path / "x")
+    second.restore(tensors, "here")
+    assert second.module.there.weight is second.module.back.weight
+    assert torch.equal(second.module.there.weight, first.module.there.weight)
+    one, other = first.state(), second.state()
+    assert one.keys() == other.keys()
+    assert "tied.adam.there.weight.exp_avg" in one
+    assert all(torch.equal(x, other[name]) for name, x in one.items())
 
 
 def test_a_step_that_is_not_finite_leaves_networks_alone(dataset):  # noqa: F811

@@ -63,6 +63,11 @@ def short(path) -> None:
     save_state(path, {**tensors, "parameter.quats": tensors["parameter.quats"][1:]}, header)
 
 
+def without_its_network(path) -> None:
+    tensors, header = load_state(path)
+    save_state(path, tensors, header | {"networks": ["field"]})
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -70,6 +75,7 @@ def short(path) -> None:
         (damaged, "must be a checkpoint, got "),
         (of_a_newer_version, "checkpoint schema must be 1, got 9"),
         (not_finite, "quats must be finite, got .* at index 3"),
+        (without_its_network, "network 'field' must have parameters, got none"),
         (short, r"parameter\.quats must be torch\.float32 of shape"),
     ],
     ids=lambda x: getattr(x, "__name__", ""),

@@ -39,8 +39,8 @@ class Network:
             group["lr"] = rate_at(self.rate, part)
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Everything that a checkpoint needs, by name."""
-        out = {f"{self.name}.parameter.{key}": x for key, x in self.module.state_dict().items()}
+        """Everything that a checkpoint needs, by name; a tensor that has several names is copied under each of them."""
+        out = {f"{self.name}.parameter.{key}": x.clone() for key, x in self.module.state_dict().items()}
         for key, x in self.module.named_parameters():
             moments = self.optimizer.state.get(x, {})
             out |= {f"{self.name}.adam.{key}.{moment}": value for moment, value in moments.items()}

@@ -172,7 +172,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
         tensors, header: As `drgs.files.load_state` returns them.
     Raises:
         ValueError: If the header lacks a field, or a value is of another type or out of range, or a tensor is missing
-            or has another shape than the number of Gaussians asks for.
+            or has another shape than the number of Gaussians asks for, or a network has no tensor.
     """
     advice = "restore the file, or fit again in another folder"
     kind = _HEADER | ({"active": _ACTIVE} if header.get("active") is not None else {})
@@ -189,6 +189,9 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
         for pick in header["active"]["picks"]:
             if not (0 <= pick["index"] < len(pool) and pool[pick["index"]] == pick["name"]):
                 raise ValueError(f"{path}: pick {pick['name']!r} must be of the pool, is not; {advice}")
+    for name, held in saved_networks(tensors, header).items():
+        if not held:  # every network has parameters: an optimizer of none is refused by torch
+            raise ValueError(f"{path}: network {name!r} must have parameters, got none; {advice}")
     for name, (dtype, shape) in _expected(tensors, header).items():
         x = tensors.get(name)
         if x is None or x.dtype != dtype or tuple(x.shape) != shape:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Trainer"]
 
 _MAX_BAD_STEPS = 10
-_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # what a checkpoint has besides networks
+_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # parts of names in a checkpoint, not of networks
 
 
 class Trainer:
@@ -67,8 +67,11 @@ class Trainer:
         if missing := sorted(set(rows.tensors) - set(self.parts.rates)):
             raise ValueError(f"fit: every tensor must have a learning rate, {missing[0]} has none; add it to the parts")
         names = [network.name for network in self.parts.networks]
-        if len(set(names)) < len(names) or set(names) & _RESERVED:
-            raise ValueError(f"fit: networks must have names of their own, got {', '.join(names)}; rename one")
+        if len(set(names)) < len(names) or any(_RESERVED & set(name.split(".")) for name in names):
+            raise ValueError(
+                f"fit: networks must have names of their own, none of whose parts is {', '.join(sorted(_RESERVED))}, "
+                f"got {', '.join(names)}; rename one"
+            )
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._queue = torch.zeros(0, dtype=torch.int64)
