@@ -14,6 +14,7 @@ from test_data import write_transforms
 from drgs.cameras import Camera, orbit
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
+from drgs.data.views import View, check_parallax
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.frames import load_frames
 from drgs.guards.arguments import ArgumentError
@@ -118,8 +119,6 @@ def test_transforms_hold_times_of_frames(tmp_path, lazy):
 
 def test_views_of_one_pose_at_several_times_are_not_duplicates(tmp_path, caplog):
     """Two photographs from one place at two times are two views; without times they are told of."""
-    from drgs.data.views import check_parallax
-
     data = write_transforms(tmp_path)
     data["frames"][1]["transform_matrix"] = data["frames"][0]["transform_matrix"]
     for times, told in (((0.0, 1.0, 0.0), False), ((None, None, None), True)):
@@ -129,6 +128,16 @@ def test_views_of_one_pose_at_several_times_are_not_duplicates(tmp_path, caplog)
         caplog.clear()
         check_parallax(load(tmp_path).views)
         assert ("have the pose of another one" in caplog.text) == told
+
+
+def test_a_camera_that_stands_still_has_views_at_several_times(caplog):
+    """It is warned that they tell no depth; of one time they are refused, as a camera file that is wrong."""
+    views = [View(dataclasses.replace(VIEW, time=time), str(time)) for time in (0.0, 0.5, 1.0)]
+    check_parallax(views)
+    assert "all 3 training views stand in one place: the photographs tell no depths" in caplog.text
+    for time in (None, 0.5):
+        with pytest.raises(ValueError, match=r"^the 3 training views must have poses of their own, all have the same"):
+            check_parallax([View(dataclasses.replace(VIEW, time=time), view.name) for view in views])
 
 
 def test_a_scene_is_rendered_at_the_time_of_the_camera(rng):

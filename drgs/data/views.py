@@ -253,10 +253,12 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
 
 
 def check_parallax(views: list[View]) -> None:
-    """Warn about views that stand in one place, from which no depth can be told; refuse poses that are all the same.
+    """Warn about views that stand in one place, from which no depth can be told; refuse views that are all the same.
+
+    Views of one pose at several times are one place: a camera that stands still before something that moves.
 
     Raises:
-        ValueError: two views or more, all of one pose.
+        ValueError: two views or more, all of one pose and of one time (or of none).
     """
     poses = np.stack([view.camera.c2w for view in views])
     spread = np.abs(poses - poses[0]).max(axis=(1, 2))
@@ -264,7 +266,8 @@ def check_parallax(views: list[View]) -> None:
     tiny = 1e-9 * max(1.0, float(np.abs(poses).max()))
     if len(views) < 2:
         return
-    if spread.max() <= tiny:
+    times = [[view.camera.time or 0.0] for view in views]  # from one place at two times, things may have moved
+    if spread.max() <= tiny and times.count(times[0]) == len(times):
         raise ValueError(
             f"the {len(views)} training views must have poses of their own, all have the same one (as view "
             f"{views[0].name!r}); check the camera file"
@@ -275,7 +278,6 @@ def check_parallax(views: list[View]) -> None:
             len(views),
         )
         return
-    times = [[view.camera.time or 0.0] for view in views]  # from one place at two times, things may have moved
     if same := len(poses) - len(np.unique(np.c_[np.round(poses / tiny).reshape(len(poses), -1), times], axis=0)):
         _log.warning(
             "%d of the %d training views have the pose of another one; check the camera file", same, len(poses)
