@@ -250,7 +250,7 @@ def _draw(g: Gaussians, camera: Camera, settings: RenderSettings) -> torch.Tenso
     """(H, W, 3) on the CPU, computed when this returns."""
     import drjit as dr
 
-    with torch.no_grad():
+    with torch.no_grad():  # a picture
         image = render(g, camera, settings, outputs=()).rgb.cpu()
     dr.sync_thread()
     return image
@@ -269,7 +269,7 @@ def _check(g: Gaussians, frame: Frame, image: torch.Tensor, crop: tuple[int, int
     K = camera.K.copy()
     K[:2, 2] -= x, y
     part = dataclasses.replace(camera, K=K, width=width, height=height)
-    with torch.no_grad():
+    with torch.no_grad():  # compared, not optimized
         truth = reference.render(g, part, RenderSettings.preset("exact"))
     error = (image[y : y + height, x : x + width].double() - truth.rgb).abs()
     # Where two peaks are nearer than float32 can tell, either order is right: the oracle marks such pixels.

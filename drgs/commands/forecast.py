@@ -35,7 +35,7 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
         K = first.K.copy()
         K[1, 2] -= int(place * max(first.height - height, 0))
         began = time.perf_counter()
-        with torch.no_grad():
+        with torch.no_grad():  # drawn to be timed
             render(gaussians, dataclasses.replace(first, K=K, height=height), settings, ()).rgb.cpu().numpy()
         return time.perf_counter() - began
 

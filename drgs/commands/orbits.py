@@ -221,7 +221,7 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
 
     def distance(camera: Camera) -> float | None:
         small = at_most(camera.undistorted(), _PROBE_PIXELS)
-        with torch.no_grad():
+        with torch.no_grad():  # looked at, not optimized
             out = render(gaussians, small, RenderSettings.preset("fast"), ("depth",))
         rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
         depth, alpha = out.depth[rows, columns].cpu().numpy(), out.alpha[rows, columns].cpu().numpy()
@@ -233,6 +233,7 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
 
 def _shape(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The middle (3,) of what there is to see, the Gaussians' offsets (P,3) from it and their reach (P,)."""
+    # Values, to place cameras by.
     means = gaussians.means.detach().cpu().numpy().astype(np.float64) + gaussians.origin
     sizes = gaussians.scales.detach().cpu().numpy().astype(np.float64).max(axis=1)
     solid = gaussians.opacities.detach().cpu().numpy() > _SOLID

@@ -120,7 +120,7 @@ def render_views(
     with movie or contextlib.nullcontext():
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
             began = time.perf_counter()
-            with torch.no_grad():
+            with torch.no_grad():  # a picture
                 out = render(gaussians, camera, settings, outputs)
             rgb, alpha = out.rgb.cpu().numpy(), out.alpha.cpu().numpy()
             seconds = time.perf_counter() - began

@@ -108,6 +108,7 @@ def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
     known = (alpha >= _OPAQUE) & np.isfinite(depth)
     low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
+    # Of one depth, too, the scale has a length to divide by: a millionth of it, which no label shows.
     high = max(high, low + 1e-12 + 1e-6 * abs(low))
 
     def colors(values: np.ndarray) -> np.ndarray:
@@ -139,7 +140,7 @@ def map_picture(values: np.ndarray) -> np.ndarray:
     known = values > 0
     top = np.log10(values[known].max()) if known.any() else 0.0
     low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
-    low = min(max(low, top - _DECADES), top - 1e-3)
+    low = min(max(low, top - _DECADES), top - 1e-3)  # of one value, too, the scale has a length to divide by
 
     def colors(exponents: np.ndarray) -> np.ndarray:
         return cv2.applyColorMap(to_bytes((exponents - low) / (top - low)), cv2.COLORMAP_INFERNO)[..., ::-1]
