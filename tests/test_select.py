@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 import weakref
+from typing import NamedTuple
 
 import dense_jacobian
 import numpy as np
@@ -17,6 +18,7 @@ from scenes_random import gaussians
 
 from drgs import fisher, reference
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.ellipsoids import Gaussians
 from drgs.gain import CRITERIA, Prior, dense, information_gain
 from drgs.information.cache import camera_key
 from drgs.select import POLICIES, Cache, Scoring, select
@@ -467,6 +469,33 @@ def test_scene_that_moves(world, one_thread):
     other = _Moving(g)
     other.speed = moving.speed
     assert select(other, cameras, known, cache=cache).computed == 3
+
+
+class _Fresh(_Moving):
+    """Its `parameters()` are other tensors at each call."""
+
+    def parameters(self):
+        return {name: x.detach() for name, x in super().parameters().items()}
+
+
+class _Plain(NamedTuple):
+    """A scene that cannot be weakly referenced."""
+
+    g: Gaussians
+
+    def at(self, time):
+        return self.g
+
+    def parameters(self):
+        return self.g.parameters()
+
+
+@pytest.mark.parametrize("kind", [_Fresh, _Plain])
+def test_cache_computes_what_it_cannot_recognize(kind):
+    """Tensors that are made for one call, and scenes without weak references, never share information."""
+    moving, cache, counter = kind(scene()), Cache(), _Counter()
+    for _ in range(2):
+        assert select(moving, line(range(3)), line([5.0]), cache=cache, information=counter).computed == 4
 
 
 def test_cache_does_not_keep_the_gaussians():

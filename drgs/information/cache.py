@@ -24,6 +24,10 @@ class Cache:
     `parameters()` has come, gone, been replaced, or been changed in place by torch, or if its origin differs; one that
     moves, also if it is another object. Changes behind torch's back (`.data`, NumPy views) need `invalidate`.
 
+    What cannot be recognized is taken for another scene, for which everything is computed anew: one whose
+    `parameters()` makes its tensors at each call (`.detach()`, `.clone()`, views), so keep them and return the same
+    ones; and one that moves and cannot be weakly referenced (a NamedTuple, a class with slots).
+
     Attributes:
         hits, misses: Views found and computed so far.
     """
@@ -61,23 +65,36 @@ class Cache:
 
 
 class _State:
-    """What a scene was when information was computed. Weak: a cache must not keep an earlier state alive."""
+    """What a scene was when information was computed. Weak: a cache must not keep an earlier state alive.
+
+    A reference that has died is to something that has gone, so it equals nothing.
+    """
 
     def __init__(self, scene: Scene):
         self.parameters = {name: (weakref.ref(x), x._version) for name, x in scene.parameters().items()}
         # Gaussians are their parameters and an origin; what else another kind of scene is made of, only it knows.
         self.origin = scene.origin.tobytes() if isinstance(scene, Gaussians) else None
-        self.itself = None if isinstance(scene, Gaussians) else weakref.ref(scene)
+        self.itself = None if isinstance(scene, Gaussians) else _reference(scene)
 
     def is_still(self, scene: Scene) -> bool:
         """Whether a scene has the same tensors, unchanged, and all else as it was."""
-        now = _State(scene)
-        if now.origin != self.origin or now.parameters.keys() != self.parameters.keys():
+        origin = scene.origin.tobytes() if isinstance(scene, Gaussians) else None
+        if origin != self.origin or (self.itself is not None and self.itself() is not scene):
             return False
-        if self.itself is not None and self.itself() is not scene:
+        now = scene.parameters()  # alive while it is compared
+        if now.keys() != self.parameters.keys():
             return False
-        pairs = zip(now.parameters.values(), self.parameters.values(), strict=True)
-        return all(new() is old() and version == earlier for (new, version), (old, earlier) in pairs)
+        return all(
+            now[name] is old() and now[name]._version == version for name, (old, version) in self.parameters.items()
+        )
+
+
+def _reference(scene: Scene) -> Callable[[], Scene | None]:
+    """A weak reference, or one that is dead from the start."""
+    try:
+        return weakref.ref(scene)
+    except TypeError:
+        return lambda: None
 
 
 def camera_key(camera: Camera) -> tuple:
