@@ -41,7 +41,7 @@ from drgs.files import load_ply  # noqa: E402
 from drgs.lab.crops import crops  # noqa: E402
 from drgs.lab.crossval import VERDICTS, crossval  # noqa: E402
 from drgs.lab.dumps import cotangents  # noqa: E402
-from drgs.lab.rasterizers import function, load  # noqa: E402
+from drgs.lab.rasterizers import function, load_rasterizer  # noqa: E402
 from drgs.lab.raw import PARAMETERS, raw_of, with_pose  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
@@ -166,7 +166,7 @@ def _alarm(name: str, g: Gaussians, camera: Camera, seed: int) -> dict:
     views = [camera]
     if not name.startswith("drgs:"):  # what the command crops for ours is cropped for it here: it is slow
         g, views, _ = crops(g, views, RenderSettings.preset("gsplat", **fields))
-    found = crossval(load(name, fields=fields), g, views, "auto", fields, seed=seed).report
+    found = crossval(load_rasterizer(name, fields=fields), g, views, "auto", fields, seed=seed).report
     return {
         "verdict": found["verdict"],
         "view": camera.name,
@@ -266,7 +266,7 @@ def outside() -> list[str]:
             continue
         for place, (g, cameras) in scenes.items():
             start = time.perf_counter()
-            found = crossval(load(name), g, cameras, preset, {"background": BACKGROUND})
+            found = crossval(load_rasterizer(name), g, cameras, preset, {"background": BACKGROUND})
             seconds = time.perf_counter() - start
             view = found.report["image"]["views"][0]
             odd = "; ".join(f"{c['name']}: {c['found']}" for c in found.report["conventions"]) or "-"

@@ -1,6 +1,6 @@
 """Image metrics: how well Gaussians show views that they were not fitted to.
 
-Metrics that cannot be computed are None with a reason, never left out. `VARIANTS` says exactly what each number is.
+Metrics that cannot be computed are None with a reason, never left out. `DEFINITIONS` says exactly what each number is.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METRICS",
-    "VARIANTS",
+    "DEFINITIONS",
     "Lpips",
     "evaluate",
     "flip",
@@ -36,14 +36,14 @@ __all__ = [
     "write_metrics",
 ]
 
-VARIANTS = {
+DEFINITIONS = {
     "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
     "ssim": "11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
 }
-METRICS = tuple(VARIANTS)
+METRICS = tuple(DEFINITIONS)
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
 _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
@@ -53,7 +53,7 @@ _VIEWERS_VIEWS = 8  # enough for a mean difference, and a second at most
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, see `VARIANTS`.
+    """Peak signal-to-noise ratio in dB, see `DEFINITIONS`.
 
     Args:
         image, target: (H, W, 3) in [0, 1].
@@ -70,7 +70,7 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Structural similarity of (H, W, 3) images in [0, 1], at least 11x11 pixels, see `VARIANTS`."""
+    """Structural similarity of (H, W, 3) images in [0, 1], at least 11x11 pixels, see `DEFINITIONS`."""
     return float(_ssim_map(image, target)[5:-5, 5:-5].mean())
 
 
@@ -210,7 +210,7 @@ def _evaluated(
         mean[name] = sum(values) / len(values) if values and len(values) == len(views) else None
         if not views:
             reasons[name] = "no view is held out"
-    variants = dict(VARIANTS)
+    variants = dict(DEFINITIONS)
     if lpips is not None:
         variants["lpips"] += f", {lpips.backbone} backbone"
     return {"views": views, "mean": mean, "variants": variants, "reasons": reasons}

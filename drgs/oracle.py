@@ -20,7 +20,7 @@ __all__ = [
     "activate",
     "cull_near",
     "float64",
-    "intrinsics",
+    "scale_and_shift",
     "sh_basis",
     "sh_colors",
     "take",
@@ -90,7 +90,7 @@ def activate(g, s: RenderSettings) -> SimpleNamespace:
     )
 
 
-def intrinsics(cam) -> tuple[torch.Tensor, torch.Tensor]:
+def scale_and_shift(cam) -> tuple[torch.Tensor, torch.Tensor]:
     """Of K, in pixels: the (2, 2) that acts on x/z and y/z, skew included, and the principal point (2,).
 
     Raises:
@@ -107,7 +107,7 @@ def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
     u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
     if getattr(cam, "model", "pinhole") == "pinhole":
-        scale, shift = intrinsics(cam)
+        scale, shift = scale_and_shift(cam)
         plane = torch.linalg.solve(scale, (torch.stack([u, v], dim=-1) - shift).T).T
         local = torch.cat([plane, torch.ones_like(u)[:, None]], dim=-1)
     else:
@@ -137,7 +137,7 @@ def screen_rows(x, y, z, cam, fov_clamp: str, rotation: torch.Tensor, axes: torc
         fov_clamp: Of `RenderSettings`.
         rotation: (3, 3) of w2c.
     """
-    scale, shift = intrinsics(cam)
+    scale, shift = scale_and_shift(cam)
     slopes = []
     axes_of = zip((x / z, y / z), scale.diagonal(), shift, (cam.width, cam.height), strict=True)
     for slope, f, c, size in axes_of:  # no rasterizer's clamp knows of skew

@@ -23,7 +23,7 @@ from drgs.oracle import (
     activate,
     cull_near,
     float64,
-    intrinsics,
+    scale_and_shift,
     screen_rows,
     sh_basis,
     sh_colors,
@@ -37,14 +37,14 @@ from drgs.volume import render_volume
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["Output", "render", "render_volume", "sh_basis"]
+__all__ = ["ReferenceOutput", "render", "render_volume", "sh_basis"]
 
 _TILE = 16  # pixels; both rasterizers' tile size
 _PAIRS = 1 << 19  # (ray, Gaussian) pairs held at once: about 0.3 GB of intermediates
 
 
 @dataclasses.dataclass
-class Output:
+class ReferenceOutput:
     """What `render` returns; (H, W) stands for the shape of the rays where rays are given.
 
     Attributes:
@@ -77,7 +77,7 @@ def render(
     window: tuple[int, int, int, int] | None = None,
     exact_ties: bool = False,
     effect: float = 1e-7,
-) -> Output:
+) -> ReferenceOutput:
     """Renders by brute force in float64.
 
     Args:
@@ -102,7 +102,7 @@ def render(
         effect: The change of a weight that matters to `ambiguous`.
 
     Returns:
-        `Output` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
+        `ReferenceOutput` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
 
     Raises:
         ValueError: If `ewa` meets rays or distortion, or a camera is needed and missing.
@@ -140,7 +140,7 @@ def render(
         joined = torch.cat([part[name] for part in parts])
         fields[name] = joined.reshape(*view.shape, *joined.shape[1:])
     seen = torch.zeros(len(g.means), dtype=torch.float64).index_add(0, scene.index, seen)
-    return Output(visibility=seen, **fields)
+    return ReferenceOutput(visibility=seen, **fields)
 
 
 def _project(
@@ -151,7 +151,7 @@ def _project(
     Tile bounds: three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by
     the tolerance, exact, grown by it. None without tile culling.
     """
-    scale, shift = intrinsics(cam)
+    scale, shift = scale_and_shift(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
     mean2d = torch.stack([x / z, y / z], dim=-1) @ scale.T + shift
     rows = screen_rows(x, y, z, cam, s.fov_clamp, rotation, scene.axes)
@@ -336,7 +336,7 @@ def _composite(
     exact_ties: bool,
     effect: float,
 ) -> dict:
-    """The fields of `Output` for one chunk of rays."""
+    """The fields of `ReferenceOutput` for one chunk of rays."""
     a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels)
     # Near misses are sorted in, without effect, to see what they would have done.
     candidate = checks[0] | (checks[1] >= -tolerance)

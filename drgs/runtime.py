@@ -44,8 +44,8 @@ __all__ = [
     "setup",
 ]
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
@@ -90,14 +90,14 @@ _computing = threading.RLock()
 _owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
 
 
-def alone(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def alone(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Lets one Python thread at a time compute, as one computation uses all cores, and refuses in a forked child.
 
     Dr.Jit's worker threads do not survive `os.fork`: a kernel would wait for them forever.
     """
 
     @functools.wraps(function)
-    def one_at_a_time(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def one_at_a_time(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         global _owner
         _refuse_fork()
         _owner = os.getpid()
@@ -115,7 +115,7 @@ def _refuse_fork() -> None:
         )
 
 
-def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], Result]) -> Result:
+def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _Result:
     """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph."""
     import torch
 

@@ -17,7 +17,7 @@ import torch
 from drgs.cameras import Camera, look_at
 from drgs.ellipsoids import Gaussians
 from drgs.lab.crossval import VERDICTS, Result, crossval
-from drgs.lab.rasterizers import function, load
+from drgs.lab.rasterizers import function, load_rasterizer
 
 __all__ = ["assert_matches", "random_scene"]
 
@@ -57,7 +57,7 @@ def assert_matches(
     results = []
     for g, views in scenes:
         if isinstance(rasterizer, str):
-            made = load(rasterizer, g, views, {"background": background})
+            made = load_rasterizer(rasterizer, g, views, {"background": background})
         else:
             made = function(rasterizer, getattr(rasterizer, "__name__", "rasterizer"))
         result = crossval(made, g, views, preset, {"background": background}, **options)

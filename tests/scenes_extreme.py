@@ -6,9 +6,9 @@ import math
 
 from scenes_random import camera, gaussians
 
-from drgs.lab.extremes import CASES, Case
+from drgs.lab.extremes import CASES, ExtremeCase
 
-__all__ = ["CASES", "CROWDS", "Case", "crowd"]
+__all__ = ["CASES", "CROWDS", "ExtremeCase", "crowd"]
 
 
 def _huge_crowd(g):

@@ -46,6 +46,15 @@ FLOORS: list[tuple[set[str], str]] = [
 # Modules that may `import drgs`.
 FACADE = {"cli": "the program", "runtime": "`__version__`, which the package states there"}
 
+# Names that more than one module defines: what they share is what the name says.
+SHARED = {
+    "run": "what the program calls of each command",
+    "Scene": "the options of the command of that name, beside what is rendered",
+    "coverage": "a policy's name is that of the information it goes by",
+    "render": "the truth takes the arguments of what it checks",
+    "sh_basis": "the truth has its own, so that it cannot borrow from what it checks",
+}
+
 LINES = 400  # what is read in one go
 
 
@@ -125,6 +134,31 @@ def test_no_cycles_at_import():
         ready = sorted(m for m in rest if not graph[m] & rest)
         assert ready, f"in a cycle, or above one: {sorted(rest)}"
         done += ready
+
+
+def public_names(tree: ast.Module) -> Iterator[str]:
+    """Functions, classes and constants that a module defines at its top level and that do not start with _."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [x.id for target in targets for x in ast.walk(target) if isinstance(x, ast.Name)]
+        else:
+            continue
+        yield from (name for name in names if not name.startswith("_"))
+
+
+def test_a_name_means_one_thing():
+    """No two modules define the same public name, but for those of which it is said why, which all do."""
+    homes: dict[str, set[str]] = {}
+    for module, tree in modules().items():
+        for name in public_names(tree):
+            homes.setdefault(name, set()).add(module)
+    several = {name: where for name, where in homes.items() if len(where) > 1}
+    assert {name: where for name, where in several.items() if name not in SHARED} == {}
+    assert set(SHARED) <= set(several), "defined once: take it off the list"
+    assert {module for module in several["run"] if not module.startswith("commands.")} == set()
 
 
 def test_no_file_is_too_long():

@@ -310,7 +310,7 @@ def test_entries_that_jump_are_left_out():
 def test_a_model_beside_another():
     """A rasterizer that is far from what it claims is another model, or undecided; no bug is made up."""
     g, cameras = random_scene(0, count=40, width=32, height=24)
-    result = crossval(rasterizers.load("drgs:inria"), g, cameras, "exact", {"background": BACKGROUND})
+    result = crossval(rasterizers.load_rasterizer("drgs:inria"), g, cameras, "exact", {"background": BACKGROUND})
     assert result.verdict in ("model difference", "undecided"), "\n".join(result.lines())
 
 
@@ -328,7 +328,7 @@ def test_cameras_that_show_nothing():
 def test_our_own_presets_agree_with_the_oracle(preset):
     """`drgs:PRESET` is held against float64."""
     g, cameras = random_scene(1)
-    result = crossval(rasterizers.load(f"drgs:{preset}"), g, cameras, "auto", {"background": BACKGROUND})
+    result = crossval(rasterizers.load_rasterizer(f"drgs:{preset}"), g, cameras, "auto", {"background": BACKGROUND})
     assert result.verdict == "agreement", "\n".join(result.lines())
     assert result.report["reference"] == "float64 oracle"
     assert result.report["preset"] == preset
@@ -341,7 +341,7 @@ def test_near_ties_are_no_difference(contrast, monkeypatch):
     Pixels without ties are compared as ever: there a wrong gradient is still found.
     """
     g, cameras = _tied(contrast)
-    ours = rasterizers.load("drgs:gsplat")
+    ours = rasterizers.load_rasterizer("drgs:gsplat")
     result = crossval(ours, g, cameras, "gsplat", {"background": BACKGROUND})
     assert result.verdict == "agreement", "\n".join(result.lines())
     assert 0 < result.report["near_ties"] < 0.6 * result.report["pixels"]
@@ -382,7 +382,7 @@ def test_crops_show_something():
     away = np.diag([-1.0, 1, -1, 1]) @ np.array(camera.w2c)
     away[2, 3] -= 1000
     cameras = [dataclasses.replace(wide, w2c=x, name=n) for n, x in (("one", wide.w2c), ("empty", away), ("two", w2c))]
-    result = crossval(rasterizers.load("drgs:gsplat"), many, cameras, "auto", {"background": BACKGROUND})
+    result = crossval(rasterizers.load_rasterizer("drgs:gsplat"), many, cameras, "auto", {"background": BACKGROUND})
     report = result.report
     assert result.verdict == "agreement", "\n".join(result.lines())
     assert report["cameras"] == ["one", "two"]
@@ -404,7 +404,7 @@ def test_settings_hold_for_both_sides(fields):
     """What --set says changes the rasterizer of ours and the oracle alike."""
     g, cameras = random_scene(2, count=40, width=32, height=24)
     fields = {"background": BACKGROUND, **fields}
-    result = crossval(rasterizers.load("drgs:exact", fields=fields), g, cameras, "exact", fields)
+    result = crossval(rasterizers.load_rasterizer("drgs:exact", fields=fields), g, cameras, "exact", fields)
     assert result.verdict == "agreement", "\n".join(result.lines())
     assert result.model.settings.background == BACKGROUND
 

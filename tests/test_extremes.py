@@ -20,7 +20,7 @@ from scenes_random import camera, gaussians, gradients
 from drgs import reference
 from drgs.integrator import render, render_jvp, render_rays
 from drgs.lab.refusals import REFUSALS
-from drgs.lab.stress import measure, refused, truth_of
+from drgs.lab.stress import refused, row_of, truth_of
 from drgs.settings import RenderSettings
 from drgs.tracing import bvh
 
@@ -52,7 +52,7 @@ def test_extremes(name, traversal):
     On `bvh` where float32 world space cannot hold these bounds: finite values and a warning.
     """
     case, truth = _known(name)
-    row = measure(case, traversal, truth)
+    row = row_of(case, traversal, truth)
     warns = (traversal, case.bvh) == ("bvh", "warns")
     assert row.finite, row
     assert row.verdict == ("warns" if warns else "holds"), row

@@ -134,7 +134,7 @@ def test_what_raises_becomes_a_row(monkeypatch, tmp_path, capsys):
 
 def test_a_scene_that_cannot_be_built_is_a_row_for_each_traversal():
     """So is what goes wrong before the renderer is called."""
-    case = extremes.Case("broken", lambda rng: 1 / 0)
+    case = extremes.ExtremeCase("broken", lambda rng: 1 / 0)
     rows = list(stress.rows(case))
     assert [row.traversal for row in rows] == ["tiles", "bvh"]
     assert all(row.verdict == "FAILS" and "ZeroDivisionError" in row.remark for row in rows)
@@ -153,7 +153,7 @@ def test_warnings_are_part_of_the_verdict(monkeypatch, expected):
             return true(*args)
 
         monkeypatch.setattr(accuracy, "compare", loud)
-    row = stress.measure(case, "bvh", stress.truth_of(case))
+    row = stress.row_of(case, "bvh", stress.truth_of(case))
     assert row.verdict == "FAILS"
     assert ("no warning" if expected else "a warning without need") in row.remark
 

@@ -19,7 +19,7 @@ from drgs.integrator import render
 from drgs.lab.tradeoff import measure
 from drgs.lab.tradeoff_advice import USES, interval, recommend
 from drgs.lab.tradeoff_full import measure_full
-from drgs.lab.tradeoff_rows import VARIANTS, GroupInformation, Interval, Measured, TradeoffRow, WorstErrors
+from drgs.lab.tradeoff_rows import TRADEOFF_VARIANTS, GroupInformation, Interval, Measured, TradeoffRow, WorstErrors
 from drgs.settings import RenderSettings
 
 BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
@@ -57,14 +57,14 @@ def rows(report) -> dict:
 
 def few(monkeypatch, *names):
     """Measure only these rows."""
-    kept = tuple(v for v in VARIANTS if v.name in ("exact", *names))
+    kept = tuple(v for v in TRADEOFF_VARIANTS if v.name in ("exact", *names))
     assert len(kept) == 1 + len(names)
-    monkeypatch.setattr(tradeoff, "VARIANTS", kept)
+    monkeypatch.setattr(tradeoff, "TRADEOFF_VARIANTS", kept)
 
 
 def test_rows_are_complete(report):
     """A row a setting; every number there, or a reason why not."""
-    names = [variant.name for variant in VARIANTS]
+    names = [variant.name for variant in TRADEOFF_VARIANTS]
     assert [row["name"] for row in report["rows"]] == names
     assert len(set(names)) == len(names)
     for row in report["rows"]:
@@ -82,7 +82,7 @@ def test_rows_are_complete(report):
 
 def test_settings_of_the_design_are_all_there():
     """Every value that the settings' table names is switched on somewhere, at least by a preset."""
-    made = [RenderSettings.preset(v.preset, **v.fields) for v in VARIANTS]
+    made = [RenderSettings.preset(v.preset, **v.fields) for v in TRADEOFF_VARIANTS]
     values = lambda name: {getattr(settings, name) for settings in made}  # noqa: E731
     assert values("response") == {"peak", "integral", "ewa"}
     assert values("order") == {"center", "ray", "entry"}
@@ -98,7 +98,7 @@ def test_settings_of_the_design_are_all_there():
     assert values("sh_direction") == {"gaussian", "ray"}
     for name in ("stop", "fov_clamp", "culling"):
         assert len(values(name)) == 3
-    assert {v.share for v in VARIANTS} == {1, 0.5, 0.25}
+    assert {v.share for v in TRADEOFF_VARIANTS} == {1, 0.5, 0.25}
 
 
 def test_exact_is_the_unit(report):
@@ -138,7 +138,7 @@ def test_gradient_error_is_the_jacobians(place, monkeypatch):
     fast, exact = (
         fisher.jacobian_columns(g, camera, index, RenderSettings.preset(*p)).double() for p in (["fast"], ["exact"])
     )
-    variants = tuple(v for v in VARIANTS if v.name in ("exact", "fast"))
+    variants = tuple(v for v in TRADEOFF_VARIANTS if v.name in ("exact", "fast"))
     found = [
         measure(g, [camera], variants, repeats=0, seed=seed).rows[1].gradient.groups["log_scales"] for seed in range(40)
     ]
@@ -149,7 +149,7 @@ def test_gradient_error_is_the_jacobians(place, monkeypatch):
 @pytest.mark.parametrize("key", ["extent", "transmittance_min", "alpha_min"])
 def test_errors_grow_with_the_cut_off(report, key):
     """Wider cut-offs: larger errors of image, gradient and information."""
-    single = [v for v in VARIANTS if v.preset == "exact" and set(v.fields) == {key} and v.share == 1]
+    single = [v for v in TRADEOFF_VARIANTS if v.preset == "exact" and set(v.fields) == {key} and v.share == 1]
     single.sort(key=lambda v: -v.fields[key] if key == "extent" else v.fields[key])
     assert len(single) >= 3
     found = [rows(report)[v.name] for v in single]
@@ -228,7 +228,7 @@ def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     assert [(view["width"], view["height"]) for view in report["views"]] == [(20, 16)] * 2
     assert report["full"]["forward"]["size"] == report["full"]["forward"]["drawn"] == [80, 64]
 
-    g, variants = load_ply(place / "scene.ply"), tuple(v for v in VARIANTS if v.name in ("exact", "fast"))
+    g, variants = load_ply(place / "scene.ply"), tuple(v for v in TRADEOFF_VARIANTS if v.name in ("exact", "fast"))
     measured = measure(g, [camera.resized(20, 16) for camera in large], variants, repeats=1)
 
     def timed(seconds):
@@ -393,7 +393,7 @@ def test_groups_without_a_derivative_have_no_error(place):
     """Rotating a sphere changes nothing: its rounding is not taken for an error of 100 %."""
     g = load_ply(place / "scene.ply")
     g = g.replace(log_scales=g.log_scales[:, :1].expand(-1, 3).contiguous())
-    variants = tuple(v for v in VARIANTS if v.name in ("exact", "extent=4"))
+    variants = tuple(v for v in TRADEOFF_VARIANTS if v.name in ("exact", "extent=4"))
     row = measure(g, load_cameras_json(place / "cameras.json"), variants, repeats=0).rows[1]
     assert row.gradient.groups["quats"] is None
     assert row.information.groups["rotations"] == GroupInformation(None, None)

@@ -41,7 +41,7 @@ def run(args: Crossval) -> int:
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0
-    rasterizer = rasterizers.load(args.rasterizer, g, cameras, fields)
+    rasterizer = rasterizers.load_rasterizer(args.rasterizer, g, cameras, fields)
     with Bar("crossval", show=not args.quiet) as bar:
 
         def advance(stage: str) -> None:

@@ -21,7 +21,7 @@ from drgs.select import Scoring, Selection, select
 if TYPE_CHECKING:
     from drgs.commands.options import Select
 
-__all__ = ["print_table", "run"]
+__all__ = ["print_picks", "run"]
 
 _SHORT = {"rotations": "rot.", "log_scales": "scales", "logit_opacities": "opac."}  # a table has 80 columns
 
@@ -78,10 +78,10 @@ def run(args: Select) -> None:
     }
     write_json(args.output, report)
     if not args.quiet:
-        print_table(report, selection, args.output)
+        print_picks(report, selection, args.output)
 
 
-def print_table(report: dict, selection: Selection, output: Path) -> None:
+def print_picks(report: dict, selection: Selection, output: Path) -> None:
     """The picks with each group's part of the score, and what to know about them, on stdout."""
     title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
     groups, rows = list(selection.picks[0].parts), []

@@ -13,7 +13,7 @@ from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import claim
 from drgs.lab import extremes, refusals
-from drgs.lab.stress import BOUNDS, Row, rows
+from drgs.lab.stress import BOUNDS, StressRow, rows
 
 if TYPE_CHECKING:
     from drgs.commands.options import Stress
@@ -73,11 +73,11 @@ def _number(x: float | None) -> str:
     return "-" if x is None else f"{x:.0e}"
 
 
-def _finite(row: Row) -> str:
+def _finite(row: StressRow) -> str:
     return "-" if row.finite is None else "yes" if row.finite else "NO"
 
 
-def _printed(row: Row) -> str:
+def _printed(row: StressRow) -> str:
     """Lines of at most 80 characters; the case has a line of its own."""
     gradient = " ".join((_number(row.gradient), row.group)).strip()
     others = (_number(row.forward), _number(row.duality), _number(row.fisher))
@@ -86,7 +86,7 @@ def _printed(row: Row) -> str:
     return "\n".join([_line(row.traversal, row.verdict, _number(row.image), gradient, *others), *remark])
 
 
-def markdown(found: list[Row]) -> list[str]:
+def markdown(found: list[StressRow]) -> list[str]:
     """The lines of a table."""
     lines = [
         "| case | traversal | " + " | ".join(COLUMNS.values()) + " | finite | verdict | remark |",
@@ -102,7 +102,7 @@ def markdown(found: list[Row]) -> list[str]:
     return lines
 
 
-def _write(args: Stress, found: list[Row], seconds: float) -> None:
+def _write(args: Stress, found: list[StressRow], seconds: float) -> None:
     """stress.json, and stress.md with the table."""
     env = runtime.info()
     report = {

@@ -41,7 +41,7 @@ from drgs.lab.tradeoff import measure
 from drgs.lab.tradeoff_advice import USES, Advice, recommend
 from drgs.lab.tradeoff_full import FullSize, measure_full
 from drgs.lab.tradeoff_plot import plot
-from drgs.lab.tradeoff_rows import CLOCKS, VARIANTS, Interval, Measured, TradeoffRow
+from drgs.lab.tradeoff_rows import CLOCKS, TRADEOFF_VARIANTS, Interval, Measured, TradeoffRow
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -70,14 +70,14 @@ def run(args: Tradeoff) -> None:
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")
     cameras, source = seen_views(args, given)
     reduced = [at_most(camera, args.max_pixels) for camera in cameras]
-    turns = (args.repeats + 1) * (1 + sum(x.by == "view" for x in VARIANTS))
+    turns = (args.repeats + 1) * (1 + sum(x.by == "view" for x in TRADEOFF_VARIANTS))
     with Bar("tradeoff", turns, not args.quiet) as bar:
-        measured = measure(gaussians, reduced, VARIANTS, fields, args.repeats, args.seed, bar.advance)
+        measured = measure(gaussians, reduced, TRADEOFF_VARIANTS, fields, args.repeats, args.seed, bar.advance)
     with Bar("tradeoff", show=not args.quiet) as bar:
         say = lambda label: bar.update(0, label=f"tradeoff, {label}")  # noqa: E731
         budget = args.repeats, args.seconds, args.seed
         full = measure_full(measured, gaussians, cameras, args.max_error, *budget, say)
-    for row, variant in zip(measured.rows, VARIANTS, strict=True):
+    for row, variant in zip(measured.rows, TRADEOFF_VARIANTS, strict=True):
         row.flags = None if variant.by == "oracle" else variant.flags(args.overrides)
     report = _Report(
         scene=str(args.scene),

@@ -8,17 +8,15 @@ whole picture, and views further apart can be matched.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
+    from drgs.data.matching import Progress
 
 __all__ = ["Features", "Matches", "detect"]
-
-Progress = Callable[[str, int, int], None]
 
 _MOST = 6000  # features of a picture, the strongest
 _CONTRAST = 0.02  # half of OpenCV's default: weak features still match along a line

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "ssim", "ssim_map", "terms_of"]
+__all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "padded_ssim", "ssim_map", "terms_of"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -74,7 +74,7 @@ class Photometric:
         if frame.mask is not None:
             rgb = rgb * frame.mask[..., None]
         loss = (1 - self.ssim_weight) * (rgb - target).abs().mean()
-        return loss + self.ssim_weight * (1 - ssim(rgb, target)) if self.ssim_weight else loss
+        return loss + self.ssim_weight * (1 - padded_ssim(rgb, target)) if self.ssim_weight else loss
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Scale:
         return self.weight * gaussians.scales.mean() * (5 / self.extent)
 
 
-def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+def padded_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Mean structural similarity, 11x11 window, sigma 1.5, zero-padded, data range 1.
 
     Args:

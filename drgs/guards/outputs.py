@@ -155,7 +155,7 @@ class Claim:
             ValueError: If they have not.
         """
         ours = JOURNAL, locks.NAME
-        content = [x for x in self.path.iterdir() if x.name not in ours and not unfinished.NAME.fullmatch(x.name)]
+        content = [x for x in self.path.iterdir() if x.name not in ours and not unfinished.PATTERN.fullmatch(x.name)]
         for path in content:
             if not self.is_made(path, by):
                 raise ValueError(

@@ -11,9 +11,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["NAME", "delete", "delete_all", "hidden_file", "is_left_over", "temporary_folder"]
+__all__ = ["PATTERN", "delete", "delete_all", "hidden_file", "is_left_over", "temporary_folder"]
 
-NAME = re.compile(r"\.drgs\..+\.[a-z0-9_]{8}\.tmp(\.[a-z0-9]+)?")
+PATTERN = re.compile(r"\.drgs\..+\.[a-z0-9_]{8}\.tmp(\.[a-z0-9]+)?")
 """What they are called, and nothing else is."""
 
 _made: set[str] = set()  # by this process, and not finished
@@ -61,7 +61,7 @@ def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iter
 
 def is_left_over(path: Path) -> bool:
     """Whether another process left it, in a folder that this one alone writes into."""
-    return NAME.fullmatch(path.name) is not None and str(path) not in _made
+    return PATTERN.fullmatch(path.name) is not None and str(path) not in _made
 
 
 def delete_all() -> None:

@@ -166,7 +166,7 @@ class Diagonal:
                 if k == GEOMETRY:
                     total = dr.fma(row.w, row.w, total)
                 else:
-                    total += squares(row, k, self.weights, self.summed)
+                    total += weighted_squares(row, k, self.weights, self.summed)
             dr.scatter_add(self.buffer, total, index * self.width + k, hits, mode=self.mode)
         for k in range(self.bands):
             for c in range(3):
@@ -176,7 +176,7 @@ class Diagonal:
         return states
 
 
-def squares(row: Row, j: int, weights, summed=False):
+def weighted_squares(row: Row, j: int, weights, summed=False):
     """sum_c weight_c (dC_c / d(geometry j))^2."""
     slopes, g, turned = row.slopes, row.g, row.turned
     if summed:
@@ -250,7 +250,7 @@ class Variance:
             K = len(rows[0].basis)
             light = [dr.gather(lib.Float, self.light, index * (3 * K) + k, hits) for k in range(3 * K)]
         for row, state in zip(rows, states, strict=True):
-            total = sum(v[j] * squares(row, j, self.weights) for j in range(GEOMETRY))
+            total = sum(v[j] * weighted_squares(row, j, self.weights) for j in range(GEOMETRY))
             shares = [v[GEOMETRY + c] for c in range(3)]
             for k, weight in enumerate(light):
                 band, c = row.basis[k // 3], k % 3

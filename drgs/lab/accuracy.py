@@ -145,7 +145,7 @@ class Oracle:
     """The float64 oracle on one scene: images, J^T u for random u, J v for a random v.
 
     Attributes:
-        out: `reference.Output`.
+        out: `reference.ReferenceOutput`.
         good: (H, W) pixels that do not hang on a near tie, and are not in `skip`.
         u, back: Cotangents of the images, 0 where not `good`, and the gradient they give, by group.
         v, push: Tangents of the groups and the tangent images they give.
@@ -193,7 +193,7 @@ def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: boo
 
 
 def gradients(
-    g: Gaussians, cam: Camera, out: Output | reference.Output, u: Mapping[str, torch.Tensor]
+    g: Gaussians, cam: Camera, out: Output | reference.ReferenceOutput, u: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
     """float64 gradient of sum <u, image> by group, `camera` as a twist."""
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
@@ -264,12 +264,12 @@ def _largest(x: torch.Tensor) -> float:
 # -------------------------------------------------- the dense Jacobian
 
 
-def jacobian(g: Gaussians, out: reference.Output, features: bool = False) -> dict[str, torch.Tensor]:
+def jacobian(g: Gaussians, out: reference.ReferenceOutput, features: bool = False) -> dict[str, torch.Tensor]:
     """Group of `drgs.fisher` -> (3 P, parameters...) float64 derivative of the oracle's rgb.
 
     Args:
         g: The Gaussians, leaves.
-        out: `reference.Output` with its graph.
+        out: `reference.ReferenceOutput` with its graph.
         features: Whether `features` (P, N), the derivative of a pixel's feature by those of the Gaussians, is added.
     """
     wanted = {name: x for name, x in g.parameters().items() if name != "features"}

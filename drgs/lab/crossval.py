@@ -108,7 +108,7 @@ def crossval(
     """Compare a rasterizer with the model that it claims to compute.
 
     Args:
-        rasterizer: From `drgs.lab.rasterizers.load`.
+        rasterizer: From `drgs.lab.rasterizers.load_rasterizer`.
         g: The scene.
         cameras: Pinhole cameras of one image size.
         preset: What it claims to be, or `auto`: the preset whose image needs least to be explained.

@@ -18,7 +18,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.lab.accuracy import random_camera, random_gaussians
 from drgs.settings import RenderSettings
 
-__all__ = ["CASES", "SIZE", "Case"]
+__all__ = ["CASES", "SIZE", "ExtremeCase"]
 
 SIZE = (9, 7)
 """Width and height of the images, unless a case says otherwise."""
@@ -28,7 +28,7 @@ Builder = Callable[[np.random.Generator], Built]
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
+class ExtremeCase:
     """One scene.
 
     Attributes:
@@ -308,11 +308,11 @@ _MODES = {
 }
 
 
-def _cases(name: str, build: Builder, modes: str = "exact", **options) -> list[Case]:
+def _cases(name: str, build: Builder, modes: str = "exact", **options) -> list[ExtremeCase]:
     """A scene in each of the modes, which are named where they are not `exact`."""
     fields = options.pop("fields", {})
     return [
-        Case(
+        ExtremeCase(
             name if mode == "exact" else f"{name}, `{mode}`",
             build,
             preset=_MODES[mode].get("preset", "exact"),

@@ -25,7 +25,7 @@ from drgs.lab.raw import COLORS, POSE, gaussians_of, image_of, posed
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
 
-__all__ = ["Rasterizer", "function", "load", "ours"]
+__all__ = ["Rasterizer", "function", "load_rasterizer", "ours"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Rasterizer:
         return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}  # new leaves
 
 
-def load(
+def load_rasterizer(
     text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, fields: dict | None = None
 ) -> Rasterizer | Dump:
     """A rasterizer by its name.

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.gain import Information
     from drgs.lab.accuracy import Oracle
-    from drgs.lab.extremes import Case
+    from drgs.lab.extremes import ExtremeCase
     from drgs.lab.refusals import Refusal
     from drgs.settings import RenderSettings
 
-__all__ = ["BOUNDS", "Row", "Truth", "measure", "refused", "rows", "truth_of"]
+__all__ = ["BOUNDS", "StressRow", "Truth", "row_of", "refused", "rows", "truth_of"]
 
 BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fisher": 1e-4}
 """What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
@@ -40,7 +40,7 @@ _CRITERIA = ("logdet", "eig", "trace_cov")
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class StressRow:
     """One case on one traversal.
 
     Attributes:
@@ -67,7 +67,7 @@ class Row:
     seconds: float = 0.0
 
 
-def rows(case: Case | Refusal) -> Iterator[Row]:
+def rows(case: ExtremeCase | Refusal) -> Iterator[StressRow]:
     """Measure a case on each of its traversals; what raises becomes a row."""
     from drgs.lab.refusals import Refusal
 
@@ -76,15 +76,15 @@ def rows(case: Case | Refusal) -> Iterator[Row]:
         return
     truth = functools.cache(lambda: truth_of(case))  # takes longer than the renderer
     for traversal in case.traversals:
-        yield _caught(case.name, traversal, lambda traversal=traversal: measure(case, traversal, truth()))
+        yield _caught(case.name, traversal, lambda traversal=traversal: row_of(case, traversal, truth()))
 
 
-def _caught(name: str, traversal: str, make: Callable[[], Row]) -> Row:
+def _caught(name: str, traversal: str, make: Callable[[], StressRow]) -> StressRow:
     try:
         return make()
     except Exception as error:  # whatever a backend does wrong must not end the run
         text = " ".join(str(error).split()) or "no message"
-        return Row(name, traversal, remark=f"raised {type(error).__name__}: {text}")
+        return StressRow(name, traversal, remark=f"raised {type(error).__name__}: {text}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Truth:
     remark: str
 
 
-def truth_of(case: Case) -> Truth:
+def truth_of(case: ExtremeCase) -> Truth:
     """Build a case and ask the oracle."""
     from drgs import reference
     from drgs.lab.accuracy import FIELDS, Oracle, jacobian, squares
@@ -131,7 +131,7 @@ def truth_of(case: Case) -> Truth:
     return Truth(g, cam, oracle, view, squares(jacobian(g, out, features=True)), remark)
 
 
-def measure(case: Case, traversal: str, truth: Truth) -> Row:
+def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
     """One row: every error of a case on `tiles` or `bvh`, and what they amount to."""
     from drgs.lab.accuracy import compare
 
@@ -173,7 +173,7 @@ def measure(case: Case, traversal: str, truth: Truth) -> Row:
         f"{ties:.2g} % of pixels near a tie, left out" if ties else "",
         remark,
     )
-    return Row(
+    return StressRow(
         case.name,
         traversal,
         **values,
@@ -194,7 +194,7 @@ def _rounded(g: Gaussians, cam: Camera) -> dict[str, float]:
     return {name: max(bound, more.get(name, 0.0)) for name, bound in BOUNDS.items()}
 
 
-def _information(case: Case, settings: RenderSettings, truth: Truth) -> tuple[float | None, bool, str]:
+def _information(case: ExtremeCase, settings: RenderSettings, truth: Truth) -> tuple[float | None, bool, str]:
     """Error of the Fisher diagonal (and gains), whether all of it and of the blocks is finite, and a remark."""
     from drgs import fisher
     from drgs.lab.accuracy import entry_error
@@ -266,7 +266,7 @@ def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
     return dataclasses.replace(cam, K=K, width=w, height=h)
 
 
-def refused(case: Refusal) -> Row:
+def refused(case: Refusal) -> StressRow:
     """The row of input that must raise ValueError, or be warned about, with one line that says why."""
     start, count, message = time.perf_counter(), 0, ""
     for call, text in case.attempts():
@@ -283,6 +283,6 @@ def refused(case: Refusal) -> Row:
         message = next((x for x in told if text in x and "\n" not in x), "")
         if not message:
             got = told or f"{type(result).__name__} without a word"
-            return Row(case.name, "all", remark=f"attempt {count}: must be told {text!r}, got {got}")
+            return StressRow(case.name, "all", remark=f"attempt {count}: must be told {text!r}, got {got}")
     seconds = time.perf_counter() - start
-    return Row(case.name, "all", verdict="warns", remark=f"{count} attempts, e.g. {message}", seconds=seconds)
+    return StressRow(case.name, "all", verdict="warns", remark=f"{count} attempts, e.g. {message}", seconds=seconds)

@@ -24,8 +24,8 @@ from drgs.lab.tradeoff_rows import (
     TradeoffRow,
     Variant,
     WorstErrors,
-    one_line,
     rows_of,
+    why_skipped,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["clocked", "measure", "placed"]
 
 Tensors = dict[str, torch.Tensor]
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
 _AT_LEAST = 3  # but not before so many
@@ -204,7 +204,7 @@ class _Turn:
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
             if number % len(self.stage.cameras) not in self.stage.truth:
                 raise  # this is the truth
-            self.row.skipped = one_line(error)
+            self.row.skipped = why_skipped(error)
 
     def _take(self, number: int, timed: bool) -> None:
         """`take`, unless the row is skipped.
@@ -227,7 +227,7 @@ class _Turn:
             try:
                 parts, took["fisher"] = clocked(lambda: stage.information(camera, self.settings, share))
             except NotImplementedError as error:
-                self.row.notes["information"] = one_line(error)
+                self.row.notes["information"] = why_skipped(error)
         if number == 0:
             self.first = sum(took.values())
         if timed:
@@ -286,7 +286,7 @@ def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) ->
         try:
             found = _by_rays(row, stage, truth, chosen)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
-            row.skipped = one_line(error)
+            row.skipped = why_skipped(error)
             continue
         if row.by == "oracle":
             own = found
@@ -369,7 +369,7 @@ def _reduced(camera: Camera, share: float) -> Camera:
     return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
-def clocked(work: Callable[[], Result]) -> tuple[Result, float]:
+def clocked(work: Callable[[], _Result]) -> tuple[_Result, float]:
     """What it returns, and the seconds until it was computed."""
     import drjit as dr
 

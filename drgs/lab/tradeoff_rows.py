@@ -13,7 +13,7 @@ from drgs.settings import RenderSettings
 
 __all__ = [
     "CLOCKS",
-    "VARIANTS",
+    "TRADEOFF_VARIANTS",
     "WorstErrors",
     "FullTime",
     "GradientError",
@@ -24,7 +24,7 @@ __all__ = [
     "Measured",
     "TradeoffRow",
     "Variant",
-    "one_line",
+    "why_skipped",
     "rows_of",
 ]
 
@@ -76,7 +76,7 @@ def _rows(kind: str, preset: str, key: str, *values) -> list[Variant]:
 
 
 _EWA = {"response": "ewa", "order": "center"}
-VARIANTS = (
+TRADEOFF_VARIANTS = (
     Variant("precision"),
     Variant("precision", by="oracle"),
     # One switch away from exact.
@@ -120,7 +120,7 @@ def _short(value) -> str:
     return f"{value:g}" if value >= 0.01 else f"{value:.0e}".replace("e-0", "e-")
 
 
-def one_line(error: Exception) -> str:
+def why_skipped(error: Exception) -> str:
     """Why something was skipped."""
     return " ".join(str(error).split()).removeprefix("RenderSettings: ") or type(error).__name__
 
@@ -347,7 +347,7 @@ def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[Tradeof
         except (ValueError, NotImplementedError) as error:
             if not rows:
                 raise  # the truth itself
-            row.skipped = one_line(error)
+            row.skipped = why_skipped(error)
         else:
             same = seen.setdefault((row.settings, variant.share, variant.by == "oracle"), variant.name)
             if same != variant.name:

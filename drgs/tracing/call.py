@@ -19,7 +19,7 @@ from drgs.tracing import projection
 from drgs.tracing.composite import Composite, Compositor
 from drgs.tracing.field import Field
 from drgs.tracing.harmonics import sh_basis
-from drgs.tracing.pose import checked_pose, local_directions, shifted
+from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.tiles import TileTraversal
 
 __all__ = ["OF_VIEW", "Call", "Arguments", "Output", "numbers"]
@@ -124,7 +124,7 @@ class Call:
             self._set_rays(o - origin, d)
         else:
             self.shape = (camera.height, camera.width)
-            pose = checked_pose(camera)
+            pose = rigid_pose(camera)
             if settings.traversal == "bvh" or settings.sh_direction == "ray":
                 d = local_directions(camera) @ pose[:3, :3]
                 center = -(pose[:3, 3] @ pose[:3, :3]) - origin

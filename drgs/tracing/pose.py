@@ -9,10 +9,10 @@ import torch
 
 from drgs.cameras import Camera, rigid
 
-__all__ = ["checked_pose", "local_directions", "quaternion_product", "shifted", "turned", "twisted"]
+__all__ = ["rigid_pose", "local_directions", "quaternion_product", "shifted", "turned", "twisted"]
 
 
-def checked_pose(camera: Camera) -> torch.Tensor:
+def rigid_pose(camera: Camera) -> torch.Tensor:
     """(3, 4) of w2c in float64, as the rigid motion that it means; a copy of an array, which may be read-only."""
     w2c = camera.w2c
     if not isinstance(w2c, torch.Tensor):

@@ -9,7 +9,7 @@ from drgs.guards import memory
 from drgs.settings import EPS_ALPHA
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import OF_VIEW, Call, Output, numbers
-from drgs.tracing.pose import checked_pose, quaternion_product, shifted, turned, twisted
+from drgs.tracing.pose import quaternion_product, rigid_pose, shifted, turned, twisted
 
 __all__ = ["push_forward"]
 
@@ -67,7 +67,7 @@ def _column(call: Call, given: dict) -> dict:
         column["quats"] = column.get("quats", 0) + 0.5 * quaternion_product(given["rotations"].to(call.home), q)
     if "camera" in given:
         twist = given["camera"]
-        w2c = checked_pose(call.camera).detach()  # numbers: where the derivative is taken
+        w2c = rigid_pose(call.camera).detach()  # numbers: where the derivative is taken
         change = twisted(w2c, twist)
         # Numbers as well. The inputs are of a re-centered world: w2c there is that of x + origin.
         w2c_there = call.inputs["w2c"].cpu().detach().reshape(3, 4)
