@@ -21,13 +21,17 @@ the structure.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from drgs import runtime
+from drgs.settings import RenderSettings
 from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.projection import Projected
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.tiles import depth_order
 from drgs.tracing.walk import EMPTY, Part
 
@@ -50,10 +54,11 @@ class BvhTraversal:
 
     world = True
 
-    def __init__(self, lib, settings, projected: Projected, rays: int):
-        self.lib, self.settings, self.projected, self.rays, self.certificate = lib, settings, projected, rays, {}
+    def __init__(self, lib: Lib, settings: RenderSettings, projected: Projected, rays: int) -> None:
+        self.lib, self.settings, self.projected, self.rays = lib, settings, projected, rays
+        self.certificate: dict = {}
 
-    def start(self, model: HitModel, records, carried: list, basis: int) -> None:
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int) -> None:
         """Build the proxies, and find the order of the rays."""
         self.model, self.records, self.carried, self.basis = model, records, carried, basis
         lib, s = self.lib, self.settings
@@ -75,7 +80,7 @@ class BvhTraversal:
         ordered = s.order != "entry"
         return [Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, ordered, self.center_key)]
 
-    def _ray(self, i) -> Ray:
+    def _ray(self, i: UInt32) -> Ray:
         carried = [dr.gather(self.lib.Float, c, i) for c in self.carried]
         return Ray(carried=carried, basis=self.basis)
 
@@ -83,8 +88,8 @@ class BvhTraversal:
         """Of the view's ellipsoids, for rays with these origins."""
         if self.rays == 0:
             return None
-        projected, origins = self.projected, ray.carried[-6:-3]
-        corners = [f(x) for f in (dr.min, dr.max) for x in origins]
+        projected = self.projected
+        corners = [f(x) for f in (dr.min, dr.max) for x in ray.carried[-6:-3]]
         dr.eval(projected.ellipsoids, projected.alive, corners)
         ellipsoids = np.array([x.numpy() for x in projected.ellipsoids])
         alive = projected.alive.numpy() & np.ones(ellipsoids.shape[1], bool)
@@ -107,7 +112,16 @@ class Proxies:
         scale: Length of traced directions.
     """
 
-    def __init__(self, lib, scene, members, first, box, back, scale):
+    def __init__(
+        self,
+        lib: Lib,
+        scene: Any,
+        members: np.ndarray,
+        first: np.ndarray,
+        box: Sequence[np.ndarray] | np.ndarray,
+        back: float,
+        scale: float,
+    ) -> None:
         self.scene = scene
         self.listed = [dr.opaque(lib.UInt32, int(x)) for x in first[-2:]]
         self.members, self.first = lib.UInt32(members.astype(np.uint32)), lib.UInt32(first.astype(np.uint32))
@@ -116,7 +130,16 @@ class Proxies:
         self.size, self.back, self.scale = (dr.opaque(lib.Float, float(x)) for x in (size, back, scale))
 
 
-def proxy_scene(lib, means, quats, radii, alive, origins, nested=True, tails=False) -> Proxies | None:
+def proxy_scene(
+    lib: Lib,
+    means: np.ndarray,
+    quats: np.ndarray,
+    radii: np.ndarray,
+    alive: np.ndarray,
+    origins: np.ndarray,
+    nested: bool = True,
+    tails: bool = False,
+) -> Proxies | None:
     """Build the proxies, or None when nothing can be hit.
 
     Args:
@@ -179,7 +202,7 @@ def proxy_scene(lib, means, quats, radii, alive, origins, nested=True, tails=Fal
     return Proxies(lib, scene, members, first, box, back, proxies.min())
 
 
-def _groups(columns):
+def _groups(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of equal columns (k, N) side by side, and where each group starts, one more at the end."""
     order = np.argsort(columns[0], kind="stable")
     x = columns[0, order]
@@ -196,7 +219,7 @@ def _groups(columns):
     return np.concatenate([some[np.lexsort((some, group))], alone]), np.concatenate([[0], np.cumsum(sizes)])
 
 
-def _grown(radii, means, distance):
+def _grown(radii: np.ndarray, means: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Half axes of proxies that are traced over `distance`, or through the box of all of them where that is shorter."""
     widest = radii.max(0)
     size = np.linalg.norm((means + widest).max(1) - (means - widest).min(1))
@@ -207,7 +230,9 @@ def _grown(radii, means, distance):
     return np.maximum(radii * (1 + 1e-4 + graze), _THIN * reach)
 
 
-def _around(to, quats, radii, spread, distance, spheres):
+def _around(
+    to: np.ndarray, quats: np.ndarray, radii: np.ndarray, spread: float, distance: np.ndarray, spheres: bool
+) -> np.ndarray:
     """Indices of ellipsoids that a point within `spread` of 0 may be inside of; boxes, or spheres, stand for them."""
     widest = radii.max(0)
     if spheres:
@@ -228,18 +253,18 @@ def _around(to, quats, radii, spread, distance, spheres):
 class _ProxyStream:
     """Listed Gaussians, then the proxies along rays in the order of their entry points; a `Stream`."""
 
-    def __init__(self, lib, proxies: Proxies | None, ray: Ray, bounded: bool):
+    def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, bounded: bool) -> None:
         self.lib, self.proxies, self.ray, self.bounded = lib, proxies, ray, bounded
         self.mi = runtime.mitsuba()
         self.d = ray.carried[-3:]
         if proxies is not None:
             # Parameters along a ray count from where it starts, so that they are small and their rounding is.
-            self.start = self._enter(ray.carried[-6:-3])
+            self.start = self._enter(proxies, ray.carried[-6:-3])
             self.o = [dr.fma(d, self.start, x) for x, d in zip(ray.carried[-6:-3], self.d, strict=True)]
             size = dr.maximum(dr.maximum(abs(self.o[0]), abs(self.o[1])), abs(self.o[2]))
             self.step = _STEP * dr.maximum(size, proxies.scale)
 
-    def begin(self):
+    def begin(self) -> tuple:
         """(candidates so far, parameter, step, primitive, next member, end of members, something left)."""
         lib, p = self.lib, self.proxies
         width = dr.width(self.d)
@@ -250,10 +275,9 @@ class _ProxyStream:
         at = dr.zeros(lib.Float, width)
         return lib.UInt32(0), at, lib.Float(self.step), none, *(lib.UInt32(x) for x in p.listed), some
 
-    def _enter(self, origin):
+    def _enter(self, p: Proxies, origin: list[Float]) -> Float:
         """Where a ray starts: at the box of all primitives, but not before it was moved back."""
-        lib, p = self.lib, self.proxies
-        near = lib.Float(-p.back)
+        near = self.lib.Float(-p.back)
         for o, d, low, high in zip(origin, self.d, p.low, p.high, strict=True):
             along = dr.minimum((low - o) / d, (high - o) / d)
             along -= 1e-6 * (abs(along) + p.size)  # earlier by more than rounding
@@ -261,20 +285,20 @@ class _ProxyStream:
             near = dr.maximum(near, dr.select(abs(along) < 1e30, along, near))
         return near
 
-    def more(self, s):
+    def more(self, s: tuple) -> Mask:
         """Whether the ray goes on."""
         return s[6] != 0
 
-    def place(self, s):
+    def place(self, s: tuple) -> UInt32:
         """The number of candidates before."""
         return s[0]
 
-    def of(self, lanes) -> _ProxyStream:
+    def of(self, lanes: UInt32) -> _ProxyStream:
         """The same for some of the rays."""
         carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]
         return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.bounded)
 
-    def next(self, s, active):
+    def next(self, s: tuple, active: Mask) -> tuple[UInt32, Mask, Float, tuple]:
         """One member of the current primitive, or the next primitive (whose members follow)."""
         lib, p, mi = self.lib, self.proxies, self.mi
         if p is None:
@@ -313,7 +337,7 @@ class _ProxyStream:
         return index, valid, bound, (count + 1, at, step, last, member, end, some)
 
 
-def _coherent(lib, rays):
+def _coherent(lib: Lib, rays: list[Float]) -> UInt32:
     """Order of rays (o, d) in which neighbors are alike: along a Morton curve of directions and origins."""
     count = dr.width(rays)
     if count <= 16:
@@ -333,7 +357,7 @@ def _coherent(lib, rays):
     return order
 
 
-def _warn_of_rounding(ellipsoids, alive, origins):
+def _warn_of_rounding(ellipsoids: np.ndarray, alive: np.ndarray, origins: np.ndarray) -> None:
     """Tell of Gaussians too thin, in two of their axes, for hits in float32 world space."""
     to = ellipsoids[:3] - origins.mean(1, keepdims=True)
     a, b, c = ellipsoids[7:]

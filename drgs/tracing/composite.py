@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import drjit as dr
 
+from drgs.settings import RenderSettings
 from drgs.tracing.derivatives import Adjoint, Tangent
 from drgs.tracing.kernels import Channels, HitModel, Primal
-from drgs.tracing.protocols import Traversal
+from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.walk import Part
 
@@ -38,15 +39,20 @@ class Compositor:
         finals: After `forward`: per traversal, (part, final states) pairs.
     """
 
-    def __init__(self, lib, settings, traversal: Traversal, want: frozenset, width: int = 0, basis: int = 0):
+    def __init__(
+        self, lib: Lib, settings: RenderSettings, traversal: Traversal, want: frozenset, width: int = 0, basis: int = 0
+    ) -> None:
         self.lib, self.settings, self.traversal, self.want = lib, settings, traversal, want
         self.width, self.basis, self.rays = width, basis, traversal.rays
         self.model = HitModel(lib, settings, traversal.world)
-        self.certificate, self.extra = {}, {}
+        self.certificate: dict = {}
+        self.extra: dict = {}
 
     # -- forward -----------------------------------------------------------------------------------------------------
 
-    def forward(self, record: list, sh, features, carried: list, keep: bool) -> dict:
+    def forward(
+        self, record: list[Float], sh: Float | None, features: Float | None, carried: list[Float], keep: bool
+    ) -> dict:
         """Flat images rgb, alpha, and where there are any depth and features.
 
         Args:
@@ -95,7 +101,7 @@ class Compositor:
         dr.eval(out, self.extra)
         return out
 
-    def _channels(self, first=0, channels=0, color=False) -> Channels:
+    def _channels(self, first: int = 0, channels: int = 0, color: bool = False) -> Channels:
         return Channels(self.buffers, self.width, first, channels, color)
 
     def _images(self) -> dict:
@@ -143,7 +149,7 @@ class Compositor:
         self.certificate["redone"] = dr.width(again)
         return part.listed(again)
 
-    def _write(self, out, channels, part, states):
+    def _write(self, out: dict, channels: Channels, part: Part, states: list[dict]) -> None:
         """Scatter the states of a part into the images."""
         lib = self.lib
         for st, at, inside in zip(states, part.flat, part.inside, strict=True):
@@ -189,7 +195,7 @@ class Compositor:
         ]
         return grads | ({"carried": carried} if carried else {})
 
-    def _cotangent(self, g: dict, channels: Channels, at, inside) -> dict:
+    def _cotangent(self, g: dict, channels: Channels, at: UInt32, inside: Mask) -> dict:
         """What `Adjoint` needs of the images' cotangents at a ray's pixel."""
         lib = self.lib
         gathered = lambda name, i: dr.gather(lib.Float, g[name], i, inside)  # noqa: E731
@@ -206,7 +212,7 @@ class Compositor:
 
     # -- tangents ----------------------------------------------------------------------------------------------------
 
-    def tangents(self, buffers: list[dict], carried: list[list]) -> list[dict]:
+    def tangents(self, buffers: list[dict], carried: list[list[Float]]) -> list[dict]:
         """Images of K tangents: dicts like the output of `forward`.
 
         Args:
@@ -237,7 +243,7 @@ class Compositor:
                         self._write_tangent(out, channels, at, inside, d)
         return results
 
-    def _write_tangent(self, out, channels, at, inside, d):
+    def _write_tangent(self, out: dict, channels: Channels, at: UInt32, inside: Mask, d: dict) -> None:
         """Scatter one tangent of a part's states into its images."""
         if channels.color:
             for c in range(3):
@@ -253,17 +259,25 @@ class Compositor:
 class Composite(dr.CustomOp):
     """`dr.custom(Composite, compositor, record, sh, features, carried, keep)`: `Compositor.forward`, with AD."""
 
-    def eval(self, compositor, record, sh, features, carried, keep):
+    def eval(
+        self,
+        compositor: Compositor,
+        record: list[Float],
+        sh: Float | None,
+        features: Float | None,
+        carried: list[Float],
+        keep: bool,
+    ) -> dict:
         """Dr.Jit's name for it."""
         self.compositor = compositor
         return compositor.forward(record, sh, features, carried, keep)
 
-    def backward(self):
+    def backward(self) -> None:
         """Dr.Jit reverse mode."""
         for name, x in self.compositor.adjoint(self.grad_out()).items():
             self.set_grad_in(name, x)
 
-    def forward(self):
+    def forward(self) -> None:
         """Dr.Jit forward mode: one tangent."""
         c = self.compositor
         tangent = {name: self.grad_in(name) for name in c.buffers}

@@ -19,17 +19,30 @@ replays the very same float32 weights: the difference is then exact to 1e-16 of 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import drjit as dr
 
 from drgs.tracing.harmonics import sh_color
-from drgs.tracing.kernels import Channels, HitModel, Primal
+from drgs.tracing.kernels import Channels, HitModel, Primal, Ray
+from drgs.tracing.protocols import Float, Mask, UInt32
 from drgs.tracing.records import load_packed, packed_size
 
 __all__ = ["Adjoint", "Tangent", "if_any_hit"]
 
+Gradient = tuple[dict[int, Float], list[Float]]  # of one hit: by entry of its record, and by what the ray carries
 
-def if_any_hit(model, channels, index, rays, states, places, active, take):
+
+def if_any_hit(
+    model: HitModel,
+    channels: Channels,
+    index: UInt32,
+    rays: list[Ray],
+    states: list[dict],
+    places: list[list],
+    active: Mask,
+    take: Callable,
+) -> list[dict]:
     """`take(index, rays, states, places, active)` where a ray of the packet meets the Gaussian, else the same states.
 
     Most Gaussians of a tile's list miss most packets of its rays, and the branch is cheaper than what it skips.
@@ -59,12 +72,19 @@ class Adjoint:
     """
 
     def __init__(
-        self, model: HitModel, channels: Channels, grads: dict, finals: list, cotangents: list, depth: bool, mode
-    ):
+        self,
+        model: HitModel,
+        channels: Channels,
+        grads: dict,
+        finals: list,
+        cotangents: list,
+        depth: bool,
+        mode: dr.ReduceMode,
+    ) -> None:
         self.m, self.channels, self.grads, self.mode = model, channels, grads, mode
         self.finals, self.cotangents, self.slots = finals, cotangents, set(model.slots(depth))
 
-    def init(self, k, alive, nowhere) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
         """State of shared ray k; `carried` collects the gradient of what the ray itself carries."""
         lib, final, g = self.m.lib, self.finals[k], self.cotangents[k]
         D = lib.Float64
@@ -83,11 +103,11 @@ class Adjoint:
             "carried": [lib.Float(0) for _ in range(g["carried"])],
         }
 
-    def shade(self, index, rays, states, places, active):
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Back-propagate through Gaussian `index` what the primal pass composited of it."""
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
-    def _take(self, index, rays, states, places, active):
+    def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit of each ray: its local derivative by AD, weighted with dL/da and with w times the cotangents."""
         m, lib, out = self.m, self.m.lib, []
         D = lib.Float64
@@ -152,11 +172,13 @@ class Tangent:
         carried: Per shared ray and tangent, the tangent of what the ray carries.
     """
 
-    def __init__(self, primal: Primal, records, slots: list[int], tangents: list[dict], carried: list[list]):
+    def __init__(
+        self, primal: Primal, records: Float, slots: list[int], tangents: list[dict], carried: list[list]
+    ) -> None:
         self.primal, self.m, self.channels = primal, primal.m, primal.channels
         self.records, self.slots, self.tangents, self.carried = records, slots, tangents, carried
 
-    def init(self, k, alive, nowhere) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
         """State of a ray: the primal's, and `d` with a tangent of it for each column."""
         lib, state = self.m.lib, self.primal.init(k, alive, nowhere)
         names = ["T", *(["depth"] if "depth" in state else [])]  # sum w is 1 - T
@@ -166,7 +188,7 @@ class Tangent:
         ]
         return state
 
-    def shade(self, index, rays, states, places, active):
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """As Primal.shade, with the tangents."""
         m, lib = self.m, self.m.lib
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
@@ -203,7 +225,7 @@ class Tangent:
                 new["d"].append(fresh)
         return out
 
-    def _load(self, index, ray, active) -> list[dict]:
+    def _load(self, index: UInt32, ray: Ray, active: Mask) -> list[dict]:
         """Tangents of what a hit reads, by column."""
         lib, count = self.m.lib, len(self.tangents)
         flat = load_packed(lib, self.records, packed_size(len(self.slots) * count), index, active)
@@ -212,7 +234,7 @@ class Tangent:
             speed["record"] = {slot: flat[j * count + k] for j, slot in enumerate(self.slots)}
         return speeds
 
-    def _slopes(self, record, ray, live, which: int):
+    def _slopes(self, record: list[Float], ray: Ray, live: Mask, which: int) -> Gradient:
         """Gradient of a hit's opacity (0) or depth (1): {slot: value}, and of what the ray carries."""
         # A graph of this hit only, from leaves of its own: the walk has suspended AD.
         with dr.resume_grad():
@@ -222,7 +244,7 @@ class Tangent:
             dr.backward_from(self.m.hit(record, ray, live)[which])
             return {k: dr.grad(record[k]) for k in self.slots}, [dr.grad(x) for x in ray.carried]
 
-    def _moved_values(self, loaded, speed, ray, carried) -> list:
+    def _moved_values(self, loaded: dict, speed: dict, ray: Ray, carried: list[Float]) -> list[Float]:
         """Tangents of the channels of a hit."""
         if not (self.channels.color and ray.basis):
             color = [speed["record"][self.m.rgb + c] for c in range(3)] if self.channels.color else []
@@ -239,7 +261,7 @@ class Tangent:
             return [dr.grad(x) for x in color] + speed.get("features", [])
 
 
-def _along(slopes, record, carried):
+def _along(slopes: Gradient, record: dict, carried: list[Float]) -> Float:
     """A gradient times a tangent."""
     of_record, of_ray = slopes
     return sum(x * record[k] for k, x in of_record.items()) + sum(x * v for x, v in zip(of_ray, carried, strict=True))

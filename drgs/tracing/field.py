@@ -16,6 +16,7 @@ import drjit as dr
 import torch
 
 from drgs.tracing.bridge import to_drjit
+from drgs.tracing.protocols import Lib
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import DeformableScene
@@ -32,10 +33,12 @@ class Field:
         shift: (3,) that is taken from the means: the call's own origin; None for no shift.
     """
 
-    def __init__(self, scene: DeformableScene, time: float | None, names: Iterable[str], shift=None):
+    def __init__(
+        self, scene: DeformableScene, time: float | None, names: Iterable[str], shift: torch.Tensor | None = None
+    ) -> None:
         self.scene, self.time, self.names, self.shift = scene, time, tuple(names), shift
 
-    def __call__(self, lib, parameters: dict) -> dict:
+    def __call__(self, lib: Lib, parameters: dict) -> dict:
         """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes."""
         return dr.custom(_Deform, self, lib, parameters)
 
@@ -50,7 +53,7 @@ class Field:
 class _Deform(dr.CustomOp):
     """`dr.custom(_Deform, field, lib, parameters)`; its derivatives evaluate the field once more in torch."""
 
-    def eval(self, field, lib, parameters):
+    def eval(self, field: Field, lib: Lib, parameters: dict) -> dict:
         """Dr.Jit's name for it."""
         self.field, self.lib = field, lib
         # Clones, as Dr.Jit and torch would share the memory.
@@ -58,14 +61,14 @@ class _Deform(dr.CustomOp):
         with torch.no_grad():  # what torch would record is asked for in `forward` and `backward`
             return self._back(field.values(self.given))
 
-    def forward(self):
+    def forward(self) -> None:
         """Dr.Jit forward mode: torch's, along the parameters' tangents."""
         tangents = {name: x.torch() for name, x in self.grad_in("parameters").items()}
         self.set_grad_out(self._back(torch.func.jvp(self.field.values, (self.given,), (tangents,))[1]))
 
-    def backward(self):
+    def backward(self) -> None:
         """Dr.Jit reverse mode: torch's, from the fields' cotangents."""
-        _, pull = torch.func.vjp(self.field.values, self.given)
+        pull = torch.func.vjp(self.field.values, self.given)[1]
         slopes = pull({name: x.torch() for name, x in self.grad_out().items()})[0]
         self.set_grad_in("parameters", self._back(slopes))
 

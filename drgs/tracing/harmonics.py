@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
+
+from drgs.tracing.protocols import Float
 
 __all__ = ["CONSTANT", "sh_basis", "sh_color"]
 
@@ -20,14 +24,15 @@ _CUBIC = (
 )
 
 
-def sh_basis(direction, coefficients: int) -> list:
+def sh_basis(direction: list[Float], coefficients: int) -> list[Float]:
     """The first 1, 4, 9 or 16 real spherical harmonics at a unit `direction` (three floats)."""
     x, y, z = direction
     basis = [type(x)(CONSTANT)]
     if coefficients > 1:
         basis += [-_LINEAR * y, _LINEAR * z, -_LINEAR * x]
     if coefficients > 4:
-        xx, yy, zz, c = x * x, y * y, z * z, _QUADRATIC
+        xx, yy, zz = x * x, y * y, z * z
+        c: tuple[float, ...] = _QUADRATIC
         basis += [c[0] * x * y, c[1] * y * z, c[2] * (2 * zz - xx - yy), c[3] * x * z, c[4] * (xx - yy)]
     if coefficients > 9:
         c = _CUBIC
@@ -43,7 +48,7 @@ def sh_basis(direction, coefficients: int) -> list:
     return basis
 
 
-def sh_color(basis: list, coefficient) -> list:
+def sh_color(basis: list[Float], coefficient: Callable[[int, int], Float]) -> list[Float]:
     """RGB = max(0.5 + sum_k basis_k coefficient(k, channel), 0); the gradient is 0 where it is clamped."""
     rgb = []
     for channel in range(3):

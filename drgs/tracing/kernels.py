@@ -15,8 +15,10 @@ import dataclasses
 
 import drjit as dr
 
+from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
 from drgs.tracing.harmonics import sh_color
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.records import RECORD
 from drgs.tracing.responses import RESPONSES
 
@@ -34,10 +36,10 @@ class Ray:
             ray.
     """
 
-    x: object = None
-    y: object = None
-    length: object = None
-    carried: list = dataclasses.field(default_factory=list)
+    x: Float = None
+    y: Float = None
+    length: Float = None
+    carried: list[Float] = dataclasses.field(default_factory=list)
     basis: int = 0
 
 
@@ -49,7 +51,7 @@ class HitModel:
         world: Records are world records.
     """
 
-    def __init__(self, lib, settings, world: bool = False):
+    def __init__(self, lib: Lib, settings: RenderSettings, world: bool = False) -> None:
         self.lib, self.s, self.world, self.response = lib, settings, world, RESPONSES[settings.response]
         # Opaque: another value is no other kernel.
         self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
@@ -65,7 +67,7 @@ class HitModel:
         """Entries of a record that carry a derivative; `depth` tells whether t* has a cotangent or tangent."""
         return self.response.slots(self.world, depth)
 
-    def hit(self, record, ray, active):
+    def hit(self, record: list[Float], ray: Ray, active: Mask) -> tuple[Float, Float, Mask]:
         """Opacity, t* (for `ewa` the Gaussian's depth) and validity of a hit; the first two carry derivatives."""
         rho2, key, u = self.response.along(record, ray, self.world)
         # Whether there is a hit has no derivative: cut-offs compare detached values.
@@ -112,7 +114,9 @@ class Channels:
             table["features"] = (self.width, self.first, self.channels)
         return table
 
-    def load(self, lib, index, ray, active, buffers=None, only=None) -> dict:
+    def load(
+        self, lib: Lib, index: UInt32, ray: Ray, active: Mask, buffers: dict | None = None, only: str | None = None
+    ) -> dict:
         """What a hit of Gaussian `index` reads, name -> list of floats; from other buffers, or `only` of one name."""
         buffers, loaded = buffers or self.buffers, {}
         for name, (stride, offset, count) in self.layout(ray).items():
@@ -126,7 +130,7 @@ class Channels:
                 loaded[name] = [dr.gather(lib.Float, buffers[name], base + k, active) for k in range(count)]
         return loaded
 
-    def values(self, model, loaded, ray) -> list:
+    def values(self, model: HitModel, loaded: dict, ray: Ray) -> list[Float]:
         """The channels of a hit: RGB, then the slice of features."""
         values = []
         if self.color and ray.basis:
@@ -145,10 +149,10 @@ class Primal:
         visibility: Float of width N that the weights are added to, or None.
     """
 
-    def __init__(self, model: HitModel, channels: Channels, want: frozenset, visibility=None):
+    def __init__(self, model: HitModel, channels: Channels, want: frozenset, visibility: Float | None = None) -> None:
         self.m, self.channels, self.want, self.visibility = model, channels, want, visibility
 
-    def init(self, k, alive, nowhere) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
         """State of a ray; the same for each shared one."""
         lib = self.m.lib
         Sum = lib.Float64 if "replay" in self.want else lib.Float
@@ -167,7 +171,7 @@ class Primal:
             state["place"] = [type(x)(x) for x in nowhere]
         return state
 
-    def shade(self, index, rays, states, places, active):
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Composite Gaussian `index` onto each of `rays`; places[k] is where the hit stands in the order."""
         m, out = self.m, []
         any_active = active & (sum((s["alive"] for s in states), m.lib.UInt32(0)) != 0)
@@ -203,7 +207,7 @@ class Primal:
         return out
 
 
-def _add(w, value, total):
+def _add(w: Float, value: Float, total: Float) -> Float:
     """total + w value in the precision of `total`."""
     Sum = type(total)
     return dr.fma(Sum(w), Sum(value), total)

@@ -55,13 +55,13 @@ def turned(omega: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     return torch.cross(omega.to(x.device).expand_as(x), x, dim=1)
 
 
-def quaternion_product(w, q):
+def quaternion_product(w: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     """(0, w) * q for (N, 3) and (N, 4) wxyz."""
     s, v = q[:, :1], q[:, 1:]
     return torch.cat([-(w * v).sum(1, keepdim=True), s * w + torch.cross(w, v, dim=1)], 1)
 
 
-def _cross_matrix(w):
+def _cross_matrix(w: torch.Tensor) -> torch.Tensor:
     zero = w.new_zeros(())
     return torch.stack(
         [torch.stack([zero, -w[2], w[1]]), torch.stack([w[2], zero, -w[0]]), torch.stack([-w[1], w[0], zero])]

@@ -8,12 +8,13 @@ Notation: W = S^-1 R^T takes a world vector into the local frame of a Gaussian; 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 
 from drgs.settings import RenderSettings
 from drgs.tracing.harmonics import sh_basis, sh_color
+from drgs.tracing.protocols import Float, Lib, Mask
 from drgs.tracing.records import ALPHA, dot
 from drgs.tracing.responses import RESPONSES
 
@@ -35,9 +36,22 @@ class Projected:
             plane (u, v) of o' x d' and the axes (f1, f2, f3) that directions are stored along.
     """
 
-    def __init__(self, record, key, bounds, lower, alive, ellipsoids=None, frame=None):
-        self.record, self.key, self.bounds, self.lower, self.alive = record, key, bounds, lower, alive
-        self.ellipsoids, self.frame = ellipsoids, frame
+    def __init__(
+        self,
+        record: list[Float],
+        key: Float,
+        bounds: list[Float] | None,
+        lower: Float,
+        alive: Mask,
+        ellipsoids: list[Float] | None = None,
+        frame: tuple | None = None,
+    ) -> None:
+        self.record, self.key, self.alive = record, key, alive
+        # Any: None where a view has no such thing, and then nobody reads it.
+        self.bounds: list[Float] | Any = bounds
+        self.lower: Float = lower
+        self.ellipsoids: list[Float] | Any = ellipsoids
+        self.frame: tuple | Any = frame
 
 
 class Screen(NamedTuple):
@@ -49,24 +63,24 @@ class Screen(NamedTuple):
         x, y: (N,) each Gaussian's anchor: the pixel center that its record is expanded around.
     """
 
-    pinhole: tuple
+    pinhole: list[Float]
     width: int
     height: int
-    x: object
-    y: object
+    x: Float
+    y: Float
 
 
 class Activated:
     """Activated parameters of every Gaussian in float64, and their camera-frame geometry."""
 
-    def __init__(self, lib, p, w2c, settings: RenderSettings, count: int):
+    def __init__(self, lib: Lib, p: dict, w2c: Float, settings: RenderSettings, count: int) -> None:
         Float64, UInt32 = lib.Float64, lib.UInt32
         self.lib, self.settings, self.response = lib, settings, RESPONSES[settings.response]
         i = dr.arange(UInt32, count)
         # Each Gaussian gathers its own entries once, so the adjoint needs no atomics.
         permute = dr.ReduceMode.Permute
 
-        def column(name, k, stride):
+        def column(name: str, k: int, stride: int) -> Float:
             return dr.gather(type(p[name]), p[name], i * stride + k, mode=permute)
 
         self.column = column
@@ -101,7 +115,7 @@ class Activated:
         ]
         self.from_local = [[sum(v[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
 
-    def _extent(self, count: int):
+    def _extent(self, count: int) -> Float:
         """Cut-off radius in standard deviations; a constant of the derivative, as every cut-off is."""
         if self.settings.extent is not None:
             return dr.opaque(self.lib.Float64, self.settings.extent)
@@ -109,7 +123,7 @@ class Activated:
         # All N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5.
         return dr.sqrt(2 * dr.log(dr.maximum(opacity * (count / 1e-5), 1)))
 
-    def listed_extent(self):
+    def listed_extent(self) -> Float:
         """Radius beyond which no hit counts: the extent, or less where alpha_min cuts earlier; detached, a cut-off."""
         extent = dr.detach(self.extent)  # a cut-off
         if self.settings.alpha_min > 0 and self.response.at_most_alpha:
@@ -118,11 +132,11 @@ class Activated:
             extent = dr.minimum(extent, dr.sqrt(2 * dr.log(ratio)) * 1.001 + 1e-3)
         return extent
 
-    def distance(self):
+    def distance(self) -> Float:
         """Of the means from the camera."""
         return dr.sqrt(dot(self.center, self.center))
 
-    def rgb(self, coefficients: int) -> list:
+    def rgb(self, coefficients: int) -> list[Float]:
         """Colors towards the mean; the derivative of the direction is kept."""
         if not coefficients:
             return [self.lib.Float(0)] * 3
@@ -137,7 +151,16 @@ class Activated:
         return sh_color(basis, lambda k, c: Float(self.column("sh", k * 3 + c, 3 * coefficients)))
 
 
-def project_screen(lib, p, w2c, pinhole, settings: RenderSettings, width: int, height: int, coefficients: int):
+def project_screen(
+    lib: Lib,
+    p: dict,
+    w2c: Float,
+    pinhole: list[Float],
+    settings: RenderSettings,
+    width: int,
+    height: int,
+    coefficients: int,
+) -> Projected:
     """Screen records of a pinhole camera.
 
     Args:
@@ -180,7 +203,7 @@ def project_screen(lib, p, w2c, pinhole, settings: RenderSettings, width: int, h
     return Projected(record, Float(key), [Float(b) for b in bounds], Float(lower), alive, frame=frame)
 
 
-def project_world(lib, p, w2c, settings: RenderSettings, coefficients: int):
+def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coefficients: int) -> Projected:
     """World records for arbitrary rays: mean, W = S^-1 R^T, opacity, extent^2, color.
 
     Args and Returns: as `project_screen`; `bounds` is None.

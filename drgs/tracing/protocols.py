@@ -3,19 +3,30 @@
 A traversal hands out parts (walk.py). A part walks its rays along a stream of candidate Gaussians and calls a kernel
 at each hit. Kernels composite (kernels.py) or differentiate what was composited (derivatives.py, jacobian.py); the one
 of the Jacobian passes its rows on to a sink. Where a *lane* is spoken of, it is one of Dr.Jit's: a lane carries one or
-four rays. `Response` (responses/) is what all of them evaluate.
+four rays. `Response` (responses/) is what all of them evaluate. The names
+of arrays in signatures are defined here, too.
 """
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
-    from drgs.tracing.kernels import HitModel
+    from drgs.tracing.kernels import HitModel, Ray
     from drgs.tracing.projection import Projected
     from drgs.tracing.walk import Part
 
-__all__ = ["Kernel", "Sink", "Stream", "Traversal"]
+__all__ = ["Float", "Int32", "Kernel", "Lib", "Mask", "Sink", "Stream", "Traversal", "UInt32", "UInt64"]
+
+Lib = ModuleType  # the module of Dr.Jit's array types of the backend (runtime.dr_types)
+
+# For signatures: what an array holds. Its class depends on the backend, so type checkers see `Any`.
+Float = Any  # Float, or Float64 where a Gaussian is projected
+UInt32 = Any
+UInt64 = Any
+Int32 = Any
+Mask = Any  # Bool
 
 
 class Traversal(Protocol):
@@ -33,7 +44,7 @@ class Traversal(Protocol):
     rays: int
     certificate: dict
 
-    def start(self, model: HitModel, records, carried: list, basis: int) -> None:
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int) -> None:
         """Build lists or proxies from the record buffer; `carried`: per-ray floats, `basis` of them an SH basis."""
 
     def parts(self, share: int) -> list[Part]:
@@ -46,26 +57,26 @@ class Stream(Protocol):
     def begin(self) -> Any:
         """State before the first candidate."""
 
-    def more(self, state) -> Any:
+    def more(self, state: Any) -> Mask:
         """Mask of lanes that have a candidate left."""
 
-    def place(self, state) -> Any:
+    def place(self, state: Any) -> UInt32:
         """UInt32, different for each candidate of a lane: where it stands in the stream."""
 
-    def next(self, state, active) -> tuple:
+    def next(self, state: Any, active: Mask) -> tuple[UInt32, Mask, Float, Any]:
         """(Gaussian, whether there is one, lower bound of its and all later order keys, new state)."""
 
-    def of(self, lanes) -> Stream:
+    def of(self, lanes: UInt32) -> Stream:
         """The same for some of the lanes."""
 
 
 class Kernel(Protocol):
     """What happens at a hit; its states, one dictionary a ray, are part of that of Dr.Jit's loop."""
 
-    def init(self, k: int, alive, nowhere: list) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
         """State of shared ray k, with `alive` (UInt32); `nowhere`: the place of no hit."""
 
-    def shade(self, index, rays: list, states: list[dict], places: list[list], active) -> list[dict]:
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Meet Gaussian `index` on each ray, at places[k] in its order; new states, keys in the same order."""
 
 
@@ -81,5 +92,5 @@ class Sink(Protocol):
     def init(self) -> dict:
         """What is kept per ray."""
 
-    def take(self, lib, index, hits, rows: list, states: list[dict]) -> list[dict]:
+    def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list, states: list[dict]) -> list[dict]:
         """Add the rows of Gaussian `index`, one a shared ray; `hits`: lanes that have any."""

@@ -6,7 +6,11 @@ traversal `tiles`) or of the world (any ray, `bvh`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
+
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 
 __all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "pack", "pack_records", "packed_size"]
 
@@ -17,22 +21,22 @@ AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPH
 W_MEAN, W_ROWS, W_ALPHA, W_EXT2, W_RGB = 0, 3, 12, 13, 14
 
 
-def dot(a, b):
+def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
     """Of two lists of three."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a, b):
+def cross(a: Sequence[Float], b: Sequence[Float]) -> list[Float]:
     """Of two lists of three."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def count_of(record: list) -> int:
+def count_of(record: list[Float]) -> int:
     """Number of Gaussians of a list of records (constants have width 1)."""
     return max(dr.width(x) for x in record)
 
 
-def pack_records(lib, record: list):
+def pack_records(lib: Lib, record: list[Float]) -> Float:
     """Interleave the entries of records, (N,) each, into one buffer of stride RECORD."""
     count = count_of(record)
     i = dr.arange(lib.UInt32, count)
@@ -48,7 +52,7 @@ def packed_size(count: int) -> int:
     return -(-count // 16) * 16
 
 
-def pack(lib, columns: list, count: int):
+def pack(lib: Lib, columns: list[Float], count: int) -> Float:
     """Interleave per-Gaussian floats: `packed_size(len(columns))` of each of `count` Gaussians together."""
     size, i, zero = packed_size(len(columns)), dr.arange(lib.UInt32, count), dr.zeros(lib.Float, count)
     buffer = dr.zeros(lib.Float, count * size)
@@ -58,7 +62,7 @@ def pack(lib, columns: list, count: int):
     return buffer
 
 
-def load_packed(lib, buffer, size: int, index, active) -> list:
+def load_packed(lib: Lib, buffer: Float, size: int, index: UInt32, active: Mask) -> list[Float]:
     """The `size` floats of a Gaussian from a buffer of `pack`."""
     values = []
     for k in range(size // 16):

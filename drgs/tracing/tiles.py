@@ -13,9 +13,11 @@ import drjit as dr
 
 from drgs import runtime
 from drgs.guards import memory
+from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
 from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.projection import Projected
+from drgs.tracing.protocols import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.responses import RESPONSES
 from drgs.tracing.walk import ListStream, Part
 
@@ -36,13 +38,16 @@ class TileTraversal:
 
     world = False
 
-    def __init__(self, lib, settings, projected: Projected, pinhole, width: int, height: int):
+    def __init__(
+        self, lib: Lib, settings: RenderSettings, projected: Projected, pinhole: list[Float], width: int, height: int
+    ) -> None:
         self.lib, self.settings, self.projected = lib, settings, projected
-        self.width, self.height, self.rays, self.certificate = width, height, width * height, {}
+        self.width, self.height, self.rays = width, height, width * height
+        self.certificate: dict = {}
         self.pinhole = [lib.Float(v) for v in pinhole]
         dr.make_opaque(*self.pinhole)
 
-    def start(self, model: HitModel, records, carried: list, basis: int) -> None:
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int) -> None:
         """Build the lists."""
         self.model, self.records, self.carried, self.basis = model, records, carried, basis
         self.lists = build(self.lib, self.projected, self.settings, self.width, self.height, records)
@@ -74,7 +79,7 @@ class TileTraversal:
         stream = ListStream(lib, lists.index, start, end, lists.ahead)
         return [Part(lib, self.model, self.records, rays, flat, inside, stream, self.settings.order == "ray")]
 
-    def _ray(self, x, y, flat, inside) -> Ray:
+    def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
         fx, skew, cx, fy, cy = self.pinhole
         v = (y - cy) / fy
@@ -96,16 +101,16 @@ class Lists:
         pairs: Number of entries.
     """
 
-    index: object
-    start: object
-    end: object
-    ahead: object
+    index: UInt32
+    start: UInt32
+    end: UInt32
+    ahead: Float | None
     columns: int
     rows: int
     pairs: int
 
 
-def build(lib, projected, settings, width: int, height: int, record) -> Lists:
+def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, height: int, record: Float) -> Lists:
     """List the Gaussians of each tile.
 
     Args:
@@ -182,7 +187,7 @@ def build(lib, projected, settings, width: int, height: int, record) -> Lists:
     return Lists(index, start, end, ahead, columns, rows, pairs)
 
 
-def depth_order(lib, key, gaussian):
+def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
     """Gaussians by (key, index)."""
     # IEEE bits order like unsigned integers once negative floats are flipped.
     bits = dr.reinterpret_array(lib.UInt32, key)
@@ -199,7 +204,7 @@ class _Tiles:
         loaded: The first entries of each lane's record.
     """
 
-    def __init__(self, lib, settings, loaded: list):
+    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float]) -> None:
         self.lib, self.r, self.response = lib, loaded, RESPONSES[settings.response]
         self.limit = loaded[layout.EXT2]
         if settings.alpha_min > 0:
@@ -208,27 +213,39 @@ class _Tiles:
             # What float32 rounds must not lose a hit: 1e-4 is a hundred times as much.
             self.limit = dr.minimum(self.limit, needed + 1e-4 * abs(needed) + 1e-4)
 
-    def center(self, x, y):
+    def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
         """Of tile (x, y), from the anchor."""
         r = self.r
         return (self.lib.Float(x) + 0.5) * TILE - r[layout.AX], (self.lib.Float(y) + 0.5) * TILE - r[layout.AY]
 
-    def depth(self, dx, dy):
+    def depth(self, dx: Float, dy: Float) -> Float:
         """t* there, at least 0: orders the list, decides nothing."""
         return self.response.depth(self.r, dx, dy)
 
-    def may_hit(self, dx, dy):
+    def may_hit(self, dx: Float, dy: Float) -> Mask:
         """False only where no pixel center of the tile around there has a hit."""
         return self.response.may_hit(self.r, dx, dy, 0.5 * (TILE - 1), self.limit)
 
 
-def _emit(lib, keys, gaussian, amount, offset, box, columns, bits, tiles, large, by_depth):
+def _emit(
+    lib: Lib,
+    keys: UInt64,
+    gaussian: UInt32,
+    amount: UInt32,
+    offset: UInt32,
+    box: list[Int32],
+    columns: int,
+    bits: tuple[int, int],
+    tiles: _Tiles,
+    large: bool,
+    by_depth: bool,
+) -> None:
     """Write the sort key of every (tile, Gaussian) pair; of those that may have a hit, if boxes are `large`."""
     x0, x1, y0, _ = box
     tile_bits, index_bits = bits
     depth_bits = 64 - tile_bits - index_bits
 
-    def body(k, x, y):
+    def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
         """Write one pair, and step to the next tile of the box, row by row."""
         tile = lib.UInt32(y * columns + x)
         dx, dy = tiles.center(x, y)
@@ -249,11 +266,11 @@ def _emit(lib, keys, gaussian, amount, offset, box, columns, bits, tiles, large,
     dr.eval(keys)
 
 
-def _suffix_minimum(lib, values, start, end):
+def _suffix_minimum(lib: Lib, values: Float, start: UInt32, end: UInt32) -> Float:
     """Running minimum of each tile's range from its end; one lane a tile."""
     out = dr.zeros(lib.Float, dr.width(values))
 
-    def body(i, low):
+    def body(i: UInt32, low: Float) -> tuple[UInt32, Float]:
         low = dr.minimum(low, dr.gather(lib.Float, values, i - 1))
         dr.scatter(out, low, i - 1)
         return i - 1, low

@@ -12,10 +12,13 @@ only where nothing that is still to come can lie in front: streams bound the key
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 
-from drgs.tracing.kernels import Ray
-from drgs.tracing.protocols import Kernel, Stream
+from drgs.tracing.kernels import HitModel, Ray
+from drgs.tracing.protocols import Float, Kernel, Lib, Mask, Stream, UInt32
 from drgs.tracing.records import RECORD
 
 __all__ = ["BUFFER", "EMPTY", "NOWHERE", "ListStream", "Part"]
@@ -36,28 +39,28 @@ class ListStream:
         ahead: (entries,) lower bound of the order key of this entry and all later ones of its lane; None without.
     """
 
-    def __init__(self, lib, index, start, end, ahead=None):
+    def __init__(self, lib: Lib, index: UInt32, start: UInt32, end: UInt32, ahead: Float | None = None) -> None:
         self.lib, self.index, self.start, self.end, self.ahead = lib, index, start, end, ahead
 
-    def begin(self):
+    def begin(self) -> UInt32:
         """The place of the first entry."""
         return self.lib.UInt32(self.start)
 
-    def more(self, i):
+    def more(self, i: UInt32) -> Mask:
         """Whether there is an entry left."""
         return i < self.end
 
-    def place(self, i):
+    def place(self, i: UInt32) -> UInt32:
         """In the list."""
         return i
 
-    def next(self, i, active):
+    def next(self, i: UInt32, active: Mask) -> tuple[UInt32, Mask, Float, UInt32]:
         """One entry."""
         index = dr.gather(self.lib.UInt32, self.index, i, active)
         bound = EMPTY if self.ahead is None else dr.gather(self.lib.Float, self.ahead, i, active)
         return index, active, bound, i + 1
 
-    def of(self, lanes) -> ListStream:
+    def of(self, lanes: UInt32) -> ListStream:
         """The entries of some lanes."""
         start, end = (dr.gather(self.lib.UInt32, x, lanes) for x in (self.start, self.end))
         return ListStream(self.lib, self.index, start, end, self.ahead)
@@ -73,22 +76,30 @@ class Part:
         failed: After a primal pass in exact order: lanes whose buffer was too short.
     """
 
-    def __init__(self, lib, model, records, rays, flat, inside, stream: Stream, ordered: bool, center_key=None):
+    def __init__(
+        self,
+        lib: Lib,
+        model: HitModel,
+        records: Float,
+        rays: list[Ray],
+        flat: list[UInt32],
+        inside: list[Mask],
+        stream: Stream,
+        ordered: bool,
+        center_key: Float | None = None,
+    ) -> None:
         self.lib, self.model, self.records = lib, model, records
         self.rays, self.flat, self.inside = rays, flat, inside
         self.stream, self.ordered, self.center_key = stream, ordered, center_key
         self.failed = None
 
-    def listed(self, again) -> list[Part]:
+    def listed(self, again: UInt32) -> list[Part]:
         """Parts that walk some of the rays again, given by their lanes, along sorted lists of all their hits."""
         lib, count = self.lib, dr.width(again)
         if count == 0:
             return []
-        pick = lambda x: dr.gather(type(x), x, again)  # noqa: E731
-        rays = [
-            Ray(*(None if v is None else pick(v) for v in (r.x, r.y, r.length)), [pick(v) for v in r.carried], r.basis)
-            for r in self.rays
-        ]
+        pick = lambda x: None if x is None else dr.gather(type(x), x, again)  # noqa: E731
+        rays = [Ray(pick(r.x), pick(r.y), pick(r.length), [pick(v) for v in r.carried], r.basis) for r in self.rays]
         flat, stream = [pick(f) for f in self.flat], self.stream.of(again)
         dr.eval(rays, flat)
         with dr.suspend_grad():  # lists say what to look at, and in which order: neither has a derivative
@@ -105,13 +116,13 @@ class Part:
         inside = [lib.Bool(True)] * len(rays)
         return [Part(lib, self.model, self.records, rays, flat, inside, stream, False)]
 
-    def _sorted_hits(self, ray, stream, start, total: int):
+    def _sorted_hits(self, ray: Ray, stream: Stream, start: UInt32, total: int) -> UInt32:
         """The hits of each ray, from its `start` on, by (key, index)."""
         lib, count = self.lib, dr.width(start)
         keys, index = dr.zeros(lib.UInt64, max(total, 1)), dr.zeros(lib.UInt32, max(total, 1))
         own = lib.UInt64(dr.arange(lib.UInt32, count)) << 32
 
-        def write(k, candidate, key, ok):
+        def write(k: UInt32, candidate: UInt32, key: Float, ok: Mask) -> None:
             # Keys are >= 0, where floats order like their bits.
             dr.scatter(keys, own | lib.UInt64(dr.reinterpret_array(lib.UInt32, key)), start + k, ok)
             dr.scatter(index, candidate, start + k, ok)
@@ -124,11 +135,11 @@ class Part:
         dr.eval(index, start)
         return index
 
-    def _each_hit(self, ray, stream, lanes: int, visit):
+    def _each_hit(self, ray: Ray, stream: Stream, lanes: int, visit: Callable) -> UInt32:
         """Number of hits of every lane; `visit(number so far, Gaussian, key, is hit)` sees each candidate."""
         lib = self.lib
 
-        def body(s, k):
+        def body(s: Any, k: UInt32) -> tuple:
             candidate, valid, _, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, ray, valid)
             visit(k, candidate, key, ok)
@@ -143,13 +154,13 @@ class Part:
                 return self._in_order(kernel)
             return self._sorted(kernel, check)
 
-    def _in_order(self, kernel):
+    def _in_order(self, kernel: Kernel) -> list[dict]:
         """Composite the candidates as they come."""
         lib, stream = self.lib, self.stream
         states = [kernel.init(k, inside, [lib.UInt32(NOWHERE)]) for k, inside in enumerate(self.inside)]
         start = stream.begin()
 
-        def body(s, go, states):
+        def body(s: Any, go: UInt32, states: list[dict]) -> tuple:
             index, valid, _, after = stream.next(s, lib.Bool(True))
             states = kernel.shade(index, self.rays, states, [[stream.place(s)]] * len(self.rays), valid)
             alive = sum((st["alive"] for st in states), lib.UInt32(0))
@@ -158,7 +169,7 @@ class Part:
         go = dr.select(stream.more(start), lib.UInt32(1), 0)
         return dr.while_loop((start, go, states), lambda s, go, states: go != 0, body)[2]
 
-    def _probe(self, index, ray, active):
+    def _probe(self, index: UInt32, ray: Ray, active: Mask) -> tuple[Float, Mask]:
         """Order key of a candidate, and whether it is a hit."""
         lib = self.lib
         record = list(dr.gather(lib.ArrayXf, self.records, index, active, shape=(RECORD, dr.width(index))))
@@ -169,7 +180,7 @@ class Part:
             key = dr.gather(lib.Float, self.center_key, index, ok)
         return key, ok
 
-    def _sorted(self, kernel, check):
+    def _sorted(self, kernel: Kernel, check: bool) -> list[dict]:
         """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
         lib, stream = self.lib, self.stream
         F, U = lib.Float, lib.UInt32
@@ -177,14 +188,18 @@ class Part:
         start = stream.begin()
         keys, index = [F(EMPTY) for _ in range(BUFFER)], [U(0) for _ in range(BUFFER)]
 
-        def exchange(enter, candidate, keys, index, last, state):
+        def exchange(
+            enter: Float, candidate: UInt32, keys: list[Float], index: list[UInt32], last: list, state: dict
+        ) -> tuple:
             """Put a hit into the buffer and composite the one that leaves it."""
             (key, at), keys, index = _push(enter, candidate, keys, index)
             out = key != EMPTY
             (state,) = kernel.shade(at, self.rays, [state], [[key, at]], out)
             return keys, index, [dr.select(out, key, last[0]), dr.select(out, at, last[1])], state
 
-        def body(s, go, keys, index, last, failed, state):
+        def body(
+            s: Any, go: UInt32, keys: list[Float], index: list[UInt32], last: list, failed: UInt32, state: dict
+        ) -> tuple:
             """Meet the next candidate; `last` left the buffer last, `failed` is 1 where a hit came too late."""
             candidate, valid, bound, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, self.rays[0], valid)
@@ -209,11 +224,11 @@ class Part:
         self.failed = failed != 0
         return [self._drain(kernel, keys, index, state)]
 
-    def _drain(self, kernel, keys, index, state):
+    def _drain(self, kernel: Kernel, keys: list[Float], index: list[UInt32], state: dict) -> dict:
         """Composite what is left in the buffer."""
         lib = self.lib
 
-        def body(j, keys, index, state):
+        def body(j: UInt32, keys: list[Float], index: list[UInt32], state: dict) -> tuple:
             (state,) = kernel.shade(
                 index[0], self.rays, [state], [[keys[0], index[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST)
             )
@@ -221,18 +236,20 @@ class Part:
             index = [*index[1:], lib.UInt32(0)]
             return j + 1, keys, index, state
 
-        def cond(j, keys, index, state):
+        def cond(j: UInt32, keys: list[Float], index: list[UInt32], state: dict) -> Mask:
             return (j < BUFFER) & (state["alive"] != 0)
 
         return dr.while_loop((lib.UInt32(0), keys, index, state), cond, body)[3]
 
 
-def _less(key_a, index_a, key_b, index_b):
+def _less(key_a: Float, index_a: UInt32, key_b: Float, index_b: UInt32) -> Mask:
     """(key, index) order."""
     return (key_a < key_b) | ((key_a == key_b) & (index_a < index_b))
 
 
-def _push(key, index, keys, indices):
+def _push(
+    key: Float, index: UInt32, keys: list[Float], indices: list[UInt32]
+) -> tuple[tuple[Float, UInt32], list[Float], list[UInt32]]:
     """Insert into an ascending buffer and take its smallest out; pushing EMPTY changes nothing."""
     keys, indices = list(keys), list(indices)
     swap = _less(keys[0], indices[0], key, index)

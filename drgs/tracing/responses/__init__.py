@@ -6,11 +6,16 @@ float64 oracle (reference.py), written independently of this.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
+from drgs.tracing.protocols import Float, Lib, Mask
 from drgs.tracing.responses.ewa import Ewa
 from drgs.tracing.responses.integral import Integral
 from drgs.tracing.responses.peak import Peak
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Ray
+    from drgs.tracing.projection import Activated, Projected, Screen
 
 __all__ = ["RESPONSES", "Response"]
 
@@ -34,16 +39,16 @@ class Response(Protocol):
 
     # Once a Gaussian and view, in float64.
 
-    def strength(self, logit, opacity, e):
+    def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
         """What stands for alpha in the record; e = exp(-|logit|)."""
 
-    def strength_slope(self, logit, opacity, e):
+    def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
         """d log strength / d logit."""
 
-    def project(self, g, screen):
+    def project(self, g: Activated, screen: Screen) -> tuple[list[Float], list[Float], Mask, tuple | None]:
         """Entries of a screen record behind the anchor, bounds in pixels, mask of what is there, `Projected.frame`."""
 
-    def extras(self, lib, projected, moved) -> list:
+    def extras(self, lib: Lib, projected: Projected, moved: list[list[Float]] | None) -> list[Float]:
         """(N,) columns for `slopes`; `moved`: tangents of the record by means, rotations and log-scales."""
 
     # Once a hit, in float32.
@@ -51,13 +56,13 @@ class Response(Protocol):
     def slots(self, world: bool, depth: bool) -> list[int]:
         """Entries of a record that carry a derivative; `depth` tells whether t* has a cotangent or tangent."""
 
-    def along(self, r, ray, world: bool) -> tuple:
+    def along(self, r: list[Float], ray: Ray, world: bool) -> tuple[Float, Float, Float | None]:
         """rho^2, t* (the order key) and u = t* |d'| (None where `opacity` does not need it) of a ray."""
 
-    def opacity(self, x, u):
+    def opacity(self, x: Float, u: Float | None) -> Float:
         """Of a hit, from x = strength exp(-rho^2 / 2)."""
 
-    def slopes(self, r, extra, ray, world: bool) -> list:
+    def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """d opacity / d (mean 3, rotation 3, log-scale 3, log strength)."""
 
     # Once a tile and Gaussian, in float32.
@@ -65,10 +70,10 @@ class Response(Protocol):
     def least_strength(self, alpha_min: float) -> float:
         """Least strength exp(-rho^2 / 2) of a hit whose opacity reaches alpha_min."""
 
-    def may_hit(self, r, dx, dy, half: float, limit):
+    def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where no ray within `half` pixels of (dx, dy), from the anchor, hits with rho^2 <= limit."""
 
-    def depth(self, r, dx, dy):
+    def depth(self, r: list[Float], dx: Float, dy: Float) -> Float:
         """t* at (dx, dy), at least 0, for the order of lists: it decides nothing else."""
 
 

@@ -7,11 +7,18 @@ its triangular factor. Of `tiles` and `order="center"` only: the model is one of
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import drjit as dr
 
 from drgs.tracing import records as layout
+from drgs.tracing.protocols import Float, Lib, Mask
 from drgs.tracing.records import cross, dot
 from drgs.tracing.responses.peak import deviation
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Ray
+    from drgs.tracing.projection import Activated, Projected, Screen
 
 __all__ = ["Ewa"]
 
@@ -27,17 +34,17 @@ class Ewa:
     extra = 9 * len(_SHAPE)
     by_tangents = True
 
-    def strength(self, logit, opacity, e):
+    def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
         """Alpha itself."""
         return opacity
 
-    def strength_slope(self, logit, opacity, e):
+    def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
         """1 - alpha, without its cancellation."""
         return dr.select(logit >= 0, e, 1) / (1 + e)
 
     # -- once a Gaussian and view ------------------------------------------------------------------------------------
 
-    def project(self, g, screen):
+    def project(self, g: Activated, screen: Screen) -> tuple[list[Float], list[Float], Mask, None]:
         """The triangular factor of Sigma'^-1 and where it is centered, the depth, and what each culling leaves."""
         fx, skew, cx, fy, cy = screen.pinhole
         Float64, s, c = type(fx), g.settings, g.center
@@ -72,7 +79,7 @@ class Ewa:
         bounds, alive = _culled(g, px, py, cxx, cyy, det, alive)
         return shape, bounds, alive, None
 
-    def extras(self, lib, projected, moved) -> list:
+    def extras(self, lib: Lib, projected: Projected, moved: list[list[Float]] | Any) -> list[Float]:
         """Tangents of the triangular factor."""
         return [lib.Float(tangent[k]) for tangent in moved for k in _SHAPE]
 
@@ -83,16 +90,16 @@ class Ewa:
         L = layout
         return [*range(L.R11, L.R23 + 1), L.ALPHA, *range(L.RGB, L.RGB + 3), *([L.H1] if depth else [])]
 
-    def along(self, r, ray, world: bool) -> tuple:
+    def along(self, r: list[Float], ray: Ray, world: bool) -> tuple[Float, Float, Float | None]:
         """d^T Sigma'^-1 d and the Gaussian's depth."""
         c1, c2, _, _ = _offset(r, ray)
         return dr.fma(c1, c1, c2 * c2), r[layout.H1], None
 
-    def opacity(self, x, u):
+    def opacity(self, x: Float, u: Float | None) -> Float:
         """alpha exp(-d^T Sigma'^-1 d / 2)."""
         return x
 
-    def slopes(self, r, extra, ray, world: bool) -> list:
+    def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """Through the tangents of the triangular factor and of the projected mean (`extras`)."""
         c1, c2, dx, dy = _offset(r, ray)
         a = r[layout.ALPHA] * dr.exp(-0.5 * dr.fma(c1, c1, c2 * c2))
@@ -109,16 +116,16 @@ class Ewa:
         """The opacity is the strength times exp(-rho^2 / 2)."""
         return alpha_min
 
-    def may_hit(self, r, dx, dy, half: float, limit):
+    def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution; 1.0001 is more than float32 rounds."""
         return ~(deviation(r, dx, dy, half) > 1.0001 * limit)
 
-    def depth(self, r, dx, dy):
+    def depth(self, r: list[Float], dx: Float, dy: Float) -> Float:
         """The Gaussian's own."""
         return r[layout.H1]
 
 
-def _offset(r, ray):
+def _offset(r: list[Float], ray: Ray) -> tuple[Float, Float, Float, Float]:
     """The triangular factor times the pixel's offset from the projected mean; the offset from the anchor."""
     L = layout
     dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
@@ -126,7 +133,7 @@ def _offset(r, ray):
     return c1, dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, r[L.R23])), dx, dy
 
 
-def _clamped(tx, ty, screen, fov_clamp: str):
+def _clamped(tx: Float, ty: Float, screen: Screen, fov_clamp: str) -> tuple[Float, Float]:
     """x/z and y/z as each rasterizer clamps them for J: symmetrically, or by the edges of the image."""
     if fov_clamp == "none":
         return tx, ty
@@ -140,7 +147,9 @@ def _clamped(tx, ty, screen, fov_clamp: str):
     return dr.clip(tx, -low_x, high_x), dr.clip(ty, -low_y, high_y)
 
 
-def _culled(g, px, py, cxx, cyy, det, alive):
+def _culled(
+    g: Activated, px: Float, py: Float, cxx: Float, cyy: Float, det: Float, alive: Mask
+) -> tuple[list[Float], Mask]:
     """Screen bounds around the projected mean by the rule of `culling`, and which Gaussians have any."""
     culling = g.settings.culling
     if culling == "inria":

@@ -11,12 +11,17 @@ notation are those of peak.py. With e = d' / |d'|,
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from drgs.tracing import records as layout
+from drgs.tracing.protocols import Float
 from drgs.tracing.records import cross, dot
 from drgs.tracing.responses.peak import Peak, approach, times
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Ray
 
 __all__ = ["Integral"]
 
@@ -31,11 +36,11 @@ class Integral(Peak):
     front_only = False
     at_most_alpha = False
 
-    def strength(self, logit, opacity, e):
+    def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
         """softplus(logit): the optical depth -log(1 - alpha) of a full pass."""
         return dr.select(logit >= 0, logit, 0) + dr.log(1 + e)
 
-    def strength_slope(self, logit, opacity, e):
+    def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
         """softplus' / softplus."""
         return opacity / (dr.maximum(logit, 0) + dr.log(1 + e))
 
@@ -44,21 +49,21 @@ class Integral(Peak):
         used = super().slots(world, False)
         return used if world else [*used, layout.H1, layout.H2, layout.H3, layout.NORM]
 
-    def _u_in_world(self, key, d, inverse):
+    def _u_in_world(self, key: Float, d: list[Float], inverse: Float) -> Float:
         # |d'|^2 is 0 where a scale is beyond 1e19: all that is in sight is then at u = 0. A mask has no derivative.
         return dr.select(dr.detach(dot(d, d)) > 0, key * dr.rsqrt(inverse), 0)
 
-    def _u_on_screen(self, r, along, inverse):
+    def _u_on_screen(self, r: list[Float], along: Float, inverse: Float) -> Float:
         return r[layout.NORM] * along * dr.sqrt(inverse)
 
-    def opacity(self, x, u):
+    def opacity(self, x: Float, u: Float) -> Float:
         """1 - exp(-tau)."""
         tau = x * (0.5 + 0.5 * dr.erf(u * _ROOT_HALF))
         # 1 - exp(-tau) rounds a small tau away; its series does not. At 0.03 both are right to 2e-7.
         series = tau * dr.fma(tau, dr.fma(tau, dr.fma(tau, -1 / 24, 1 / 6), -0.5), 1)
         return dr.select(tau < 0.03, series, 1 - dr.exp(-tau))
 
-    def slopes(self, r, extra, ray, world: bool) -> list:
+    def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """da of the module docstring."""
         p, e, u, rho2 = self._peak(r, extra, ray, world)
         gauss = dr.exp(-0.5 * rho2)

@@ -22,10 +22,17 @@ for a move dmu of the mean and a world-frame rotation R <- exp([w]x) R; integral
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 
 from drgs.tracing import records as layout
+from drgs.tracing.protocols import Float, Lib, Mask
 from drgs.tracing.records import cross, dot
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Ray
+    from drgs.tracing.projection import Activated, Projected, Screen
 
 __all__ = ["Peak", "approach", "deviation", "times"]
 
@@ -42,17 +49,17 @@ class Peak:
     extra = 33
     by_tangents = False
 
-    def strength(self, logit, opacity, e):
+    def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
         """Alpha itself."""
         return opacity
 
-    def strength_slope(self, logit, opacity, e):
+    def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
         """1 - alpha, without its cancellation."""
         return dr.select(logit >= 0, e, 1) / (1 + e)
 
     # -- once a Gaussian and view ------------------------------------------------------------------------------------
 
-    def project(self, g, screen):
+    def project(self, g: Activated, screen: Screen) -> tuple[list[Float], list[Float], Mask, tuple]:
         """The 15 numbers of rho^2, t* and |d'| around the anchor, and the bounds of the extent ellipsoid."""
         fx, skew, cx, fy, cy = screen.pinhole
         dx = [dr.rcp(fx), type(fx)(0), type(fx)(0)]
@@ -62,7 +69,7 @@ class Peak:
         cofactor = [s * volume for s in g.scale]
         f = g.from_local
 
-        def local(v, weight):  # diag(weight) R^T v, from camera axes
+        def local(v: list[Float], weight: list[Float]) -> list[Float]:  # diag(weight) R^T v, from camera axes
             return [weight[k] * (f[0][k] * v[0] + f[1][k] * v[1] + f[2][k] * v[2]) for k in range(3)]
 
         yn = (screen.y - cy) / fy
@@ -88,7 +95,7 @@ class Peak:
         numbers = [*r, e2, e3, e4, dot(f2, Dy), dot(f3, Dy), dot(f1, h), dot(f2, h), dot(f3, h), norm]
         return numbers, *_silhouette(g, screen), (g.rotation, g.scale, (u, v), (f1, f2, f3))
 
-    def extras(self, lib, projected, moved) -> list:
+    def extras(self, lib: Lib, projected: Projected, moved: list[list[Float]] | None) -> list[Float]:
         """What the closed forms need of the frame, see `extra`."""
         F = lib.Float
         rotation, scale, plane, axes = projected.frame
@@ -111,7 +118,7 @@ class Peak:
         used = [*range(L.R11, L.R23 + 1), L.ALPHA, *range(L.RGB, L.RGB + 3), *range(L.E2, L.E6 + 1)]
         return used + ([L.H1, L.H2, L.H3] if depth else [])
 
-    def along(self, r, ray, world: bool) -> tuple:
+    def along(self, r: list[Float], ray: Ray, world: bool) -> tuple[Float, Float, Float | None]:
         """rho^2, t* and u of a ray."""
         if world:
             t0, a, d, inverse = _local(r, ray)
@@ -123,23 +130,25 @@ class Peak:
         along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
         return squared * inverse, along * inverse * ray.length, self._u_on_screen(r, along, inverse)
 
-    def _u_in_world(self, key, d, inverse):
+    def _u_in_world(self, key: Float, d: list[Float], inverse: Float) -> Float | None:
         return None
 
-    def _u_on_screen(self, r, along, inverse):
+    def _u_on_screen(self, r: list[Float], along: Float, inverse: Float) -> Float | None:
         return None
 
-    def opacity(self, x, u):
+    def opacity(self, x: Float, u: Float | None) -> Float:
         """alpha exp(-rho^2 / 2)."""
         return x
 
-    def slopes(self, r, extra, ray, world: bool) -> list:
+    def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """a times the derivatives of -rho^2 / 2 (module docstring)."""
         p, _, _, rho2 = self._peak(r, extra, ray, world)
         a = r[layout.W_ALPHA if world else layout.ALPHA] * dr.exp(-0.5 * rho2)
         return [*(a * x for x in approach(extra, p)), a]
 
-    def _peak(self, r, extra, ray, world):
+    def _peak(
+        self, r: list[Float], extra: list[Float], ray: Ray, world: bool
+    ) -> tuple[list[Float], list[Float], Float, Float]:
         """p, e, u and rho^2; on the screen p and e in the frame of the ray's direction at the anchor."""
         rho2, _, u = self.along(r, ray, world)
         if world:
@@ -158,7 +167,7 @@ class Peak:
         """The opacity is the strength times exp(-rho^2 / 2)."""
         return alpha_min
 
-    def may_hit(self, r, dx, dy, half: float, limit):
+    def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution, or (if only peaks in front count) all of it is behind."""
         d = _direction(r, dx, dy)
         slopes = (r[layout.E2], r[layout.E3]), (r[layout.E4], r[layout.E5]), (0.0, r[layout.E6])
@@ -174,7 +183,7 @@ class Peak:
             met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
         return met
 
-    def depth(self, r, dx, dy):
+    def depth(self, r: list[Float], dx: Float, dy: Float) -> Float:
         """t* at a point of the image, up to |d|."""
         d = _direction(r, dx, dy)
         along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
@@ -182,11 +191,11 @@ class Peak:
         return dr.select(depth > 0, dr.minimum(depth, _FAR), 0)
 
 
-def deviation(r, dx, dy, half: float):
+def deviation(r: list[Float], dx: Float, dy: Float, half: float) -> Float:
     """Least (c1^2 + c2^2) of the record within `half` pixels of (dx, dy), rounding taken off."""
     L = layout
 
-    def least(a, b, c):  # of |a x + b y + c|
+    def least(a: Float, b: Float, c: Float) -> Float:  # of |a x + b y + c|
         parts = a * dx, b * dy, c
         rounding = 1e-6 * (abs(parts[0]) + abs(parts[1]) + abs(c))  # a few units in the last place of each part
         return dr.maximum(abs(parts[0] + parts[1] + parts[2]) - half * (abs(a) + abs(b)) - rounding, 0)
@@ -195,19 +204,19 @@ def deviation(r, dx, dy, half: float):
     return dr.fma(m1, m1, m2 * m2)
 
 
-def approach(extra, p) -> list:
+def approach(extra: list[Float], p: list[Float]) -> list[Float]:
     """d(-rho^2 / 2) by mean, rotation and log-scale: (p / s) R^T, R (S p x S^-1 p), p_k^2."""
     n, v, local = times(extra, 0, p), times(extra, 1, p), times(extra, 2, p)
     return [*n, *cross(v, n), *[x * x for x in local]]
 
 
-def times(extra, which: int, x) -> list:
+def times(extra: list[Float], which: int, x: list[Float]) -> list[Float]:
     """R S^-1 (0), R S (1) or 1 (2) times a vector in the stored axes: in world axes, world axes and local axes."""
     m = extra[6 + 9 * which : 15 + 9 * which]
     return [m[3 * r] * x[0] + m[3 * r + 1] * x[1] + m[3 * r + 2] * x[2] for r in range(3)]
 
 
-def _on_screen(r, ray):
+def _on_screen(r: list[Float], ray: Ray) -> tuple[Float, Float, list[Float], Float]:
     """Of a pinhole ray: the two parts of o' x d', d' in its own frame, and 1 / |d'|^2."""
     L = layout
     dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
@@ -217,13 +226,13 @@ def _on_screen(r, ray):
     return c1, c2, d, dr.rcp(dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2])))
 
 
-def _direction(r, dx, dy) -> list:
+def _direction(r: list[Float], dx: Float, dy: Float) -> list[Float]:
     """The three parts of d' at (dx, dy) from the anchor, along (f1, f2, f3)."""
     L = layout
     return [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
 
 
-def _local(r, ray):
+def _local(r: list[Float], ray: Ray) -> tuple[Float, list[Float], list[Float], Float]:
     """Of a ray o + t d in the world: t0, w = (o - mu) + t0 d and d in the local frame, and 1 / |d'|^2.
 
     t0, where the ray is nearest to the mean, only moves the point about which the local frame is expanded, so that what
@@ -241,7 +250,7 @@ def _local(r, ray):
     return t0, a, d, dr.rcp(dr.select(squared > 0, squared, 1))
 
 
-def _frame(n):
+def _frame(n: list[Float]) -> tuple[list[Float], list[Float]]:
     """Orthonormal u, v perpendicular to n, smooth in n; around the z axis where n is 0 (the mean at the camera).
 
     rho^2 does not depend on which pair it is, so that masks and choices in here need no derivative.
@@ -261,7 +270,7 @@ def _frame(n):
     return u, cross(n, u)
 
 
-def _perpendicular(a, n):
+def _perpendicular(a: list[Float], n: list[Float]) -> list[Float]:
     """a, perpendicular to n but for rounding, without that: its component along the largest axis of n is put right.
 
     Of a Gaussian as thin as a sheet n is the thin axis, nearly, and what a has of it is multiplied by 1 / scale.
@@ -276,7 +285,7 @@ def _perpendicular(a, n):
     return result
 
 
-def _silhouette(g, screen):
+def _silhouette(g: Activated, screen: Screen) -> tuple[list[Float], Mask]:
     """Screen bounds of the extent ellipsoid, exact where it lies in front of the camera plane, and which are there.
 
     The rays that touch the ellipsoid {c, extent^2 Sigma} are a cone; a plane through the camera with normal n is
@@ -287,7 +296,7 @@ def _silhouette(g, screen):
     c = dr.detach(g.center)  # for bounds, as sigma
     e2 = extent * extent
 
-    def sigma(a, b):
+    def sigma(a: int, b: int) -> Float:
         return e2 * sum(dr.detach(f[a][k] * f[b][k] * g.scale[k] * g.scale[k]) for k in range(3))
 
     szz = sigma(2, 2)
@@ -297,7 +306,7 @@ def _silhouette(g, screen):
     behind = ~inside & (c[2] < 0)
     den = dr.select(inside, -1, q22)
 
-    def axis(k):
+    def axis(k: int) -> tuple[Float, Float]:
         q = sigma(k, 2) - c[k] * c[2]
         root = dr.sqrt(dr.maximum(q * q - (sigma(k, k) - c[k] * c[k]) * den, 0)) / -den
         return q / den, root
@@ -316,9 +325,9 @@ def _silhouette(g, screen):
     return bounds, ~behind & (extent > 0)
 
 
-def _scaled(a, s):
+def _scaled(a: list[Float], s: Float) -> list[Float]:
     return [x * s for x in a]
 
 
-def _less(a, b, s):
+def _less(a: list[Float], b: list[Float], s: Float) -> list[Float]:
     return [x - s * y for x, y in zip(a, b, strict=True)]
