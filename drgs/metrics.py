@@ -20,7 +20,7 @@ from drgs.integrator import render
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Scene
     from drgs.files import Run
     from drgs.fitting.frames import Frame
 
@@ -152,7 +152,7 @@ def _read_weights(path: Path) -> dict:
 
 
 def evaluate(
-    g: Gaussians,
+    g: Scene,
     frames: list[Frame],
     settings: RenderSettings,
     *,
@@ -162,7 +162,7 @@ def evaluate(
     """All metrics of the given views.
 
     Args:
-        g: What is shown.
+        g: What is shown, as it is at the time of each view.
         frames: Photographs to compare with; may be empty.
         settings: As in `drgs.render`. Pixels outside a mask are black in both images.
         lpips: None reports LPIPS as None with a reason.
@@ -175,7 +175,7 @@ def evaluate(
 
 
 def _evaluated(
-    g: Gaussians, frames: list[Frame], settings: RenderSettings, lpips: Lpips | None, pictures: Path | None, bar: Bar
+    g: Scene, frames: list[Frame], settings: RenderSettings, lpips: Lpips | None, pictures: Path | None, bar: Bar
 ) -> dict:
     """`evaluate`, under a bar that it has begun."""
     views, reasons = [], {}
@@ -216,14 +216,14 @@ def _evaluated(
     return {"views": views, "mean": mean, "variants": variants, "reasons": reasons}
 
 
-def through_viewers(g: Gaussians, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:
+def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:
     """How Gaussians look in the viewers of PLY files, which draw with the rasterizers' model, not with `settings`.
 
     That model widens every Gaussian by 0.3 px^2 on the screen, so what is lost depends on the image size: it is most
     where Gaussians are smaller than a pixel, least where a viewer draws more pixels than were fitted.
 
     Args:
-        g: Fitted with `settings`.
+        g: Fitted with `settings`; what moves is drawn as it is at the time of each view, which a PLY cannot hold.
         frames: Photographs to compare with, at the size of the fit; at most 8 of them, evenly spaced, are looked at.
         settings: Of the fit.
         split: Where the frames come from, to be recorded.

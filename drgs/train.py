@@ -36,6 +36,7 @@ from drgs.integrator import render
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
+    from drgs.fitting.parts import Parts
 
 __all__ = ["ActiveConfig", "FitConfig", "FitResult", "Trainer", "fit"]
 
@@ -50,7 +51,7 @@ class FitResult:
     """What `fit` leaves behind.
 
     Attributes:
-        gaussians: The Gaussians, also in `run.point_cloud`.
+        gaussians: The Gaussians, also in `run.point_cloud`; those of a scene that moves are at rest.
         metrics: As in metrics.json.
         run: The run folder.
         seconds: Wall time of all steps, of resumed runs together.
@@ -68,6 +69,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     active: ActiveConfig | None = None,
+    parts: Parts | None = None,
     resume: bool = False,
     progress: bool = True,
 ) -> FitResult:
@@ -79,6 +81,8 @@ def fit(
         config: What to do; the defaults if left out.
         active: Start with a few views and choose more on the way; the data set is best loaded with `lazy=True` and
             without points, so that nothing of views that are not chosen is read.
+        parts: Terms of the loss, rates, networks and what is rendered; default those of `config`. Every fit must have
+            its own: they hold networks and their optimizers.
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
     Raises:
@@ -90,11 +94,16 @@ def fit(
     runtime.backend()  # sets torch's threads too, at first use
     threads = _one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
-        return _fit(dataset, out_dir, config, active, resume)
+        return _fit(dataset, out_dir, config, active, parts, resume)
 
 
 def _fit(
-    dataset: Dataset, out_dir: str | Path, config: FitConfig, active: ActiveConfig | None, resume: bool
+    dataset: Dataset,
+    out_dir: str | Path,
+    config: FitConfig,
+    active: ActiveConfig | None,
+    parts: Parts | None,
+    resume: bool,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
     train, test = dataset.split(config.test_every)
@@ -115,11 +124,11 @@ def _fit(
     frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
     held_out = load_frames(test, config.max_pixels, config.mask)
     if tensors is not None and header is not None:
-        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path))
+        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), parts)
         seconds, source = header["seconds"], header["point_source"]
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source = _start(dataset, views, frames, config, plan is not None, room)
+        trainer, source = _start(dataset, views, frames, config, parts, plan is not None, room)
         seconds = 0.0
     recorded = {
         "command": "fit",
@@ -148,8 +157,8 @@ def _fit(
     loop = _Loop(run, trainer, held_out, source, seconds, plan)
     with _fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
-    g = trainer.gaussians()
-    result = metrics.evaluate(g, held_out, config.settings, pictures=run.renders / "test")
+    g, scene = trainer.gaussians(), trainer.scene()
+    result = metrics.evaluate(scene, held_out, config.settings, pictures=run.renders / "test")
     written = metrics.write_metrics(
         run,
         "test",
@@ -161,7 +170,7 @@ def _fit(
         seconds=loop.seconds,
         bad_steps=trainer.bad_steps,
         viewers=metrics.through_viewers(
-            g, held_out or trainer.frames, config.settings, "test" if held_out else "train"
+            scene, held_out or trainer.frames, config.settings, "test" if held_out else "train"
         ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
     )
@@ -170,7 +179,13 @@ def _fit(
 
 
 def _start(
-    dataset: Dataset, views: list[View], frames: list[Frame], config: FitConfig, strict: bool, reserved: int
+    dataset: Dataset,
+    views: list[View],
+    frames: list[Frame],
+    config: FitConfig,
+    parts: Parts | None,
+    strict: bool,
+    reserved: int,
 ) -> tuple[Trainer, str]:
     """A trainer at step 0, and where its points come from: by default, if `strict`, only from `views`."""
     from drgs.data import initial_points, scene_extent
@@ -188,7 +203,7 @@ def _start(
     dense = not given and any(view.depth_path is not None for view in views)
     model = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))
     _log.info("%d initial points: %s", len(points), source)
-    return Trainer(config, frames, model, extent), source
+    return Trainer(config, frames, model, extent, parts), source
 
 
 def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame]) -> None:
@@ -259,7 +274,7 @@ class _Loop:
             self.save()
 
     def save(self) -> None:
-        """The PLY, then the checkpoint, unless both are there."""
+        """The PLY, then the checkpoint, unless both are there; a PLY knows no time, it holds what moves at rest."""
         now = self.trainer.step_index, len(self.trainer.frames)
         if now == self._saved:
             return
@@ -277,8 +292,8 @@ class _Loop:
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""
         trainer = self.trainer
-        frame, record = plan.pick(trainer.gaussians(), trainer.frames, trainer.step_index)
-        points, colors, dense = plan.points(frame, trainer.gaussians())
+        frame, record = plan.pick(trainer.scene(), trainer.frames, trainer.step_index)
+        points, colors, dense = plan.points(frame, trainer.scene())
         if len(points):
             trainer.add_points(points, colors, *trainer.config.start_of(dense))
         record["points"] = len(points)
@@ -321,7 +336,7 @@ class _Loop:
             if is_interrupted():
                 return
             with torch.no_grad():  # a picture
-                image = render(trainer.gaussians(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
+                image = render(trainer.scene(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
             values.append(metrics.psnr(image, frame.image(), frame.mask))
             if i == 0:
                 pair = torch.cat([frame.image(), image], dim=1)

@@ -11,19 +11,25 @@ import numpy as np
 import pytest
 import torch
 from test_times import Drift
-from test_train import FAST, config, dataset, random_rows  # noqa: F401 (a fixture)
+from test_train import FAST, config, dataset, random_rows, scene  # noqa: F401 (a fixture)
 
 from drgs.cameras import orbit
-from drgs.files import load_state, save_state
+from drgs.data.views import Dataset, View
+from drgs.display.pictures import write_png
+from drgs.files import load_ply, load_state, save_state
+from drgs.fitting.config import ActiveConfig
 from drgs.fitting.density import add_gaussians, relocate
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import Photometric
 from drgs.fitting.networks import Network, saved_networks
 from drgs.fitting.parts import Parts, parts_of
-from drgs.fitting.records import check_checkpoint
+from drgs.fitting.records import check_checkpoint, load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
 from drgs.integrator import render
+from drgs.metrics import evaluate
+from drgs.select import select
+from drgs.train import fit
 
 
 class Affine(torch.nn.Module):
@@ -262,3 +268,54 @@ def test_points_of_a_new_view_have_rows_of_every_tensor(dataset):  # noqa: F811
     assert not g.features[-5:].any()
     assert not g.sh[-5:, 1:].any()
     steps(trainer, 1)
+
+
+class Wind(torch.nn.Module):
+    """One velocity that all Gaussians have."""
+
+    def __init__(self):
+        super().__init__()
+        self.velocity = torch.nn.Parameter(torch.zeros(3))
+
+
+def blown(folder):
+    """Nine views, at three times in turn, of Gaussians that move by (0.6, 0, 0) in a unit of time."""
+    truth, views = scene(), []
+    for i, camera in enumerate(orbit((0, 0, 0), 3.0, 9, width=24, height=24)):
+        camera = dataclasses.replace(camera, time=i % 3 / 2)
+        image = render(Drift(truth, torch.tensor([0.6, 0, 0])), camera, FAST).rgb
+        write_png(folder / f"{i}.png", image.numpy())
+        views.append(View(camera=camera, name=str(i), image_path=folder / f"{i}.png"))
+    points = truth.means.double().numpy()
+    return Dataset(folder, "transforms", views, points, np.full((len(truth), 3), 0.5, np.float32), "made for a test")
+
+
+def test_a_moving_fit_is_looked_at_as_it_moves(tmp_path, monkeypatch):
+    """Picks, previews and metrics see the scene at the times of the views; the PLY holds it at rest."""
+    data, wind = blown(tmp_path), Wind()
+    with torch.no_grad():
+        wind.velocity += torch.tensor([0.6, 0, 0])  # fitted already, so that a few steps are enough
+    cfg = config(max_steps=6, max_gaussians=60, init_points="all", dc_rate=0.2)
+    parts = dataclasses.replace(
+        parts_of(cfg, 3.0),
+        networks=[Network("wind", wind, 1e-3)],
+        scene=lambda rows: Drift(rows.gaussians(), wind.velocity),
+    )
+    active, chosen_of = ActiveConfig(initial=3, add=1, every=3, pick_points="uncovered"), []
+
+    def choose(scene, *arguments, **options):
+        chosen_of.append(scene)
+        return select(scene, *arguments, **options)
+
+    monkeypatch.setattr("drgs.select.select", choose)
+    result = fit(data, tmp_path / "run", cfg, active=active, parts=parts, progress=False)
+    frames = load_frames(data.split()[1], cfg.max_pixels, cfg.mask)
+    moving = Drift(result.gaussians, wind.velocity.detach())
+    shown, at_rest = (evaluate(x, frames, cfg.settings)["mean"]["psnr"] for x in (moving, result.gaussians))
+    assert shown > at_rest + 1
+    previews = [event["test_psnr"] for event in result.run.events() if event["event"] == "preview"]
+    for told in (result.metrics["mean"]["psnr"], previews[-1]):
+        assert told == pytest.approx(shown, abs=1e-3)
+    assert torch.equal(load_ply(result.run.point_cloud).means, result.gaussians.means)
+    assert [type(scene) for scene in chosen_of] == [Drift]
+    assert load_run(result.run).networks.keys() == {"wind"}

@@ -28,7 +28,7 @@ from drgs.fitting.frames import Frame, load_frames
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Scene
     from drgs.fitting.config import ActiveConfig, FitConfig
 
 __all__ = [
@@ -93,15 +93,15 @@ class ActiveViews:
         """How many Gaussians density control leaves room for: the shares of the views that are still to be picked."""
         return self._share * (self.active.add - len(self.picks))
 
-    def points(self, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, torch.Tensor, bool]:
+    def points(self, frame: Frame, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, bool]:
         """Points for new Gaussians from the view that was picked last.
 
-        Those that can be triangulated with it, and random ones where the Gaussians leave its pixels more than half
+        Those that can be triangulated with it, and random ones where the scene leaves its pixels more than half
         transparent. Of a view with a depth map: points of the map, there only.
 
         Args:
             frame: Its photograph.
-            gaussians: The scene as it is now.
+            scene: As it is now, seen at the time of the view.
         Returns:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
@@ -110,7 +110,7 @@ class ActiveViews:
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
         with torch.no_grad():  # the Gaussians are fitted elsewhere
-            alpha = render(gaussians, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
+            alpha = render(scene, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
         is_open = alpha < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED
@@ -148,11 +148,11 @@ class ActiveViews:
         """Whether a view is to be added before step `step` (from 0)."""
         return len(self.picks) < min(self.active.add, step // self.active.every)
 
-    def pick(self, gaussians: Gaussians, frames: list[Frame], step: int) -> tuple[Frame, dict]:
+    def pick(self, scene: Scene, frames: list[Frame], step: int) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
         Args:
-            gaussians: The scene as it is now.
+            scene: As it is now, seen by each view at its time.
             frames: The photographs seen so far; of these, too, only the cameras matter.
             step: Steps done.
         Returns:
@@ -165,7 +165,7 @@ class ActiveViews:
         pixels = active.info_pixels or self._config.max_pixels
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
-                gaussians,
+                scene,
                 [at_most(self._camera(i), pixels) for i in left],
                 [at_most(frame.camera, pixels) for frame in frames],
                 1,
@@ -190,7 +190,7 @@ class ActiveViews:
             "policy": active.policy,
             "criterion": active.criterion if active.policy == "fisher" else None,
             "prior": {"value": active.prior, "relative": active.relative_prior},
-            "gaussians": len(gaussians),
+            "gaussians": len(scene.at(frames[0].camera.time)),
             "left_out": selection.left_out,
             "notes": selection.notes,
             "candidates": [

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.networks import rate_at
@@ -19,7 +20,7 @@ from drgs.fitting.rows import GaussianRows
 from drgs.integrator import render
 
 if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Scene
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
@@ -136,8 +137,13 @@ class Trainer:
         }
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians of the rows as they are, without a graph."""
+        """The Gaussians of the rows as they are, without a graph: those of a scene that moves are at rest."""
         return self.rows.gaussians().detach()
+
+    def scene(self) -> Scene:
+        """What a step renders, to be looked at: `gaussians`, or the scene that the parts make of the rows."""
+        scene = self.parts.scene(self.rows)
+        return scene.detach() if isinstance(scene, Gaussians) else scene  # looked at, not optimized
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header of a checkpoint."""
