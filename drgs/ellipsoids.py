@@ -22,8 +22,9 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = ["DeformableScene", "Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
+__all__ = ["Y_00", "DeformableScene", "Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
 
+Y_00 = 0.28209479177387814  # the spherical harmonic of degree 0, sqrt(1 / (4 pi))
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
 # float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
 _FAR_RATIO = 1e5

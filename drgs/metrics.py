@@ -6,7 +6,6 @@ Metrics that cannot be computed are None with a reason, never left out. `DEFINIT
 from __future__ import annotations
 
 import importlib.util
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ import torch
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
+from drgs.fitting.losses import psnr_of
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 
@@ -66,7 +66,7 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
         mse = float((error * mask).sum() / mask.double().sum())
     else:
         mse = float(error.mean())
-    return -10 * math.log10(max(mse, 1e-10))  # equal images have 100 dB, which averages can take
+    return psnr_of(mse)
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:

@@ -17,7 +17,7 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Y_00, Gaussians
 from drgs.guards.arguments import ArgumentError
 
 __all__ = [
@@ -31,7 +31,6 @@ __all__ = [
     "scene_of",
 ]
 
-_SH0 = 0.28209479177387814  # Y_00
 _LEAST_SCALE, _LEAST_OPACITY, _MOST_OPACITY = 1e-20, 1e-12, 1 - 2.0**-26
 
 
@@ -137,7 +136,7 @@ def color_of(colors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, f
     # The shift is taken off the image again: whatever it is, the gradient is the same.
     shift = 0.5 - min(0.0, float(first.detach().min()) if first.numel() else 0.0)
     first = torch.nn.functional.pad(first, (0, 3 - first.shape[1]))
-    return ((first + (shift - 0.5)) / _SH0)[:, None, :], rest if rest.shape[1] else None, shift
+    return ((first + (shift - 0.5)) / Y_00)[:, None, :], rest if rest.shape[1] else None, shift
 
 
 def cameras_of(viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int) -> list[Camera]:

@@ -24,6 +24,7 @@ from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
 from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.losses import psnr_of
 from drgs.guards.outputs import Claim, claim
 from drgs.integrator import render
 from drgs.settings import RenderSettings
@@ -310,7 +311,7 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
         "fast": statistics.median(a for a, _ in times),
         "volprim_rf_basic": statistics.median(b for _, b in times),
         "ratio": statistics.median(b / a for a, b in times),
-        "psnr_between": float(-10 * np.log10(max(mse, 1e-10))),
+        "psnr_between": psnr_of(mse),
         "note": "its defaults: 3 sigma, 64 hits a ray, transmittance 0.01; srgb_primitives off; 1 sample a pixel",
     }
 

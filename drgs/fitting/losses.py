@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "padded_ssim", "ssim_map", "terms_of"]
+__all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "padded_ssim", "psnr_of", "ssim_map", "terms_of"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -118,6 +118,11 @@ class Scale:
         """See `LossTerm`."""
         # The weight of MCMC's authors is for scenes with an extent of about 5.
         return self.weight * gaussians.scales.mean() * (5 / self.extent)
+
+
+def psnr_of(mse: float) -> float:
+    """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]."""
+    return -10 * math.log10(max(mse, 1e-10))  # equal images have 100 dB, which averages can take
 
 
 def padded_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ import math
 
 import torch
 
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Y_00, Gaussians
 
 __all__ = ["GaussianRows"]
 
@@ -54,7 +54,7 @@ class GaussianRows:
                 "quats": quats,
                 "log_scales": (scale * _spacing(points)).log().float()[:, None].repeat(1, 3),
                 "logit_opacities": torch.full((n,), math.log(opacity / (1 - opacity))),
-                "sh_dc": ((colors.float() - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
+                "sh_dc": ((colors.float() - 0.5) * (1 / Y_00))[:, None, :],
                 "sh_rest": torch.zeros(n, 0, 3),
             }
         )

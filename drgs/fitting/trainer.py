@@ -14,6 +14,7 @@ import torch
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
+from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
 from drgs.fitting.rows import GaussianRows
@@ -130,8 +131,7 @@ class Trainer:
         return {
             "loss": float(loss.detach()),  # told, as all of these
             "terms": terms,
-            # Equal images have 100 dB, which averages can take.
-            "psnr": -10 * math.log10(max(mse, 1e-10)) if math.isfinite(mse) else None,
+            "psnr": psnr_of(mse) if math.isfinite(mse) else None,
             "view": frame.name,
             "events": events,
         }

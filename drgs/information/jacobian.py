@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
+from drgs.ellipsoids import Y_00
 from drgs.tracing.derivatives import if_any_hit
-from drgs.tracing.harmonics import CONSTANT
 from drgs.tracing.protocols import Sink
 from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
@@ -210,7 +210,7 @@ class Blocks:
             for c in range(3):
                 entries = [_entry(row.slopes, row.g, row.turned, j, c) for j in range(GEOMETRY)]
                 # d color / d sh_0, 0 where the color is clamped.
-                lit = dr.select(row.color[c] > 0, row.w * CONSTANT, 0)
+                lit = dr.select(row.color[c] > 0, row.w * Y_00, 0)
                 full.append((self.weights[c], [*entries, *(lit if k == c else None for k in range(3))]))
         for i in range(self.SIZE):
             for j in range(i + 1):

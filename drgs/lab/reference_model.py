@@ -8,7 +8,6 @@ rest, so that gradients can be compared at the conventions that were found (conv
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 
 from drgs import reference
 from drgs.cameras import Camera, rigid
+from drgs.ellipsoids import Y_00
 from drgs.integrator import render
 from drgs.lab.raw import COLORS, gaussians_of, image_of, posed
 from drgs.oracle import activate, float64, screen_rows
@@ -23,7 +23,6 @@ from drgs.settings import RenderSettings
 
 __all__ = ["ORDERS", "ReferenceModel"]
 
-_SH0 = math.sqrt(1 / (4 * math.pi))
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
 _WINDOW = 16  # pixels a side
 _NEAR = 2e-6  # of the distance: some ten times what float32 loses where it computes a depth
@@ -211,7 +210,7 @@ class ReferenceModel:
         elif self.direction == "camera frame":
             towards = towards @ w2c[:3, :3].T
         color = 0.5 + (reference.sh_basis(towards, sh.shape[1])[..., None] * sh).sum(1)
-        return ((color - 0.5) / _SH0)[:, None]  # the renderer clamps at 0 as ever
+        return ((color - 0.5) / Y_00)[:, None]  # the renderer clamps at 0 as ever
 
 
 def _windows(camera: Camera) -> Iterator[tuple[int, int, int, int]]:

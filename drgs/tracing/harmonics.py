@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import drjit as dr
 
+from drgs.ellipsoids import Y_00
 from drgs.tracing.protocols import Float
 
-__all__ = ["CONSTANT", "sh_basis", "sh_color"]
+__all__ = ["sh_basis", "sh_color"]
 
-CONSTANT = 0.28209479177387814  # the basis function of degree 0
 _LINEAR = 0.4886025119029199
 _QUADRATIC = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 _CUBIC = (
@@ -27,7 +27,7 @@ _CUBIC = (
 def sh_basis(direction: list[Float], coefficients: int) -> list[Float]:
     """The first 1, 4, 9 or 16 real spherical harmonics at a unit `direction` (three floats)."""
     x, y, z = direction
-    basis = [type(x)(CONSTANT)]
+    basis = [type(x)(Y_00)]
     if coefficients > 1:
         basis += [-_LINEAR * y, _LINEAR * z, -_LINEAR * x]
     if coefficients > 4:
