@@ -1,6 +1,7 @@
 """What a command was given and which views its options name: each rule once, for every command."""
 
 import dataclasses
+import shutil
 
 import pytest
 from test_active import SIZE, write_still
@@ -27,7 +28,8 @@ def place(tmp_path_factory):
     run = Run(folder / "run")
     config = FitConfig(settings=RenderSettings.preset("fast", background=SKY), test_every=3, max_pixels=100)
     train = [name for i, name in enumerate(NAMES) if i % 3]
-    run.start({"data": str(folder / "data"), "train": train, "test": ["0", "3", "6"], "fit": config.to_json()})
+    recorded = {"data": str(folder / "data"), "train": train, "test": ["0", "3", "6"], "fit": config.to_json()}
+    run.start({"command": "fit", **recorded})
     run.log("start")
     save_ply(gaussians, run.point_cloud)
     save_cameras_json(folder / "list.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=SIZE))
@@ -62,6 +64,27 @@ def test_a_run_is_a_folder_with_a_fit_in_it(place, tmp_path):
         (tmp_path / name).mkdir(parents=True)
         (tmp_path / name / name).write_text("{}")
         assert not is_run(tmp_path / name)
+
+
+@pytest.mark.parametrize("command", [Select, Fisher])
+def test_a_run_without_its_log_is_one_for_every_option(place, tmp_path, command):
+    """What is fitted and what is known come from the run, by whatever of its files are left; else one line."""
+    shutil.copytree(place / "run", tmp_path / "run")
+    (tmp_path / "run/log.jsonl").unlink()
+    assert is_run(tmp_path / "run")
+    args, its = given(tmp_path, command)
+    named = known_views(str(tmp_path / "run"), args, its)
+    for known in (known_views(None, args, its), named):
+        assert [camera.name for camera in known.cameras] == ["1", "2", "4", "5", "7", "8"]
+    (tmp_path / "run/config.json").write_text('{"schema": 1, "command": "scene"}')
+    assert Source.of("--train", str(tmp_path / "run")).kind == "data"
+    with pytest.raises(FileNotFoundError, match=r"run: must be a run folder, found no config\.json of a fit; name a"):
+        Given.at(tmp_path / "run")
+    (tmp_path / "run/config.json").write_text("{")
+    (tmp_path / "run/state.safetensors").write_text("")
+    assert Source.of("--train", str(tmp_path / "run")).kind == "run"
+    with pytest.raises(ValueError, match=r"config\.json: must be valid JSON"):
+        Given.at(tmp_path / "run")
 
 
 def test_kinds_of_sources(place):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.files import Run, load_ply
-from drgs.fitting.records import FitRecord, load_run
+from drgs.fitting.records import FitRecord, is_run, load_run
 from drgs.guards.foreign import refuse_foreign
 from drgs.settings import RenderSettings
 
@@ -49,15 +49,19 @@ class Given:
 
     @classmethod
     def at(cls, path: Path) -> Given:
-        """What a PLY or a run folder holds; any folder is taken for a run.
+        """What a PLY or a run folder holds.
 
         Raises:
-            FileNotFoundError: If there is no such PLY, or the run has no checkpoint yet.
+            FileNotFoundError: If there is no such PLY, a folder is no run's, or the run has no checkpoint yet.
             ValueError: If a file is damaged, or of a format of somebody else's.
         """
         if not path.is_dir():
             return cls(load_ply(path))
         refuse_foreign(path, "a run folder or a 3DGS PLY file")
+        if not is_run(path):
+            raise FileNotFoundError(
+                f"{path}: must be a run folder, found no config.json of a fit; name a 3DGS PLY or run `drgs fit` first"
+            )
         run = Run(path)
         loaded = load_run(run)
         return cls(loaded.gaussians, run, loaded.record)

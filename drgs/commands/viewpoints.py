@@ -233,7 +233,7 @@ def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
     """
     if text is None and given.run is None:
         raise ValueError("a PLY has no record of its views: --train must name a data set, a run or a cameras.json")
-    source = Source.of("--train", str(given.run.path) if text is None else text)
+    source = Source("--train", str(given.run.path), "run") if text is None else Source.of("--train", text)
     pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":

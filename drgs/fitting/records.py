@@ -17,13 +17,22 @@ from drgs.files import load_ply, load_state
 from drgs.fitting.config import FitConfig
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
-from drgs.guards.json_files import check_json, read_json
+from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.files import Run
 
-__all__ = ["FitRecord", "LoadedRun", "check_checkpoint", "fit_record", "fitted_views", "is_run", "load_run"]
+__all__ = [
+    "FitRecord",
+    "LoadedRun",
+    "check_checkpoint",
+    "fit_record",
+    "fitted_views",
+    "is_fit_config",
+    "is_run",
+    "load_run",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -125,8 +134,22 @@ def _shows(path: Path, gaussians: Gaussians) -> bool:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a folder has a fit in it, however far that came."""
-    return (path / "config.json").is_file() and (path / "log.jsonl").is_file()
+    """Whether a folder has a fit in it, however far that came and whatever else is missing: its config.json says so.
+
+    One that does not, because it was damaged or edited, counts beside a checkpoint or a log: its reader says what is
+    wrong with it.
+    """
+    config, others = path / "config.json", ("state.safetensors", "log.jsonl")
+    return config.is_file() and (is_fit_config(config) or any((path / name).is_file() for name in others))
+
+
+def is_fit_config(path: Path) -> bool:
+    """Whether a config.json can be read and is of a fit."""
+    try:
+        value = parse_json(path.read_bytes(), str(path))
+    except (OSError, ValueError):
+        return False
+    return isinstance(value, dict) and value.get("command") == "fit" and isinstance(value.get("schema"), int)
 
 
 def fit_record(run: Run) -> FitRecord:

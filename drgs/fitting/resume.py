@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import logging
 import os
 import shutil
@@ -11,7 +9,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from drgs.files import load_state
-from drgs.fitting.records import check_checkpoint
+from drgs.fitting.records import check_checkpoint, is_fit_config
 from drgs.guards.outputs import claim, replacing
 
 if TYPE_CHECKING:
@@ -52,7 +50,7 @@ def claim_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()
     """
     held = claim(run.path, command, inputs=inputs)
     try:
-        is_fit = _is_fit(run.path / "config.json")
+        is_fit = is_fit_config(run.path / "config.json")
         if is_fit and resume:
             pictures = ("preview_*.png", "test/*.png", "train/*.png", "all/*.png")
             drawn = [str(path.relative_to(run.path)) for kind in pictures for path in run.renders.glob(kind)]
@@ -123,13 +121,6 @@ def keep_previous(run: Run) -> None:
             os.link(run.state, name)
         except OSError:  # a file system without links
             shutil.copyfile(run.state, name)
-
-
-def _is_fit(path: Path) -> bool:
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        value = json.loads(path.read_bytes())
-        return isinstance(value, dict) and value.get("command") == "fit" and isinstance(value.get("schema"), int)
-    return False
 
 
 def _put_aside(path: Path, held: Claim, is_damaged: bool) -> None:
