@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from drgs.commands.overrides import check_color, parsed
-from drgs.fitting.config import ActiveConfig, Degree, FitConfig, InitPoints, Mask, PickPoints
+from drgs.fitting.config import ActiveConfig, Degree, FitConfig, InitPoints, MaskUse, PickPoints
 from drgs.information.choices import Criterion, Method, Policy
 from drgs.settings import Preset, RenderSettings
 
@@ -197,7 +197,7 @@ class Fit(_Policy, _Data):
     """Continue from the last checkpoint in the run folder."""
     save_every: int = FitConfig.save_every
     """Steps between checkpoints."""
-    mask: Mask = FitConfig.mask
+    mask: MaskUse = FitConfig.mask
     """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
     background: tuple[float, float, float] = RenderSettings.background
     """RGB in [0, 1] behind everything."""

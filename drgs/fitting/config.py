@@ -13,10 +13,10 @@ from drgs.settings import RenderSettings
 if TYPE_CHECKING:
     from drgs.select import Scoring
 
-__all__ = ["ActiveConfig", "Degree", "FitConfig", "InitPoints", "Mask", "PickPoints"]
+__all__ = ["ActiveConfig", "Degree", "FitConfig", "InitPoints", "MaskUse", "PickPoints"]
 
 InitPoints = Literal["auto", "views", "all"]
-Mask = Literal["auto", "object", "valid", "ignore"]
+MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
 Degree = Literal[0, 1, 2, 3]
 
@@ -82,7 +82,7 @@ class FitConfig:
     sh_degree: Degree = 3
     deterministic: bool = False
     save_every: int = 1000
-    mask: Mask = "auto"
+    mask: MaskUse = "auto"
     means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
     dc_rate: float = 2.5e-3
     rest_rate: float = 1.25e-4
