@@ -9,9 +9,8 @@ and forward mode (composite.py); what a Gaussian needs once a view is differenti
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,10 @@ import torch
 from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene
-from drgs.guards.arguments import must_be
+from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
-from drgs.tracing.bridge import differentiable
+from drgs.tracing.bridge import differentiable, own_errors
 from drgs.tracing.call import Call, Output
 from drgs.tracing.tangents import push_forward
 
@@ -71,7 +70,7 @@ def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wan
     seen = gaussians_at("render", gaussians, camera)
     check_view("render", seen, camera, settings)
     call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted)
-    with _own_errors():
+    with own_errors():
         return call.output(differentiable(call))
 
 
@@ -99,7 +98,8 @@ def render_jvp(
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
             the pose, rotation first: c2w <- exp(xi) c2w. Of a `drgs.ellipsoids.DeformableScene` the names are those
-            of its `parameters()`, `camera`, and `rotations` where it has `quats`.
+            of its `parameters()` that are floats, `camera`, and `rotations` where it has `quats`; so none of its own
+            may be called `camera`, `rotations`, `w2c`, `ray_origins` or `ray_directions`.
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried
         through one traversal.
@@ -113,7 +113,8 @@ def render_jvp(
     settings = settings or RenderSettings.preset("exact")
     # The tangents are given: a graph of torch would lead nowhere.
     call = Call(seen.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene)
-    return push_forward(call, dict(tangents))
+    with own_errors():
+        return push_forward(call, dict(tangents))
 
 
 @runtime.alone
@@ -133,12 +134,17 @@ def render_rays(
     Returns:
         An `Output` with the leading shape of the rays instead of (H, W).
     """
+    if isinstance(gaussians, Scene) and not isinstance(gaussians, Gaussians):
+        raise ArgumentError(
+            f"render_rays: gaussians must be Gaussians, as rays have no time, got {kind_of(gaussians)}; "
+            "use scene.at(time)"
+        )
     check_scene("render_rays", gaussians, settings)
     settings = settings or RenderSettings.preset("exact", traversal="bvh")
     if settings.traversal != "bvh":
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
     call = Call(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
-    with _own_errors():
+    with own_errors():
         return call.output(differentiable(call))
 
 
@@ -152,17 +158,3 @@ def _wanted(outputs: Iterable[str]) -> frozenset[str]:
     if unknown:
         raise ValueError(f"render: outputs must be among {', '.join(OUTPUTS)}, got {unknown[0]!r}")
     return frozenset(_NAMES[name] for name in outputs)
-
-
-@contextlib.contextmanager
-def _own_errors() -> Iterator[None]:
-    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said."""
-    try:
-        yield
-    except RuntimeError as error:
-        cause = error.__cause__
-        while cause is not None and not isinstance(cause, ValueError | NotImplementedError):
-            cause = cause.__cause__
-        if cause is None:
-            raise
-        raise cause from None

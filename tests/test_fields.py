@@ -120,6 +120,68 @@ def test_information_of_weights(view):
         assert abs(float(ratio.mean()) - 1) < 0.27, name
 
 
+@pytest.mark.parametrize("name", ["camera", "rotations", "w2c", "ray_origins", "ray_directions"])
+def test_names_of_the_view_are_refused(view, name):
+    """A parameter named like what belongs to the view would be taken for it, and the other way round."""
+    scene, cam = view
+    scene.parameters = lambda: {**scene.start.parameters(), **scene.weights, name: torch.zeros(6)}
+    calls = (
+        lambda: render_jvp(scene, cam, {"means": torch.zeros(10, 3)}, FAST),
+        lambda: fisher.diagonal(scene, cam, FAST, "probes", groups=["in.bias"], probes=1),
+    )
+    scene.at = lambda time: scene.start
+    for call in calls:
+        with pytest.raises(ValueError, match=rf"^scene\.parameters\(\): names .* got '{name}'; rename it, e\.g\. "):
+            call()
+
+
+class Chosen(Swarm):
+    """A swarm that only some of its means follow, by a list of integers."""
+
+    chosen = torch.tensor([0, 3, 4])
+
+    def parameters(self):
+        return {**super().parameters(), "chosen": self.chosen}
+
+    def deform(self, parameters, time):
+        p = dict(parameters)
+        chosen = p.pop("chosen")
+        moved = super().deform(p, time)
+        return moved.replace(means=p["means"].index_copy(0, chosen, moved.means[chosen]))
+
+
+def test_integers_stay_integers(view):
+    """They index in `deform` under every derivative, and have neither tangent nor group."""
+    _, cam = view
+    scene = Chosen(view[0].start)
+    H = {m: fisher.diagonal(scene, cam, FAST, m, groups=["in.bias"], probes=2) for m in ("columns", "probes")}
+    assert all(float(x["in.bias"].min()) > 0 for x in H.values())
+    with pytest.raises(ValueError, match="tangents must be named among .* got 'chosen'"):
+        render_jvp(scene, cam, {"chosen": torch.zeros(3)}, FAST)
+    with pytest.raises(ValueError, match="groups must be among .* got 'chosen'"):
+        fisher.diagonal(scene, cam, FAST, "columns", groups=["chosen"])
+
+
+def test_errors_of_a_field_are_told_as_they_are(view):
+    """What `deform` refuses arrives as it was said, not as Dr.Jit's error; so does what has no forward mode."""
+    scene, cam = view
+    told, deform = ValueError("Swarm: time must be at most 1, got 2; wrap it"), scene.deform
+
+    def fails(parameters, time):
+        raise told
+
+    calls = (
+        lambda: render_jvp(scene, cam, {"in.bias": torch.ones(3)}, FAST),
+        lambda: fisher.diagonal(scene, cam, FAST, "probes", groups=["in.bias"], probes=1),
+    )
+    seen = deform(scene.parameters(), cam.time)
+    scene.at, scene.deform = (lambda time: seen), fails
+    for call in calls:
+        with pytest.raises(ValueError, match=r"^Swarm: time must be") as error:
+            call()
+        assert error.value is told
+
+
 def test_refusals(view):
     """Closed forms know nothing of a network, and Gaussians have no weights."""
     scene, cam = view

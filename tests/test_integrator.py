@@ -619,3 +619,32 @@ def test_graph_that_is_retained(rng, traversal):
     out.rgb.sum().backward()
     with pytest.raises(RuntimeError, match="second time"):
         out.alpha.sum().backward()
+
+
+def test_no_rays_have_empty_images(rng):
+    """Their shape is kept, each Gaussian has a visibility of 0, and gradients are 0, not an error."""
+    g = gaussians(rng, 3, 1).replace(features=torch.ones(3, 2))
+    out = render_rays(g, torch.zeros(3), torch.zeros(4, 0, 3), outputs="all")
+    assert [tuple(x.shape) for x in (out.rgb, out.alpha, out.depth, out.features)] == [
+        (4, 0, 3),
+        *2 * [(4, 0)],
+        (4, 0, 2),
+    ]
+    assert [tuple(x.shape) for x in (out.median_depth, out.count)] == 2 * [(4, 0)]
+    assert out.visibility.tolist() == [0, 0, 0]
+    out.rgb.sum().backward()
+    assert float(g.means.grad.abs().max()) == 0
+
+
+def test_rays_have_no_time(rng):
+    """A scene that moves has no Gaussians for them; which to take is said."""
+
+    class Moving:
+        def at(self, time):
+            return gaussians(rng, 3, 1)
+
+        def parameters(self):
+            return {}
+
+    with pytest.raises(ValueError, match=r"render_rays: .* as rays have no time, got .*; use scene\.at\(time\)$"):
+        render_rays(Moving(), torch.zeros(3), torch.ones(3))

@@ -113,7 +113,9 @@ def scene_groups(scene) -> dict[str, Group]:
     """The groups of a scene besides those of its Gaussians: none, unless it is a `DeformableScene`."""
     if not isinstance(scene, DeformableScene):
         return {}
-    own = {name: tuple(x.shape) for name, x in scene.parameters().items() if name not in _FIELDS}
+    own = {
+        name: tuple(x.shape) for name, x in scene.parameters().items() if name not in _FIELDS and x.is_floating_point()
+    }
     return {
         name: Group(shape=lambda _, shape=shape: shape, input=name, owner="scene", fisherrf=None)
         for name, shape in own.items()

@@ -9,7 +9,7 @@ import torch
 
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
-from drgs.tracing.bridge import to_drjit
+from drgs.tracing.bridge import own_errors, to_drjit
 from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.pose import quaternion_product
@@ -198,6 +198,7 @@ class Replay:
         return torch.stack([_torch(x) for x in self.basis], 1).square(), torch.stack([_torch(x) for x in self.lit], 1)
 
 
+@own_errors()
 def by_probes(
     gaussians: Gaussians,
     camera: Camera,

@@ -5,7 +5,8 @@ Not `dr.wrap`, whose description of its outputs is one global of all threads, an
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from drgs import runtime
 if TYPE_CHECKING:
     from drgs.tracing.call import Call
 
-__all__ = ["differentiable", "to_drjit"]
+__all__ = ["differentiable", "own_errors", "to_drjit"]
 
 
 def to_drjit(lib: ModuleType, x: torch.Tensor) -> Any:
@@ -25,10 +26,24 @@ def to_drjit(lib: ModuleType, x: torch.Tensor) -> Any:
     return (lib.TensorXf64 if x.dtype == torch.float64 else lib.TensorXf)(x.detach().contiguous())
 
 
+@contextlib.contextmanager
+def own_errors() -> Iterator[None]:
+    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said."""
+    try:
+        yield
+    except RuntimeError as error:
+        cause = error.__cause__
+        while cause is not None and not isinstance(cause, ValueError | NotImplementedError):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from None
+
+
 def differentiable(call: Call) -> dict[str, torch.Tensor]:
     """Run `call.trace` on its torch inputs, through whichever bridge their derivative needs."""
     values = call.inputs.values()
-    if call.count == 0:
+    if call.count == 0 or call.pixels == 0:
         return call.nothing()
     if _forward_ad(values):
         return dict(zip(call.image_names, _Functional.apply(call, *values), strict=True))

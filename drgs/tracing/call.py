@@ -77,10 +77,7 @@ class Call:
         field: From the scene's parameters to the Gaussians'; None for those of the Gaussians themselves.
         shape: Of the images: (H, W), or that of the rays.
         extra, certificate: Of the last `trace`: outputs without a derivative, and `Output.certificate`.
-        result_names: Of the images that the last differentiable `trace` gave, in their order.
     """
-
-    result_names: list[str]
 
     def __init__(
         self,
@@ -107,8 +104,13 @@ class Call:
             origin = np.asarray(gaussians.origin, np.float64) + [float(x) for x in middle]
             gaussians = gaussians.replace(means=gaussians.means - middle, origin=origin)
         given = gaussians.parameters()
-        self.field = None if scene is None else Field(scene, camera.time, given, middle)
-        given = given if scene is None else scene.parameters()
+        self.field = None
+        if scene is not None:
+            fields, given = given, {name: self._move(x) for name, x in scene.parameters().items()}
+            _check_names(given)
+            fixed = {name: x for name, x in given.items() if not x.is_floating_point()}
+            given = {name: x for name, x in given.items() if name not in fixed}
+            self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
         self.count, self.coefficients = len(gaussians), gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
@@ -229,14 +231,24 @@ class Call:
         return Output(**made, certificate=dict(self.certificate))
 
     def nothing(self) -> dict:
-        """Flat images of no Gaussians: the background, with a derivative of 0."""
+        """Flat images of no Gaussians, or without pixels: the background, with a derivative of 0."""
         pixels = self.pixels
-        sizes = {"median": pixels, "count": pixels, "visibility": 0}
+        sizes = {"median": pixels, "count": pixels, "visibility": self.count}
         self.extra = {name: dr.zeros(self.lib.Float, sizes[name]) for name in self.want & set(sizes)}
         zero = 0 * sum(x.sum().to(torch.float32) for x in self.inputs.values())
         flat = {"alpha": pixels, "features": pixels * self.width} | ({"depth": pixels} if "depth" in self.want else {})
         images = {name: zero.expand(size) for name, size in flat.items()}
         return {"rgb": zero + torch.tensor(self.settings.background, device=self.home).repeat(pixels), **images}
+
+
+def _check_names(parameters: dict) -> None:
+    """Refuse a scene's parameter that has the name of what belongs to the view: their tangents would be mixed."""
+    for name in parameters:
+        if name in (*OF_VIEW, "camera", "rotations"):
+            raise ArgumentError(
+                f"scene.parameters(): names must not be those of the view's pose or of rotations, got {name!r}; rename "
+                f"it, e.g. {name + '_of_scene'!r}"
+            )
 
 
 def numbers(what: str, x) -> torch.Tensor:

@@ -9,7 +9,7 @@ global of all threads.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -31,12 +31,18 @@ class Field:
         time: Of the view.
         names: Of the fields that are wanted.
         shift: (3,) that is taken from the means: the call's own origin; None for no shift.
+        fixed: Those of the scene's parameters that nothing is differentiated by, as they are no floats.
     """
 
     def __init__(
-        self, scene: DeformableScene, time: float | None, names: Iterable[str], shift: torch.Tensor | None = None
+        self,
+        scene: DeformableScene,
+        time: float | None,
+        names: Iterable[str],
+        shift: torch.Tensor | None = None,
+        fixed: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
-        self.scene, self.time, self.names, self.shift = scene, time, tuple(names), shift
+        self.scene, self.time, self.names, self.shift, self.fixed = scene, time, tuple(names), shift, dict(fixed or {})
 
     def __call__(self, lib: Lib, parameters: dict) -> dict:
         """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes."""
@@ -44,7 +50,7 @@ class Field:
 
     def values(self, parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """The same in torch."""
-        fields = self.scene.deform(parameters, self.time).parameters()
+        fields = self.scene.deform({**self.fixed, **parameters}, self.time).parameters()
         if self.shift is not None:
             fields["means"] = fields["means"] - self.shift
         return {name: fields[name] for name in self.names}
