@@ -218,6 +218,7 @@ def within(scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, d
     half = 2 * torch.asin(((d - axis).norm(dim=1).max() / 2).clamp(max=1))
     away = scene.means.detach() - o[0]  # as above, down to the margin of 1e-9 radians for rounding
     angle = torch.atan2(torch.linalg.cross(away, axis.expand_as(away)).norm(dim=1), (away @ axis).abs())
+    # No derivative, and no 0 / 0, as above.
     radius = reach * scene.axes.detach().norm(dim=1).amax(1)
     spread = torch.asin((radius / away.norm(dim=1).clamp(min=1e-300)).clamp(max=1))
     return (angle - spread <= half + 1e-9) | (half > 1.5)

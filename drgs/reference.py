@@ -163,6 +163,7 @@ def _project(
     bounds = []
     for slack in (-tolerance, 0.0, tolerance):
         if s.culling == "inria":
+            # 0.1 is the rasterizer's own floor; no derivative, as above.
             mid, det = cov.mean(-1), cov.prod(-1) - rows.detach().prod(1).sum(-1) ** 2
             largest = mid + (mid * mid - det).clamp(min=0.1).sqrt()
             radius = torch.ceil(3 * largest.sqrt() * (1 + slack))[:, None]
@@ -225,10 +226,10 @@ def _responses(
     # Where it is clamped, and how near to that, are numbers; the value of a clamp that the gradient passes is one, too.
     over, to_max = (a > s.alpha_max).detach(), (a / s.alpha_max - 1).abs().detach()
     top, left = torch.full_like(a, s.alpha_max), torch.full_like(a, 1 - s.alpha_max)
-    if s.alpha_max_gradient == "pass":
+    if s.alpha_max_gradient == "pass":  # the value of the clamp with the derivative of a
         top, left = a + (top - a).detach(), rest + (left - rest).detach()
     a, rest = torch.where(over, top, a), torch.where(over, left, rest)
-    with torch.no_grad():
+    with torch.no_grad():  # which hits exist, and in which order, has no derivative
         distance = away.norm(dim=-1)
         exists, margin = torch.ones_like(over), torch.full_like(a, math.inf)
 
@@ -238,13 +239,13 @@ def _responses(
 
         if s.culling == "extent":
             rho = rho2.sqrt()
-            cut(rho <= scene.extent, (scene.extent - rho) / scene.extent.clamp(min=1e-300))
+            cut(rho <= scene.extent, (scene.extent - rho) / scene.extent.clamp(min=1e-300))  # no 0 / 0
         else:
             tile = torch.floor(pixels / _TILE)[:, None, :]
             tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.screen[-1])
             cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
         if form.front_only:
-            cut(t > 0, t / distance.clamp(min=1e-300))
+            cut(t > 0, t / distance.clamp(min=1e-300))  # no 0 / 0
         if s.alpha_min > 0:
             cut(a >= s.alpha_min, a / s.alpha_min - 1)
         if scene.near_margin is not None:
@@ -255,6 +256,7 @@ def _responses(
             key = reach @ rotation[2] if s.depth_key == "z" else reach.norm(dim=-1)
         elif s.order == "entry":
             key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length
+    # The order is a constant of every derivative.
     return a, rest, t, key.detach().expand_as(a), exists, margin, to_max, distance
 
 

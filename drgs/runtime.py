@@ -124,7 +124,7 @@ def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _R
     with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             x = functorch.get_unwrapped(x)
-        return convert(x.detach())
+        return convert(x.detach())  # numpy takes no tensor with a graph
 
 
 def setup(variant: str | None = None, threads: int | None = None) -> Backend:

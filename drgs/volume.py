@@ -180,7 +180,7 @@ def _chunk(
     """The fields of `Volume` for a few rays."""
     keep = within(scene, reach, o, d)
     index = torch.nonzero(keep)[:, 0]
-    with torch.no_grad():
+    with torch.no_grad():  # which ones are used, and in which order, has no derivative
         tau, t, slope = _meet(scene, index.expand(len(o), -1), o, d)
         ahead = tau * _phi(t * slope)
         used = ahead > _CUT

@@ -177,9 +177,10 @@ class Oracle:
         loss = sum((images[name] * u).sum() for name, u in self.u.items())
         groups = leaves(g, cam)
         back = _grad(loss, groups, create_graph=True)
-        # Tangents are constants, and so are the results: the graph has served.
+        # Tangents are constants.
         change = {**self.v, "camera": -cam.w2c.detach() @ (self.v["camera"][:, None, None] * twist_basis()).sum(0)}
         self.push = _grad(sum((back[name].double() * change[name]).sum() for name in back), self.u)
+        # The graph has served: numbers from here on.
         self.back = {n: x.detach().double() for n, x in back.items()}
         self.back["camera"] = pose_gradient(cam, self.back["camera"])
         self.u = {name: u.detach() for name, u in self.u.items()}
@@ -258,7 +259,7 @@ def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle)
 
 
 def _largest(x: torch.Tensor) -> float:
-    return float(x.detach().abs().max()) if x.numel() else 0.0
+    return float(x.detach().abs().max()) if x.numel() else 0.0  # an error is a number
 
 
 # -------------------------------------------------- the dense Jacobian
@@ -274,6 +275,7 @@ def jacobian(g: Gaussians, out: reference.ReferenceOutput, features: bool = Fals
     """
     wanted = {name: x for name, x in g.parameters().items() if name != "features"}
     J = dict(zip(wanted, _dense(out.rgb.reshape(-1), list(wanted.values())), strict=True))
+    # Where the derivative is taken is a constant.
     J["rotations"] = turn(g.quats.detach().double(), J.pop("quats"))
     J = {name: J[name] for name in ("means", "rotations", "log_scales", "logit_opacities", "sh")}
     if features and g.features is not None:

@@ -55,7 +55,7 @@ def wide_gradients(
     except Exception as error:  # whatever a function raises that knows three channels only
         return {}, f"it draws no image of {channels} channels: {one_line(error)}"
     wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0)
-    with torch.no_grad():
+    with torch.no_grad():  # images alone are compared
         drawn = [tuple(x.cpu() for x in model.draw(raw, camera, case.oracle))]
     found = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
     right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]

@@ -256,6 +256,6 @@ def _legal(name: str, fields: dict) -> dict:
 
 
 def _drawn(model: ReferenceModel, raw: dict, camera: Camera, oracle: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    with torch.no_grad():
+    with torch.no_grad():  # images alone are compared
         image, alpha = model.draw(raw, camera, oracle)
     return image.cpu(), alpha.cpu()

@@ -119,6 +119,7 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
         got = found[name].reshape(wanted.shape) if found[name].size == wanted.size else found[name]
         if got.shape != wanted.shape:
             raise ValueError(f"{path}: {name} must have shape {wanted.shape}, got {got.shape}: it is of another scene")
+        # Arrays of float32, which the other side may have computed again from its own parameters.
         if not np.allclose(got, wanted, rtol=1e-5, atol=1e-6):
             what = "the same scene, cameras and background"
             raise ValueError(f"{path}: must be of {what}, its {name} differs; write it anew from --export")

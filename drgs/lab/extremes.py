@@ -74,7 +74,7 @@ def _change(change: Callable[[Gaussians, Camera], None], **options) -> Builder:
 
     def build(rng: np.random.Generator) -> Built:
         g, cam = _base(rng, **options)
-        with torch.no_grad():
+        with torch.no_grad():  # leaves are changed in place
             change(g, cam)
         return g, cam
 
@@ -112,7 +112,7 @@ def _scaled(factor: float) -> Builder:
 
     def build(rng: np.random.Generator) -> Built:
         g, cam = _base(rng)
-        with torch.no_grad():
+        with torch.no_grad():  # leaves are changed in place
             g.means.mul_(factor)
             g.log_scales.add_(math.log(factor))
             pose = cam.w2c.clone()
@@ -190,7 +190,7 @@ def _offset(rng: np.random.Generator, where: str) -> Built:
     """A world 1e6 from zero whose detail is 1e-2: float64 means, or float32 means relative to `origin`."""
     g, cam = _base(rng)
     shift = np.array([1e6, -7e5, 3e5])
-    with torch.no_grad():
+    with torch.no_grad():  # leaves are changed in place
         g.means.mul_(0.1)
         g.log_scales.fill_(math.log(1e-2)).add_(0.3 * torch.tensor(rng.normal(size=(len(g), 3))))
         pose = cam.w2c.clone()

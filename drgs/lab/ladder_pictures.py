@@ -70,6 +70,7 @@ class Pictures:
             )
         if crop < 0:
             raise ValueError(f"ladder: crop must be >= 0 pixels, got {crop}; correct it")
+        # Each picture makes leaves of its own.
         self.g, self.cameras, self.crop, self.gradients = g.detach(), list(cameras), crop, gradients
         self.advance = advance or (lambda: None)
         self.background = (0.0, 0.0, 0.0)

@@ -132,6 +132,7 @@ def _percent(x: float | None) -> str:
     """Two digits below 1 %, none above 10."""
     if x is None:
         return "-"
+    # Below 5e-5 two digits of a percent round to 0, and -0.00 says nothing.
     digits = 0 if abs(x) >= 0.1 or abs(x) < 5e-5 else 1 if abs(x) >= 0.01 else 2
     x = 0.0 if abs(x) < 5e-5 else x
     return f"{100 * x:.{digits}f} %"

@@ -196,7 +196,7 @@ def _taste(draw: Callable) -> tuple[torch.dtype, str]:
     problem = None
     for dtype, device in places:
         try:
-            with torch.no_grad():
+            with torch.no_grad():  # asked only whether it draws
                 image, _ = draw({k: x.to(device, dtype) for k, x in raw.items()}, camera, (0.0, 0.0, 0.0))
             if image.dtype == dtype:
                 return dtype, device

@@ -109,7 +109,7 @@ class ReferenceModel:
         """
         camera = self._camera(camera)
         found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-        with torch.no_grad():
+        with torch.no_grad():  # marks of pixels have no derivative
             g, _ = gaussians_of(self._parameters(raw, camera))
             for x, y, width, height in _windows(camera):
                 window = (x, y, width, height)

@@ -37,6 +37,7 @@ class Refusal:
 
 def _scene() -> tuple[Gaussians, Camera]:
     rng = np.random.default_rng(0)
+    # No leaves: their values are changed in place.
     return random_gaussians(rng, 4, 4, 2).detach(), random_camera(rng, (9, 7))
 
 
@@ -72,7 +73,7 @@ def _broken_camera() -> Attempts:
     """A camera is refused when it is made, and once more when its pose has been moved since."""
     g, cam = _scene()
     for value in (math.nan, math.inf):
-        K, w2c = cam.K.copy(), cam.w2c.detach().clone()
+        K, w2c = cam.K.copy(), cam.w2c.detach().clone()  # changed in place, which no leaf can be
         K[0, 0] = w2c[0, 3] = value
         yield lambda K=K: dataclasses.replace(cam, K=K), "K must"
         yield lambda w2c=w2c: dataclasses.replace(cam, w2c=w2c), "pose must be finite"

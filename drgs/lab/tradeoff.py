@@ -214,11 +214,12 @@ class _Turn:
         """
         stage, view, share = self.stage, number % len(self.stage.cameras), self.row.share
         camera, took = stage.cameras[view], {}
-        with torch.no_grad():
+        with torch.no_grad():  # what an image alone takes
             _, took["forward"] = clocked(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
 
         def both():
             image = stage.image(stage.moving, camera, self.settings, share)
+            # The image is looked at only: its graph is that of `pull`.
             return image.detach().cpu(), stage.pull(image, stage.cotangents[view])
 
         (image, slopes), took["forward_backward"] = clocked(both)
@@ -348,7 +349,7 @@ def _tracer(
         return render_rays(g, origins, directions, settings, outputs=())
 
     def forward():
-        with torch.no_grad():
+        with torch.no_grad():  # what images alone take
             return trace(stage.gaussians)
 
     def both(good=None):

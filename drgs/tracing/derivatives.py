@@ -112,8 +112,8 @@ class Adjoint:
         m, lib, out = self.m, self.m.lib, []
         D = lib.Float64
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
-        # A graph of this hit only, from leaves of its own: the walk has suspended AD.
         with dr.resume_grad():
+            # A graph of this hit only, from leaves of its own: the walk has suspended AD.
             fixed = {
                 name: [dr.detach(x) for x in xs] for name, xs in self.channels.load(lib, index, rays[0], going).items()
             }
@@ -236,8 +236,8 @@ class Tangent:
 
     def _slopes(self, record: list[Float], ray: Ray, live: Mask, which: int) -> Gradient:
         """Gradient of a hit's opacity (0) or depth (1): {slot: value}, and of what the ray carries."""
-        # A graph of this hit only, from leaves of its own: the walk has suspended AD.
         with dr.resume_grad():
+            # A graph of this hit only, from leaves of its own: the walk has suspended AD.
             record = [dr.detach(x) for x in record]
             ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])
             dr.enable_grad(record, ray.carried)

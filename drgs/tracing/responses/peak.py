@@ -297,6 +297,7 @@ def _silhouette(g: Activated, screen: Screen) -> tuple[list[Float], Mask]:
     e2 = extent * extent
 
     def sigma(a: int, b: int) -> Float:
+        # Bounds have no derivative.
         return e2 * sum(dr.detach(f[a][k] * f[b][k] * g.scale[k] * g.scale[k]) for k in range(3))
 
     szz = sigma(2, 2)
