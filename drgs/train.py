@@ -28,7 +28,7 @@ from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.trainer import Trainer
+from drgs.fitting.trainer import StepResult, Trainer
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
 from drgs.integrator import render
@@ -237,7 +237,7 @@ class _Loop:
     ) -> None:
         self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
         self.seconds, self.plan = seconds, plan
-        self._recent: list[dict] = []
+        self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
 
@@ -259,12 +259,12 @@ class _Loop:
                     with interrupts.at_once():
                         self._pick(self.plan, bar)
                 began = time.perf_counter()
-                row = trainer.step()
+                step = trainer.step()
                 self.seconds += time.perf_counter() - began
                 done = trainer.step_index
-                self._log(row)
-                if row["psnr"] is not None:
-                    self._psnr = 0.98 * (self._psnr or row["psnr"]) + 0.02 * row["psnr"]
+                self._log(step)
+                if step.psnr is not None:
+                    self._psnr = 0.98 * (self._psnr or step.psnr) + 0.02 * step.psnr
                 shown = "" if self._psnr is None else f"{self._psnr:.2f} dB, "
                 bar.update(done, text=f"{shown}{len(trainer.rows)} Gaussians")
                 if done % preview_every == 0:
@@ -308,15 +308,15 @@ class _Loop:
             f"{plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
         )
 
-    def _log(self, row: dict) -> None:
-        """The events of a step (as `Trainer.step` returns it), and every so often the averages of the last ones."""
+    def _log(self, step: StepResult) -> None:
+        """The events of a step, and every so often the averages of the last ones."""
         done = self.trainer.step_index
-        for event in row["events"]:
+        for event in step.events:
             self.run_folder.log(event.pop("event"), step=done - 1, **event)
-        self._recent.append(row)
+        self._recent.append(step)
         if done % _LOG_EVERY == 0 or done == self.trainer.config.max_steps:
-            psnr = [r["psnr"] for r in self._recent if r["psnr"] is not None]
-            loss = [r["loss"] for r in self._recent if math.isfinite(r["loss"])]
+            psnr = [x.psnr for x in self._recent if x.psnr is not None]
+            loss = [x.loss for x in self._recent if math.isfinite(x.loss)]
             self.run_folder.log(
                 "train",
                 step=done,

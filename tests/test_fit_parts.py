@@ -25,7 +25,7 @@ from drgs.fitting.networks import Network, saved_networks
 from drgs.fitting.parts import Parts, parts_of
 from drgs.fitting.records import check_checkpoint, load_run
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.trainer import Trainer
+from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
 from drgs.metrics import evaluate
 from drgs.select import select
@@ -96,7 +96,7 @@ def one_thread():
     torch.set_num_threads(threads[1])
 
 
-def steps(trainer: Trainer, count: int) -> list[dict]:
+def steps(trainer: Trainer, count: int) -> list[StepResult]:
     return [trainer.step() for _ in range(count)]
 
 
@@ -104,15 +104,15 @@ def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path, one_thre
     """A term, features and a network take part in every step, and a checkpoint in the middle changes no bit."""
     whole, first = trainer_of(dataset), trainer_of(dataset)
     rows = steps(whole, 20)
-    assert rows[-1]["loss"] < rows[0]["loss"]
+    assert rows[-1].loss < rows[0].loss
     assert len(whole.rows) > len(dataset.points)
     features = whole.gaussians().features
     assert features.shape == (len(whole.rows), 3)
     assert bool(features.any())
-    told = {row["view"]: set(row["terms"]) for row in rows}
+    told = {row.view: set(row.terms) for row in rows}
     assert told["1"] == {"corrected", "opacity", "scale"}
     assert told["2"] == {"corrected", "near", "opacity", "scale"}
-    assert rows[5]["loss"] == pytest.approx(sum(rows[5]["terms"].values()), rel=1e-5)
+    assert rows[5].loss == pytest.approx(sum(rows[5].terms.values()), rel=1e-5)
     steps(first, 9)
     tensors, header = first.state()
     path = tmp_path / "state.safetensors"
@@ -223,7 +223,7 @@ def test_a_step_that_is_not_finite_leaves_networks_alone(dataset):  # noqa: F811
     steps(trainer, 2)
     trainer.parts.networks[0].module.gain.register_hook(lambda gradient: gradient * torch.nan)
     before = {name: x.clone() for name, x in trainer.parts.networks[0].state().items() if not name.endswith("calls")}
-    assert trainer.step()["events"][-1]["event"] == "skipped"
+    assert trainer.step().events[-1]["event"] == "skipped"
     after = trainer.parts.networks[0].state()
     assert [name for name, x in before.items() if not torch.equal(x, after[name])] == []
 

@@ -276,7 +276,7 @@ def test_bad_gradients_skip_the_step_and_ten_end_the_fit(dataset):
     before = trainer.gaussians().means.clone()
     trainer.parts = dataclasses.replace(good, terms=[Bad(0.2)])
     row = trainer.step()
-    assert [e["event"] for e in row["events"] if e["event"] == "skipped"] == ["skipped"]
+    assert [e["event"] for e in row.events if e["event"] == "skipped"] == ["skipped"]
     assert torch.equal(before, trainer.gaussians().means)
     trainer.parts = good
     trainer.step()

@@ -6,6 +6,7 @@ of random order. `drgs.train` adds files, progress and the command.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
@@ -25,10 +26,29 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["Trainer"]
+__all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10
 _RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # parts of names in a checkpoint, not of networks
+
+
+@dataclasses.dataclass(frozen=True)
+class StepResult:
+    """What one step was.
+
+    Attributes:
+        loss: Of its view, before the step, as all of these.
+        terms: Of the loss by name, those that this view has.
+        psnr: Of this view in dB; None where it is not finite.
+        view: Its name.
+        events: What is to be logged.
+    """
+
+    loss: float
+    terms: dict[str, float]
+    psnr: float | None
+    view: str
+    events: list[dict]
 
 
 class Trainer:
@@ -90,12 +110,9 @@ class Trainer:
         self.frames = [*self.frames, frame]
         self._queue = self._queue[:0]
 
-    def step(self) -> dict:
+    def step(self) -> StepResult:
         """One view, one optimizer step, and what is due at it.
 
-        Returns:
-            loss, terms (by name, those that this view has), psnr (of this view, before the step), view, and events (a
-            list of dicts, for the log).
         Raises:
             ValueError: After 10 steps in a row without a finite loss and gradient.
         """
@@ -128,13 +145,8 @@ class Trainer:
                     f"{done} (view {frame.name}); check the cameras, or lower the learning rates"
                 )
         self.step_index += 1
-        return {
-            "loss": float(loss.detach()),  # told, as all of these
-            "terms": terms,
-            "psnr": psnr_of(mse) if math.isfinite(mse) else None,
-            "view": frame.name,
-            "events": events,
-        }
+        psnr = psnr_of(mse) if math.isfinite(mse) else None
+        return StepResult(float(loss.detach()), terms, psnr, frame.name, events)  # told, not optimized
 
     def gaussians(self) -> Gaussians:
         """The Gaussians of the rows as they are, without a graph: those of a scene that moves are at rest."""
