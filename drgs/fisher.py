@@ -78,8 +78,9 @@ def diagonal(
             `probes`: mean of (J^T v)^2 over Rademacher v, unbiased, relative error about sqrt(2 / probes).
             `fisherrf`: what FisherRF's rasterizer computes: channels are summed before squaring, and the derivative of
             an activation is multiplied once instead of squared; no rotations.
-        groups: Those wanted; default all that the Gaussians have. Of a `drgs.ellipsoids.DeformableScene` also the names
-            of its own parameters, such as the weights of a network (`columns`, `probes`).
+        groups: Those wanted; default all of the Gaussians as the views see them. Of a `drgs.ellipsoids.DeformableScene`
+            a name in its `parameters()`, such as a weight of a network, is the scene's own tensor (`columns`,
+            `probes`), also where its Gaussians have the same name; `rotations` are then those of its `quats`.
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
         probes, seed: Of method `probes`.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
@@ -91,7 +92,8 @@ def diagonal(
         opacities. Of plain colors (N, D) the first three channels are `sh` (N, 1, min(D, 3)), divided by
         1 / (4 pi) about the colors themselves; the others are `features`, which say nothing about the geometry.
     Raises:
-        ValueError: If a method, group, weight or tensor is unknown or wrong, or a parameter is not finite.
+        ValueError: If a method, group, weight or tensor is unknown or wrong, a parameter is not finite, or the
+            Gaussians of a scene are not as many in all views.
     """
     if isinstance(gaussians, torch.Tensor):
         raise ArgumentError(
@@ -119,20 +121,25 @@ def diagonal(
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
     wanted = groups_of(seen, groups, gaussians)
     own = {name: group for name, group in wanted.items() if group.owner == "scene"}
-    if own and method not in ("columns", "probes"):
-        raise ValueError(
-            f"fisher.diagonal: method of group {next(iter(own))!r} must be 'columns' or 'probes', got {method!r}"
-        )
+    for name, group in own.items():
+        known = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
+        if method not in known:
+            raise ValueError(
+                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, known))}, got {method!r}; "
+                "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
+            )
     if method == "fisherrf":
         wanted = {name: group for name, group in wanted.items() if group.fisherrf}
     network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
     total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
     for number, camera in enumerate(cameras):
+        seen = gaussians_at("fisher.diagonal", gaussians, camera)
+        for name, group in wanted.items():
+            _check_same("fisher.diagonal", name, total[name], group.shape(seen))
         if not len(seen):
-            break
+            continue
         if backgrounds:  # every view has its own
             settings = settings.replace(background=backgrounds[number])
-        seen = gaussians_at("fisher.diagonal", gaussians, camera)
         theirs = {name: group for name, group in wanted.items() if name not in own}
         part: dict[str, torch.Tensor] = {}
         if method == "columns":
@@ -152,7 +159,7 @@ def diagonal(
 
 @alone
 def blocks(
-    gaussians: Gaussians,
+    gaussians: Scene,
     cameras: Camera | Sequence[Camera],
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
@@ -164,32 +171,37 @@ def blocks(
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
-    check_scene("fisher.blocks", gaussians, settings)
+    cameras = _cameras_of("fisher.blocks", gaussians, cameras, settings)
     settings = settings or RenderSettings.preset("exact")
-    total = torch.zeros(len(gaussians), BLOCK, BLOCK, dtype=torch.float64)
-    for camera in _cameras("fisher.blocks", cameras):
-        if len(gaussians):
-            total += Replay(gaussians, camera, settings).blocks(_weights(channel_weights))
+    count = len(gaussians_at("fisher.blocks", gaussians, cameras[0]))
+    total = torch.zeros(count, BLOCK, BLOCK, dtype=torch.float64)
+    for camera in cameras:
+        seen = gaussians_at("fisher.blocks", gaussians, camera)
+        _check_same("fisher.blocks", "blocks", total, (len(seen), BLOCK, BLOCK))
+        if len(seen):
+            total += Replay(seen, camera, settings).blocks(_weights(channel_weights))
     return total
 
 
 @alone
 def coverage(
-    gaussians: Gaussians, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
+    gaussians: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
 ) -> torch.Tensor:
     """(N,) float64 sum over views and pixels of w^2: the information about a color without direction."""
-    check_scene("fisher.coverage", gaussians, settings)
+    cameras = _cameras_of("fisher.coverage", gaussians, cameras, settings)
     settings = settings or RenderSettings.preset("exact")
-    total = torch.zeros(len(gaussians), dtype=torch.float64)
-    for camera in _cameras("fisher.coverage", cameras):
-        if len(gaussians):
-            total += Replay(gaussians, camera, settings, geometry=False).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
+    total = torch.zeros(len(gaussians_at("fisher.coverage", gaussians, cameras[0])), dtype=torch.float64)
+    for camera in cameras:
+        seen = gaussians_at("fisher.coverage", gaussians, camera)
+        _check_same("fisher.coverage", "coverage", total, (len(seen),))
+        if len(seen):
+            total += Replay(seen, camera, settings, geometry=False).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
     return total
 
 
 @alone
 def variance_map(
-    gaussians: Gaussians,
+    gaussians: Scene,
     camera: Camera,
     weights: Information,
     settings: RenderSettings | None = None,
@@ -203,19 +215,20 @@ def variance_map(
         gaussians, camera, settings, channel_weights: As for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0.
     """
-    check_view("fisher.variance_map", gaussians, camera, settings)
+    seen = gaussians_at("fisher.variance_map", gaussians, camera)
+    check_view("fisher.variance_map", seen, camera, settings)
     must_be("fisher.variance_map", "weights", weights, Mapping, "group -> tensor, as fisher.diagonal returns")
     settings = settings or RenderSettings.preset("exact")
-    known = {name: group for name, group in groups_of(gaussians).items() if group.spread}
+    known = {name: group for name, group in groups_of(seen).items() if group.spread}
     for name, x in weights.items():
         if name not in known:
             raise ValueError(f"fisher.variance_map: weights must be of {', '.join(known)}, got {name!r}")
-        shape = known[name].shape(gaussians)
+        shape = known[name].shape(seen)
         if tuple(x.shape) != shape:
             raise ValueError(f"fisher.variance_map: weights of {name} must have shape {shape}, got {tuple(x.shape)}")
-    if not len(gaussians):
+    if not len(seen):
         return torch.zeros(camera.height, camera.width)
-    return Replay(gaussians, camera, settings).variance(weights, _weights(channel_weights))
+    return Replay(seen, camera, settings).variance(weights, _weights(channel_weights))
 
 
 def jacobian_columns(
@@ -230,7 +243,9 @@ def jacobian_columns(
     Args:
         gaussians, camera, settings: As for `render`.
         index: Group -> integers. (M, 1 + axes) rows (gaussian, component...), (M,) for logit_opacities; `features` rows
-            are (gaussian, channel); `camera` (M,) of 0..5, the world-frame twist, rotation first.
+            are (gaussian, channel); `camera` (M,) of 0..5, the world-frame twist, rotation first. Of a
+            `drgs.ellipsoids.DeformableScene` the groups are its own tensors, by the names of its `parameters()`, and
+            rows are places in them.
         batch: Columns carried through one traversal.
     Returns:
         (columns, H, W, 3), float32, in the order of `index`; with features (columns, H, W, 3 + D).
@@ -266,13 +281,14 @@ def jacobian_columns(
     return torch.zeros(0, camera.height, camera.width, width)
 
 
-def pose_information(gaussians: Gaussians, camera: Camera, settings: RenderSettings | None = None) -> torch.Tensor:
+def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings | None = None) -> torch.Tensor:
     """(6, 6) float64: what a view says about its own pose.
 
     Of the world-frame twist c2w <- exp(xi) c2w, rotation (radians) first, then translation (world units).
     """
-    check_view("fisher.pose_information", gaussians, camera, settings)
-    columns = jacobian_columns(gaussians, camera, {"camera": range(6)}, settings)[..., :3]
+    seen = gaussians_at("fisher.pose_information", gaussians, camera)
+    check_view("fisher.pose_information", seen, camera, settings)
+    columns = jacobian_columns(seen, camera, {"camera": range(6)}, settings)[..., :3]
     flat = columns.reshape(6, -1).double()
     return flat @ flat.T
 
@@ -282,6 +298,23 @@ def _cameras(where: str, cameras: object) -> list[Camera]:
     if not cameras:
         raise ValueError("fisher: there must be at least one camera, got none")
     return cameras
+
+
+def _cameras_of(where: str, scene: object, cameras: object, settings: RenderSettings | None) -> list[Camera]:
+    """The cameras, if these are a scene and settings, too."""
+    check_any_scene(where, scene)
+    cameras = _cameras(where, cameras)
+    check_scene(where, gaussians_at(where, scene, cameras[0]), settings)
+    return cameras
+
+
+def _check_same(where: str, name: str, total: torch.Tensor, shape: tuple[int, ...]) -> None:
+    """Refuse to add up what views say about Gaussians that are not as many in each."""
+    if tuple(total.shape) != shape:
+        raise ValueError(
+            f"{where}: a scene must have as many Gaussians and coefficients in all views, got {name} of shape "
+            f"{tuple(total.shape)} in the first and {shape} in another; take views of one time"
+        )
 
 
 def _weights(channel_weights: Sequence[float]) -> list[float]:
@@ -298,7 +331,7 @@ def _tangent_shape(gaussians: Gaussians, name: str, scene: Scene) -> tuple[int, 
     """Of a group's tangent, or the pose's."""
     if name == "camera":
         return (6,)
-    known = groups_of(gaussians) | scene_groups(scene)
+    known = scene_groups(scene) or groups_of(gaussians)
     if name not in known:
         raise ValueError(f"fisher: a parameter group must be one of {', '.join(known)} or camera, got {name!r}")
     return known[name].tangent(gaussians)

@@ -101,19 +101,19 @@ def test_tangent_is_the_difference(view):
 
 
 def test_information_of_weights(view):
-    """By columns the squares of the Jacobian's columns; probes have that as their mean; other groups are unchanged."""
+    """By columns the squares of the Jacobian's columns; probes have that as their mean."""
     scene, cam = view
-    groups = ["means", "in.bias", "out.weight"]
+    groups = ["in.bias", "out.weight"]
     H = fisher.diagonal(scene, cam, FAST, "columns", groups=groups)
-    for name in groups[1:]:
+    for name in groups:
         rows = np.argwhere(np.ones(scene.weights[name].shape))
         columns = fisher.jacobian_columns(scene, cam, {name: rows}, FAST).double()
         torch.testing.assert_close(H[name].flatten(), columns.square().sum((1, 2, 3)))
         assert float(H[name].min()) > 0
-    still = fisher.diagonal(scene.at(cam.time), cam, FAST, "columns", groups=["means"])
-    assert torch.equal(H["means"], still["means"])
+    still = fisher.diagonal(scene.at(cam.time), cam, FAST)
+    assert torch.equal(fisher.diagonal(scene, cam, FAST)["means"], still["means"])
     probed = fisher.diagonal(scene, cam, FAST, "probes", groups=groups, probes=64)
-    for name in groups[1:]:
+    for name in groups:
         # Relative error sqrt(2 / 64) = 0.18 an entry; four times that of the worst, 1.5 times that of their mean.
         ratio = probed[name] / H[name]
         assert float((ratio - 1).abs().max()) < 0.7, name
@@ -191,3 +191,74 @@ def test_refusals(view):
         fisher.diagonal(scene.start, cam, FAST, "columns", groups=["in.bias"])
     with pytest.raises(ValueError, match=r"named among means, .* got 'weight'"):
         render_jvp(scene, cam, {"weight": torch.zeros(3)}, FAST)
+
+
+class Anchored(Swarm):
+    """Three anchors, each with copies of itself: its tensors are not as long as its Gaussians', but called the same."""
+
+    copies = 2
+
+    def __init__(self, start):
+        super().__init__(start.take(range(3)))
+
+    def deform(self, parameters, time):
+        p = dict(parameters)
+        for name in self.weights:
+            p.pop(name)
+        many = {name: torch.cat([x] * self.copies) for name, x in p.items()}
+        return Gaussians(**{**many, "means": many["means"] * torch.linspace(1, 1.5, len(many["means"]))[:, None]})
+
+
+def test_a_name_means_the_scene_everywhere(view):
+    """A group of a name in `parameters()` is the scene's tensor, in `diagonal` and in `jacobian_columns`."""
+    scene, cam = Anchored(view[0].start.replace(features=torch.ones(10, 4))), view[1]
+    groups = ["means", "rotations", "logit_opacities", "features"]
+    H = fisher.diagonal(scene, cam, FAST, "columns", groups=groups)
+    for name, shape in zip(groups, ((3, 3), (3, 3), (3,), (3, 4)), strict=True):
+        columns = fisher.jacobian_columns(scene, cam, {name: np.argwhere(np.ones(shape))}, FAST).double()
+        squares = columns[..., 3:] if name == "features" else columns[..., :3]
+        torch.testing.assert_close(H[name], squares.square().sum((1, 2, 3)).reshape(shape))
+        assert float(H[name].max()) > 0
+    probed = fisher.diagonal(scene, cam, FAST, "probes", groups=groups[:3], probes=64)
+    for name, found in probed.items():
+        assert abs(float(found.sum() / H[name].sum()) - 1) < 0.27, name  # as above
+    with pytest.raises(ValueError, match=r"index of means must be rows of 2 integers below \(3, 3\)"):
+        fisher.jacobian_columns(scene, cam, {"means": [[3, 0]]}, FAST)
+    with pytest.raises(ValueError, match=r"group 'means' must be .* got 'exact'; .* pass scene\.at\(time\)$"):
+        fisher.diagonal(scene, cam, FAST, groups=["means"])
+    with pytest.raises(ValueError, match="group 'features' must be 'columns', got 'probes'"):
+        fisher.diagonal(scene, cam, FAST, "probes", groups=["features"])
+
+
+def test_every_sum_takes_scenes_that_move(view):
+    """Each camera sees the Gaussians of its time."""
+    scene, cam = view
+    views = [cam, dataclasses.replace(cam, time=0.9)]
+    for summed in (fisher.blocks, fisher.coverage):
+        want = sum(summed(scene.at(each.time), each, FAST) for each in views)
+        assert torch.equal(summed(scene, views, FAST), want)
+    weights = fisher.diagonal(scene, cam, FAST)
+    weights = {name: weights[name] for name in ("log_scales", "sh")}
+    there = scene.at(cam.time)
+    assert torch.equal(fisher.variance_map(scene, cam, weights, FAST), fisher.variance_map(there, cam, weights, FAST))
+    assert torch.equal(fisher.pose_information(scene, cam, FAST), fisher.pose_information(there, cam, FAST))
+
+
+class Growing(Swarm):
+    """At time 0 nobody is there, later the first few."""
+
+    def deform(self, parameters, time):
+        return super().deform(parameters, time).take(range(round(10 * time)))
+
+
+def test_scenes_that_grow(view):
+    """What they say about a weight adds up, from an empty view on; there is no sum about their Gaussians."""
+    scene, cam = Growing(view[0].start), view[1]
+    views = [dataclasses.replace(cam, time=time) for time in (0.0, 0.4, 0.9)]
+    late = fisher.diagonal(scene, views[1:], FAST, "columns", groups=["in.bias"])["in.bias"]
+    assert float(late.min()) > 0
+    assert torch.equal(fisher.diagonal(scene, views, FAST, "columns", groups=["in.bias"])["in.bias"], late)
+    for summed in (fisher.diagonal, fisher.blocks, fisher.coverage):
+        for some in (views, views[1:]):
+            with pytest.raises(ValueError, match=rf"^fisher\.{summed.__name__}: a scene must have as many Gaussians"):
+                summed(scene, some, FAST)

@@ -1,7 +1,8 @@
 """Parameter groups of Fisher information. A group is one entry of `GROUPS`; nothing else asks for its name.
 
-A group belongs to the Gaussians, as a view sees them, or to the scene that they come from: each tensor of a
-`DeformableScene` that is none of theirs, such as a weight of a network, is a group (`scene_groups`).
+A group belongs to the Gaussians, as a view sees them, or to the scene that they come from: each float tensor of a
+`DeformableScene`, such as a weight of a network, is a group of that name (`scene_groups`). Where both have the name,
+such as `means`, it is the scene's.
 """
 
 from __future__ import annotations
@@ -106,27 +107,33 @@ GROUPS = {
         there=lambda g: g.features is not None,
     ),
 }
-_FIELDS = {group.input for group in GROUPS.values()}
 
 
 def scene_groups(scene) -> dict[str, Group]:
-    """The groups of a scene besides those of its Gaussians: none, unless it is a `DeformableScene`."""
+    """The groups of a scene itself: none, unless it is a `DeformableScene`, which may share names with its Gaussians.
+
+    Those that have `quats` have `rotations`, too.
+    """
     if not isinstance(scene, DeformableScene):
         return {}
-    own = {
-        name: tuple(x.shape) for name, x in scene.parameters().items() if name not in _FIELDS and x.is_floating_point()
-    }
-    return {
-        name: Group(shape=lambda _, shape=shape: shape, input=name, owner="scene", fisherrf=None)
-        for name, shape in own.items()
-    }
+    shapes = {name: tuple(x.shape) for name, x in scene.parameters().items() if x.is_floating_point()}
+    own = {name: _own(name, shape) for name, shape in shapes.items()}
+    if "quats" in shapes:
+        own["rotations"] = dataclasses.replace(_own("quats", (shapes["quats"][0], 3)), pull=_turned)
+    return own
+
+
+def _own(name: str, shape: tuple[int, ...]) -> Group:
+    """A scene's tensor; images of features tell about features only, RGB about all others."""
+    outputs = GROUPS["features"].outputs if name == "features" else (0, 3)
+    return Group(shape=lambda _: shape, input=name, owner="scene", fisherrf=None, outputs=outputs)
 
 
 def groups_of(gaussians, wanted=None, scene=None) -> dict[str, Group]:
-    """The groups that Gaussians have, or those of them and of their scene that are wanted, in the order of `GROUPS`.
+    """The groups that Gaussians have; or those that are wanted, of their scene where it has the name, else of them.
 
     Raises:
-        ValueError: If one is wanted that they do not have.
+        ValueError: If one is wanted that neither has.
     """
     if isinstance(wanted, str):
         wanted = (wanted,)
