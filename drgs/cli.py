@@ -110,7 +110,7 @@ class _Stderr(logging.StreamHandler):
 
 def _parse_arguments(argv: list[str]) -> Any:
     """The dataclass of the command in argv; tyro's framed usage errors become one line."""
-    commands = typing.Union[  # noqa: UP007 (built at run time)
+    commands: Any = typing.Union[  # noqa: UP007 (built at run time)
         tuple(Annotated[options, subcommand(name)] for name, options in _OPTIONS.items())
     ]
     errors = io.StringIO()
@@ -134,7 +134,8 @@ def _parse_arguments(argv: list[str]) -> Any:
 def _one_line(framed: str) -> str:
     """The message in tyro's box of box-drawing characters, with its first suggestion."""
     lines = [line.strip("╭╮╰╯│ ") for line in framed.splitlines()]
-    sections, title = [[]], True
+    sections: list[list[str]] = [[]]
+    title = True
     for line in lines:
         if title and "─" in line:  # the box's upper edge carries only a title
             title = False

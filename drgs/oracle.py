@@ -6,8 +6,9 @@ Torch in float64; autograd gives the gradients of whatever is built on it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -52,14 +53,14 @@ def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
     return torch.stack(basis, dim=-1)
 
 
-def float64(x) -> torch.Tensor:
+def float64(x: Any) -> torch.Tensor:
     """A tensor keeps its graph, anything else is copied."""
     if isinstance(x, torch.Tensor):
         return x.to("cpu", torch.float64)
     return torch.tensor(x, dtype=torch.float64)
 
 
-def activate(g, s: RenderSettings) -> SimpleNamespace:
+def activate(g: Any, s: RenderSettings) -> SimpleNamespace:
     """Activated parameters in float64, relative to the Gaussians' origin; `view_rays` says where that is."""
     raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
     means, quats, log_scales, logits, sh = map(float64, raw)
@@ -90,7 +91,7 @@ def activate(g, s: RenderSettings) -> SimpleNamespace:
     )
 
 
-def scale_and_shift(cam) -> tuple[torch.Tensor, torch.Tensor]:
+def scale_and_shift(cam: Any) -> tuple[torch.Tensor, torch.Tensor]:
     """Of K, in pixels: the (2, 2) that acts on x/z and y/z, skew included, and the principal point (2,).
 
     Raises:
@@ -102,7 +103,7 @@ def scale_and_shift(cam) -> tuple[torch.Tensor, torch.Tensor]:
     return K[:2, :2], K[:2, 2]
 
 
-def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def camera_rays(cam: Any, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixel centers (H*W, 2) and world directions (H*W, 3)."""
     v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
     u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
@@ -116,7 +117,9 @@ def camera_rays(cam, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     return torch.stack([u, v], dim=-1), local @ rotation
 
 
-def cull_near(scene: SimpleNamespace, rotation, center, s: RenderSettings, tolerance: float) -> SimpleNamespace:
+def cull_near(
+    scene: SimpleNamespace, rotation: torch.Tensor, center: torch.Tensor, s: RenderSettings, tolerance: float
+) -> SimpleNamespace:
     """Drops means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
     z = ((scene.means - center) @ rotation[2]).detach()  # culling has no derivative
     if s.near > 0:
@@ -129,7 +132,15 @@ def cull_near(scene: SimpleNamespace, rotation, center, s: RenderSettings, toler
     return take(scene, keep)
 
 
-def screen_rows(x, y, z, cam, fov_clamp: str, rotation: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
+def screen_rows(
+    x: torch.Tensor,
+    y: torch.Tensor,
+    z: torch.Tensor,
+    cam: Any,
+    fov_clamp: str,
+    rotation: torch.Tensor,
+    axes: torch.Tensor,
+) -> torch.Tensor:
     """(N, 2, 3) rows of J W R S: semi-axes (N, 3, 3) projected by the local affine approximation of the perspective.
 
     Args:
@@ -160,7 +171,7 @@ def sh_colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
     return (0.5 + (basis[..., None] * sh).sum(-2)).clamp(min=0)
 
 
-def view_rays(g, cam, rays, window=None) -> SimpleNamespace:
+def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | None = None) -> SimpleNamespace:
     """The rays to render, in the frame that the Gaussians' origin is 0 of.
 
     Args:
@@ -172,7 +183,8 @@ def view_rays(g, cam, rays, window=None) -> SimpleNamespace:
         (P, 2), and the shape of the image.
     """
     offset = float64(getattr(g, "origin", (0, 0, 0)))
-    rotation = center = None
+    rotation: torch.Tensor | Any = None  # Any: no camera, no pose, and then nobody reads it
+    center: torch.Tensor | Any = None
     if cam is not None:
         rotation, translation = rigid(float64(cam.w2c))
         center = -rotation.T @ translation - offset
@@ -203,7 +215,9 @@ def view_rays(g, cam, rays, window=None) -> SimpleNamespace:
     )
 
 
-def within(scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor):
+def within(
+    scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor
+) -> torch.Tensor:
     """(N,) bool, False only where no ray, extended to both sides, comes within `reach` (N,) sigma of a mean.
 
     Compares each bounding sphere with the cone around the rays; rays without a common origin keep all.

@@ -13,6 +13,7 @@ Any sensor, film and reconstruction filter. A box filter and one sample at the p
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import drjit as dr
 
@@ -22,13 +23,14 @@ from drgs.tracing.bvh import BvhTraversal
 from drgs.tracing.composite import Composite, Compositor
 from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.projection import project_world
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 
 mi = runtime.mitsuba()
 
 __all__ = ["DrgsIntegrator"]
 
 
-class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
+class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[name-defined]
     """Radiance field of one `ellipsoids` shape.
 
     Plugin parameters: `preset` (default `exact`; its traversal is replaced by `bvh`) and any field of `RenderSettings`
@@ -41,7 +43,7 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
         `drgs.render` with a pose that requires a gradient.
     """
 
-    def __init__(self, props):
+    def __init__(self, props: Any) -> None:
         super().__init__(props)
         fields = {"traversal": "bvh"}
         preset = props.get("preset", "exact")
@@ -51,12 +53,14 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
         self.settings = RenderSettings.preset(preset, **fields)
         self.pose = None
 
-    def sample_rays(self, scene, sensor, *args, **kwargs):
+    def sample_rays(self, scene: Any, sensor: Any, *args: Any, **kwargs: Any) -> tuple:
         """Mitsuba's, remembering where the camera is: rays start on the near plane, not at the camera."""
         self.pose = sensor.world_transform().matrix
         return super().sample_rays(scene, sensor, *args, **kwargs)
 
-    def sample(self, mode, scene, sampler, ray, δL, state_in, active, **kwargs):
+    def sample(
+        self, mode: dr.ADMode, scene: Any, sampler: Any, ray: Any, δL: Any, state_in: Any, active: Mask, **kwargs: Any
+    ) -> tuple:
         """Radiance along rays (Primal), its forward derivative, or back-propagation of δL."""
         if mode == dr.ADMode.Primal:
             L, alpha = self._trace(scene, ray)
@@ -71,7 +75,7 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
                 change = dr.forward_to(L)
         return change, active & (dr.detach(alpha) > 0), [], None  # a mask has no derivative
 
-    def _trace(self, scene, ray):
+    def _trace(self, scene: Any, ray: Any) -> tuple[Any, Float]:
         """(Color3f, alpha) of every ray."""
         lib, s = runtime.dr_types(), self.settings
         p, coefficients = _parameters(lib, scene)
@@ -96,12 +100,12 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):
         i = dr.arange(lib.UInt32, n)
         return mi.Color3f(*[dr.gather(lib.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
 
-    def to_string(self):
+    def to_string(self) -> str:
         """For Mitsuba's printout of a scene."""
         return f"DrgsIntegrator[{self.settings}]"
 
 
-def _camera_axes(lib, pose, origins):
+def _camera_axes(lib: Lib, pose: Any, origins: list[Float]) -> list[list[Float]]:
     """Rows of w2c: of the sensor (whose x and y point the other way), or at the first ray's origin in world axes."""
     if pose is None:
         axes = [[lib.Float64(float(r == c)) for c in range(3)] for r in range(3)]
@@ -113,7 +117,7 @@ def _camera_axes(lib, pose, origins):
     return [[*row, -sum(x * y for x, y in zip(row, center, strict=True))] for row in axes]
 
 
-def _parameters(lib, scene):
+def _parameters(lib: Lib, scene: Any) -> tuple[dict[str, Float], int]:
     """Raw parameter arrays of the scene's `ellipsoids` shape, attached to its AD graph."""
     shapes = [s for s in scene.shapes() if s.is_ellipsoids()]
     if len(shapes) != 1:
@@ -128,7 +132,7 @@ def _parameters(lib, scene):
     data, opacity, sh = params["data"], params["opacities"], params["sh_coeffs"]
     count = dr.width(data) // 10
 
-    def columns(width):
+    def columns(width: int) -> tuple[UInt32, UInt32]:
         j = dr.arange(lib.UInt32, count * width)
         return j // width * 10, j % width
 

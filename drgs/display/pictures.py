@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -179,9 +180,10 @@ class Video:
         fps: Frames a second.
     """
 
-    def __init__(self, path: str | os.PathLike, fps: float = 24.0):
+    def __init__(self, path: str | os.PathLike, fps: float = 24.0) -> None:
         self.path, self.fps = Path(path), fps
-        self._writer = self._size = None
+        self._writer: Any = None
+        self._size: tuple[int, int] | None = None
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Video:
@@ -235,7 +237,8 @@ class Video:
         import cv2
 
         with _no_native_stderr():  # OpenCV prints that it prefers another tag, and goes on
-            self._writer = cv2.VideoWriter(self._name, cv2.VideoWriter_fourcc(*"VP90"), self.fps, size)
+            tag = cv2.VideoWriter_fourcc(*"VP90")  # type: ignore[attr-defined]  # OpenCV's stubs leave it out
+            self._writer = cv2.VideoWriter(self._name, tag, self.fps, size)
         if not self._writer.isOpened():
             raise OSError(f"{self.path}: OpenCV must be able to encode VP9, this build cannot; use --format png")
         self._size = size

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from typing import Any
 
 __all__ = ["Bar"]
 
@@ -16,7 +17,7 @@ FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
 LEAST_OFTEN = 30.0
 _bars: list[Bar] = []  # that are open, the innermost last
-_output: _Lines | _Terminal | None = None  # there is one while one of them is shown
+_output: _Lines | _Terminal | Any = None  # None while none of them is shown
 
 
 class Bar:
@@ -32,7 +33,7 @@ class Bar:
 
     def __init__(
         self, label: str, total: int | None = None, show: bool | None = None, done: int = 0, lines_only: bool = False
-    ):
+    ) -> None:
         self.label, self.total, self.done, self.text = label, total, done, ""
         self.is_drawn, self.is_told = not lines_only, False
         self._show, self._before = show, done
@@ -40,7 +41,7 @@ class Bar:
 
     def __enter__(self) -> Bar:
         self.began = self._reached = time.monotonic()
-        self.is_shown = bool(_bars and _bars[-1].is_shown) if self._show is None else self._show
+        self.is_shown: bool = bool(_bars and _bars[-1].is_shown) if self._show is None else self._show
         _open(self)
         return self
 
@@ -116,7 +117,7 @@ def _close(bar: Bar) -> None:
 class _Lines:
     """Lines of the innermost bar, from a thread."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._began = self._last = time.monotonic()
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="drgs progress", daemon=True)
@@ -150,7 +151,7 @@ class _Lines:
 class _Terminal:
     """The innermost bar, drawn by rich."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         from rich import progress
         from rich.console import Console
 
@@ -164,7 +165,7 @@ class _Terminal:
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # what goes to a file stays there
         )
-        self._tasks: dict[Bar, int] = {}
+        self._tasks: dict[Bar, Any] = {}
 
     def draw(self, bar: Bar) -> None:
         if not bar.is_drawn:
@@ -173,8 +174,9 @@ class _Terminal:
             self._tasks[bar] = self._bars.add_task(bar.label, total=bar.total, completed=bar.done, count="", text="")
             self._bars.start()
         count = "" if bar.total is None else f"{bar.done}/{bar.total}"
-        shown = {"description": bar.label, "count": count, "text": bar.text}
-        self._bars.update(self._tasks[bar], completed=bar.done, total=bar.total, **shown)
+        self._bars.update(
+            self._tasks[bar], completed=bar.done, total=bar.total, description=bar.label, count=count, text=bar.text
+        )
         self._show_innermost()
 
     def erase(self, bar: Bar) -> None:

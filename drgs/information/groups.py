@@ -8,11 +8,12 @@ such as `means`, it is the scene's.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 
-from drgs.ellipsoids import DeformableScene
+from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.gain import Information
 from drgs.information.jacobian import GEOMETRY
 from drgs.tracing.pose import quaternion_product
@@ -53,12 +54,12 @@ class Group:
     merge: Callable = lambda squares: squares
     there: Callable = lambda _: True
 
-    def tangent(self, gaussians) -> tuple[int, ...]:
+    def tangent(self, gaussians: Gaussians) -> tuple[int, ...]:
         """Shape of a tangent in `render_jvp`."""
         return (self.columns or self.shape)(gaussians)
 
 
-def _geometry(first: int, count: int, name: str, **options) -> Group:
+def _geometry(first: int, count: int, name: str, **options: Any) -> Group:
     """`count` numbers a Gaussian from entry `first` of the rows on."""
     shape = (lambda g: (len(g), count)) if count > 1 else (lambda g: (len(g),))
     return Group(
@@ -109,7 +110,7 @@ GROUPS = {
 }
 
 
-def scene_groups(scene) -> dict[str, Group]:
+def scene_groups(scene: Scene | None) -> dict[str, Group]:
     """The groups of a scene itself: none, unless it is a `DeformableScene`, which may share names with its Gaussians.
 
     Those that have `quats` have `rotations`, too.
@@ -129,7 +130,9 @@ def _own(name: str, shape: tuple[int, ...]) -> Group:
     return Group(shape=lambda _: shape, input=name, owner="scene", fisherrf=None, outputs=outputs)
 
 
-def groups_of(gaussians, wanted=None, scene=None) -> dict[str, Group]:
+def groups_of(
+    gaussians: Gaussians, wanted: str | Sequence[str] | None = None, scene: Scene | None = None
+) -> dict[str, Group]:
     """The groups that Gaussians have; or those that are wanted, of their scene where it has the name, else of them.
 
     Raises:

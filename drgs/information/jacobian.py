@@ -8,15 +8,20 @@ a Gaussian (replay.py).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 
 from drgs.ellipsoids import Y_00
 from drgs.tracing.derivatives import if_any_hit
-from drgs.tracing.protocols import Sink
+from drgs.tracing.kernels import Channels, HitModel, Ray
+from drgs.tracing.protocols import Float, Lib, Mask, Sink, UInt32
 from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
+
+if TYPE_CHECKING:
+    from drgs.tracing.projection import Projected
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
 
@@ -24,7 +29,14 @@ GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order 
 _OPACITY, _COLOR, _SHAPE = 0, 1, 10  # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
 
 
-def extras(lib, response: Response, logit, projected, moved: list | None, color: list | None):
+def extras(
+    lib: Lib,
+    response: Response,
+    logit: Float,
+    projected: Projected,
+    moved: list[list[Float]] | None,
+    color: list[list[Float]] | None,
+) -> Float:
     """What hits need besides the record, packed (records.pack).
 
     Args:
@@ -53,12 +65,12 @@ class Row(NamedTuple):
         basis: SH basis along the ray; empty where SH are evaluated towards the mean.
     """
 
-    slopes: list | None
-    g: list | None
-    w: Any
-    turned: list | None
-    color: list | None
-    basis: list
+    slopes: list[Float] | Any
+    g: list[Float] | Any
+    w: Float
+    turned: list[list[Float]] | None
+    color: list[Float] | Any
+    basis: list[Float]
 
 
 class Rows:
@@ -71,13 +83,15 @@ class Rows:
         color: The color depends on the mean, through the direction.
     """
 
-    def __init__(self, model, channels, buffer, sink: Sink, finals, color: bool):
+    def __init__(
+        self, model: HitModel, channels: Channels, buffer: Float | None, sink: Sink, finals: list[dict], color: bool
+    ) -> None:
         self.m, self.channels, self.sink, self.finals = model, channels, sink, finals
         self.buffer, self.color = buffer, color
         self.size = packed_size(_SHAPE + model.response.extra)
         self.colors = buffer is not None or sink.needs_color
 
-    def init(self, k, alive, nowhere) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
         """State of shared ray k: what is left of each channel behind the last hit."""
         lib, final = self.m.lib, self.finals[k]
         D = lib.Float64
@@ -86,11 +100,11 @@ class Rows:
         state = {"T": lib.Float(1), "rest": rest, "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0)}
         return {**state, **self.sink.init()}
 
-    def shade(self, index, rays, states, places, active):
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit of each of `rays`."""
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
-    def _take(self, index, rays, states, places, active):
+    def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Replay a hit that some ray of the packet has: B_c as in derivatives.py, exact as the sums are float64."""
         m, lib, rows, out = self.m, self.m.lib, [], []
         D = lib.Float64
@@ -107,7 +121,7 @@ class Rows:
                 at_end = at_end & (p == q)
             new["alive"] = dr.select(at_end, 0, st["alive"])
             slopes = g = turned = None
-            color = self.channels.values(m, loaded, ray) if self.colors else None
+            color: list[Float] | Any = self.channels.values(m, loaded, ray) if self.colors else None
             if extra:
                 rest = [r - D(w) * D(c) for r, c in zip(st["rest"], color, strict=True)]
                 new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
@@ -125,13 +139,13 @@ class Rows:
             out.append(new)
         return self.sink.take(lib, index, hits, rows, out)
 
-    def _slopes(self, record, extra, ray) -> list:
+    def _slopes(self, record: list[Float], extra: list[Float], ray: Ray) -> list[Float]:
         """The GEOMETRY derivatives of the opacity of a hit, before the clamp at alpha_max."""
         *slopes, strength = self.m.response.slopes(record, extra[_SHAPE:], ray, self.m.world)
         return [*slopes, strength * extra[_OPACITY]]
 
 
-def _entry(slopes, g, turned, j, c):
+def _entry(slopes: list[Float], g: list[Float], turned: list[list[Float]] | None, j: int, c: int) -> Float:
     """dC_c / d(geometry j)."""
     value = g[c] * slopes[j]
     return value + turned[c][j] if turned and j < 3 else value
@@ -148,7 +162,16 @@ class Diagonal:
         summed: Sum the channels before squaring, as FisherRF does.
     """
 
-    def __init__(self, lib, count: int, weights, entries, mode, bands: int = 0, summed: bool = False):
+    def __init__(
+        self,
+        lib: Lib,
+        count: int,
+        weights: Sequence[float],
+        entries: Sequence[int],
+        mode: dr.ReduceMode,
+        bands: int = 0,
+        summed: bool = False,
+    ) -> None:
         self.width = GEOMETRY + 1 + 3 * bands
         self.buffer = dr.zeros(lib.Float, count * self.width)
         self.weights, self.entries, self.mode, self.bands, self.summed = weights, entries, mode, bands, summed
@@ -158,7 +181,7 @@ class Diagonal:
         """Nothing is kept per ray."""
         return {}
 
-    def take(self, lib, index, hits, rows, states):
+    def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""
         for k in self.entries:
             total = lib.Float(0)
@@ -176,7 +199,7 @@ class Diagonal:
         return states
 
 
-def weighted_squares(row: Row, j: int, weights, summed=False):
+def weighted_squares(row: Row, j: int, weights: Sequence[float], summed: bool = False) -> Float:
     """sum_c weight_c (dC_c / d(geometry j))^2."""
     slopes, g, turned = row.slopes, row.g, row.turned
     if summed:
@@ -195,7 +218,7 @@ class Blocks:
     WIDTH = SIZE * (SIZE + 1) // 2
     needs_color = True
 
-    def __init__(self, lib, count: int, weights, mode):
+    def __init__(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode) -> None:
         self.buffer = dr.zeros(lib.Float, count * self.WIDTH)
         self.weights, self.mode = weights, mode
 
@@ -203,7 +226,7 @@ class Blocks:
         """Nothing is kept per ray."""
         return {}
 
-    def take(self, lib, index, hits, rows, states):
+    def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""
         full = []
         for row in rows:
@@ -234,14 +257,14 @@ class Variance:
 
     needs_color = False
 
-    def __init__(self, buffer, weights, light=None):
+    def __init__(self, buffer: Float, weights: Sequence[float], light: Float | None = None) -> None:
         self.buffer, self.weights, self.light = buffer, weights, light
 
     def init(self) -> dict:
         """The sum along a ray."""
         return {"variance": type(self.buffer)(0)}
 
-    def take(self, lib, index, hits, rows, states):
+    def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows to their rays."""
         v = list(dr.gather(lib.ArrayXf, self.buffer, index, hits, shape=(16, dr.width(index))))
         out = []

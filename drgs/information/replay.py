@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import torch
@@ -13,6 +14,7 @@ from drgs.tracing.bridge import own_errors, to_drjit
 from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.pose import quaternion_product
+from drgs.tracing.protocols import Float
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -27,7 +29,7 @@ __all__ = ["Replay", "by_probes"]
 class Replay:
     """A view rendered once, to be replayed for information."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True):
+    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True) -> None:
         # Without a graph of torch: information is a number, and its derivatives are taken here.
         self.call = call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset())
         self.lib, self.settings, self.count = call.lib, settings, len(gaussians)
@@ -38,7 +40,8 @@ class Replay:
             self.compositor.forward(*arguments, keep=True)
         p = {name: x.array for name, x in self.inputs.items()}
         self.along_ray = settings.sh_direction == "ray"
-        self.color, self.extras, self.light = False, None, None
+        self.color, self.extras = False, None
+        self.light: torch.Tensor | Any = None  # of SH along each ray, once `sums` or `sh_spread` was called
         if not geometry:
             return
         moved_color = None
@@ -56,7 +59,7 @@ class Replay:
         )
         dr.eval(self.extras)
 
-    def _colors(self, p):
+    def _colors(self, p: dict) -> tuple[list[Float], list[Float], list[list[Float]] | None]:
         """Per channel where the color is not clamped, the SH basis, and dc/dmu (None for degree 0)."""
         lib, K = self.lib, self.call.coefficients
         i = dr.arange(lib.UInt32, self.count)
@@ -92,7 +95,7 @@ class Replay:
             moved.append([lit[c] * inverse * (slope[j] - radial * d[j]) for j in range(3)])
         return lit, basis_width, moved
 
-    def _moved_records(self):
+    def _moved_records(self) -> list[list[Float]] | None:
         """Tangents of the records along means, rotations and log-scales, for a response that asks for them."""
         if not self.compositor.model.response.by_tangents:
             return None
@@ -117,7 +120,7 @@ class Replay:
         c = self.compositor
         return part.run(Rows(c.model, c.passes[0], self.extras, sink, finals, self.color))
 
-    def _summed(self, sink_of, width: int) -> torch.Tensor:
+    def _summed(self, sink_of: Callable[[dr.ReduceMode], Diagonal | Blocks], width: int) -> torch.Tensor:
         """(N, width) float64: what `sink_of(reduce mode)` sums up in its `buffer`, over all parts."""
         total = torch.zeros(self.count, width, dtype=torch.float64)
         for part, finals in self.compositor.finals[0]:
@@ -127,7 +130,7 @@ class Replay:
             total += _torch(sink.buffer).reshape(total.shape)
         return total
 
-    def sums(self, entries, weights, summed: bool = False) -> torch.Tensor:
+    def sums(self, entries: Sequence[int], weights: Sequence[float], summed: bool = False) -> torch.Tensor:
         """(N, 11) float64: squares of the geometry, and sum w^2; those of SH along each ray are kept in `light`."""
         bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
         made = lambda mode: Diagonal(self.lib, self.count, weights, entries, mode, bands, summed)  # noqa: E731
@@ -135,7 +138,7 @@ class Replay:
         self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
         return total[:, : GEOMETRY + 1]
 
-    def diagonal(self, groups: dict, weights, fisherrf: bool) -> Information:
+    def diagonal(self, groups: dict, weights: Sequence[float], fisherrf: bool) -> Information:
         """`fisher.diagonal` of one view."""
         entries = sorted({k for group in groups.values() for k in group.entries})
         sums, result = self.sums(entries, weights, fisherrf), {}
@@ -146,7 +149,7 @@ class Replay:
                 result[name] = result[name] / group.fisherrf(self.call.inputs)
         return result
 
-    def blocks(self, weights) -> torch.Tensor:
+    def blocks(self, weights: Sequence[float]) -> torch.Tensor:
         """`blocks` of one view."""
         lib, size = self.lib, Blocks.SIZE
         total = self._summed(lambda mode: Blocks(lib, self.count, weights, mode), Blocks.WIDTH)
@@ -156,12 +159,13 @@ class Replay:
         full[:, column, row] = total
         return full
 
-    def variance(self, information: Information, weights) -> torch.Tensor:
+    def variance(self, information: Information, weights: Sequence[float]) -> torch.Tensor:
         """`variance_map`."""
-        lib, camera = self.lib, self.call.camera
+        lib = self.lib
         table = torch.zeros(self.count, 16, dtype=torch.float64)
         for name, values in information.items():
             group = GROUPS[name]
+            assert group.spread is not None, name  # `variance_map` has refused the others
             spread = group.spread(values.double().cpu(), self)
             # Squared weights w^2 are of one channel each.
             first = group.entries[0]
@@ -169,14 +173,14 @@ class Replay:
         if not torch.isfinite(table).all():
             raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
         buffer = to_drjit(lib, table.float().reshape(-1).to(self.call.home)).array
-        image = dr.zeros(lib.Float, camera.width * camera.height)
+        image = dr.zeros(lib.Float, self.call.pixels)
         light = None if self.light is None else to_drjit(lib, self.light.float().reshape(-1).to(self.call.home)).array
         for part, finals in self.compositor.finals[0]:
             states = self._replay(part, finals, Variance(buffer, weights, light))
             for state, at, inside in zip(states, part.flat, part.inside, strict=True):
                 dr.scatter(image, state["variance"], at, inside)
         dr.eval(image)
-        return image.torch().cpu().reshape(camera.height, camera.width)
+        return image.torch().cpu().reshape(self.call.shape)
 
     def sh_information(self, squares: torch.Tensor) -> torch.Tensor:
         """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2; call after `sums`."""
@@ -204,7 +208,7 @@ def by_probes(
     camera: Camera,
     settings: RenderSettings,
     groups: dict,
-    weights,
+    weights: Sequence[float],
     probes: int,
     seed: int,
     scene: DeformableScene | None = None,
@@ -227,7 +231,8 @@ def by_probes(
     compositor, arguments = call.prepare(inputs)
     # The compositor's adjoint is called by hand: of the graph only what leads to its arguments is recorded.
     with dr.suspend_grad():
-        compositor.forward(*dr.detach(list(arguments)), keep=True)
+        record, sh, features, carried = dr.detach(list(arguments))
+        compositor.forward(record, sh, features, carried, keep=True)
     attached = {"record": arguments.record, "sh": arguments.sh}
     root = torch.tensor(weights).sqrt()
     for _ in range(probes if groups else 0):
@@ -256,5 +261,5 @@ def _unit(k: int) -> list[float]:
     return [float(j == k) for j in range(3)]
 
 
-def _torch(x) -> torch.Tensor:
+def _torch(x: Float) -> torch.Tensor:
     return x.torch().double().cpu()

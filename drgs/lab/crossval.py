@@ -87,8 +87,8 @@ class Result:
                 what = "lower: hits are missing" if bias < 0 else "higher"
                 lines.append(f"view {view.view}: alpha is {abs(bias):.1e} {what} on average")
         for name, group in self.groups.items():
-            what = group.verdict + (f": {group.why}" if group.why else "")
-            lines.append(f"{name}: {what}; relative difference {group.relative:.2g}, cosine {group.cosine:.6f}")
+            verdict = f"{group.verdict}: {group.why}" if group.why else group.verdict
+            lines.append(f"{name}: {verdict}; relative difference {group.relative:.2g}, cosine {group.cosine:.6f}")
         return lines
 
 
@@ -136,7 +136,8 @@ def crossval(
     places: list[Crop | None] = [None] * asked
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
         say("crops")
-        g, cameras, places = crops(g, cameras, starts[0].settings)
+        g, cameras, cropped = crops(g, cameras, starts[0].settings)
+        places = [*cropped]
     dtype = getattr(rasterizer, "dtype", torch.float32)
     raw, signs = with_pose(raw_of(g)), cotangents(cameras, seed)
     say("images")
