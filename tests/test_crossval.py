@@ -110,7 +110,12 @@ def _check(name, g, cameras, background, preset):
 
 
 @pytest.mark.parametrize(
-    ("name", "seed"), [(name, seed) for name, d in DEFECTS.items() for seed in range(1 if d.kind == "beside" else 3)]
+    ("name", "seed"),
+    [
+        pytest.param(name, seed, marks=[pytest.mark.slow] if seed == 2 else [])
+        for name, d in DEFECTS.items()
+        for seed in range(1 if d.kind == "beside" else 3)
+    ],
 )
 def test_every_defect_is_named(name, seed):
     """What is broken is named with the right groups and kind, on three random scenes (one for pose and channels)."""
