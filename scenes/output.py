@@ -68,6 +68,10 @@ def publish(out_dir, parameters, fill, where):
                 )
         partial = output.path / _PARTIAL
         mark = partial / ".parameters"
+        if not _is_ours(partial, mark):
+            raise ValueError(
+                f"{where}: {partial} must be what an interrupted call has left, it was not made here; move it away"
+            )
         if not (mark.is_file() and mark.read_text() == digest):
             unfinished.delete(partial)
             partial.mkdir()
@@ -82,11 +86,21 @@ def publish(out_dir, parameters, fill, where):
         write_file(partial / "params.json", stamped.encode())
         for path in _content(output):
             output.remove(path)
-        mark.unlink()
         for path in sorted(partial.iterdir(), key=lambda path: path.name == "params.json"):
-            output.put(path, path.name)
+            if path != mark:  # last: while anything is in the folder, the mark says whose it is
+                output.put(path, path.name)
+        mark.unlink()
         partial.rmdir()
     return out_dir
+
+
+def _is_ours(partial, mark):
+    """Whether there is nothing of somebody else's at the hidden folder: no folder, an empty one, or one with a mark."""
+    if not os.path.lexists(partial):
+        return True
+    if partial.is_symlink() or not partial.is_dir():
+        return False
+    return mark.is_file() or all(path.name == _part(mark).name for path in partial.iterdir())
 
 
 def _content(output):
@@ -96,13 +110,18 @@ def _content(output):
 
 def write_file(path, content):
     """Writes bytes under a name that appears when they are complete."""
-    hidden = path.with_name(f".{path.name}.part")
+    hidden = _part(path)
     try:
         hidden.write_bytes(content)
         os.replace(hidden, path)
     except OSError as error:
         hidden.unlink(missing_ok=True)
         raise OSError(f"scenes: {path} must be writable, got: {error.strerror}; free space") from None
+
+
+def _part(path):
+    """What a file is called while `write_file` writes it."""
+    return path.with_name(f".{path.name}.part")
 
 
 def write_png(path, picture):

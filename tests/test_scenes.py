@@ -204,6 +204,53 @@ def test_other_parameters_start_anew(tmp_path):
     assert sorted(p.name for p in (tmp_path / "set").iterdir()) == [".drgs.jsonl", "b", "params.json"]
 
 
+def test_a_hidden_folder_of_the_users_stays(tmp_path):
+    """A `.drgs.scene` without the mark of an interrupted call is refused, be it a folder, a file or a link."""
+    (tmp_path / "users").mkdir()
+    (tmp_path / "users" / "mine").write_text("precious")
+    for kind in ("folder", "file", "link"):
+        hidden = tmp_path / kind / ".drgs.scene"
+        hidden.parent.mkdir()
+        if kind == "link":
+            hidden.symlink_to(tmp_path / "users")
+        elif kind == "file":
+            hidden.write_text("precious")
+        else:
+            hidden.mkdir()
+            (hidden / "mine").write_text("precious")
+        with pytest.raises(ValueError, match="it was not made here; move it away"):
+            output.publish(tmp_path / kind, {"n": 1}, lambda folder: None, "test")
+        assert (hidden if kind == "file" else hidden / "mine").read_text() == "precious"
+
+
+def test_killed_while_it_is_published(tmp_path, monkeypatch):
+    """Whichever file was moved last, the same call then makes the whole set."""
+
+    def fill(folder):
+        for name in ("a", "b", "c"):
+            output.write_file(folder / name, name.encode())
+
+    from drgs.guards.outputs import Claim
+
+    put = Claim.put
+    for moved in range(4):
+        left = [moved]
+
+        def stop(claim, path, name, left=left):
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+            put(claim, path, name)
+
+        monkeypatch.setattr(Claim, "put", stop)
+        with pytest.raises(KeyboardInterrupt):
+            output.publish(tmp_path / str(moved), {"n": 1}, fill, "test")
+        monkeypatch.setattr(Claim, "put", put)
+        output.publish(tmp_path / str(moved), {"n": 1}, fill, "test")
+        names = sorted(path.name for path in (tmp_path / str(moved)).iterdir())
+        assert names == [".drgs.jsonl", "a", "b", "c", "params.json"]
+
+
 def test_leftovers_of_killed_runs_go(tmp_path):
     """What a killed process left is removed by the next run."""
     (tmp_path / "set" / ".drgs.scene.abcdefgh.tmp").mkdir(parents=True)
