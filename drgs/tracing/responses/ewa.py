@@ -14,7 +14,7 @@ import drjit as dr
 from drgs.tracing import records as layout
 from drgs.tracing.protocols import Float, Lib, Mask
 from drgs.tracing.records import cross, dot
-from drgs.tracing.responses.peak import deviation
+from drgs.tracing.responses.peak import AlphaStrength, deviation
 
 if TYPE_CHECKING:
     from drgs.tracing.kernels import Ray
@@ -25,7 +25,7 @@ __all__ = ["Ewa"]
 _SHAPE = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
 
 
-class Ewa:
+class Ewa(AlphaStrength):
     """A Gaussian of the image plane; t* is the Gaussian's own depth."""
 
     name = "ewa"
@@ -33,14 +33,6 @@ class Ewa:
     at_most_alpha = True
     extra = 9 * len(_SHAPE)
     by_tangents = True
-
-    def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
-        """Alpha itself."""
-        return opacity
-
-    def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
-        """1 - alpha, without its cancellation."""
-        return dr.select(logit >= 0, e, 1) / (1 + e)
 
     # -- once a Gaussian and view ------------------------------------------------------------------------------------
 
@@ -95,10 +87,6 @@ class Ewa:
         c1, c2, _, _ = _offset(r, ray)
         return dr.fma(c1, c1, c2 * c2), r[layout.H1], None
 
-    def opacity(self, x: Float, u: Float | None) -> Float:
-        """alpha exp(-d^T Sigma'^-1 d / 2)."""
-        return x
-
     def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """Through the tangents of the triangular factor and of the projected mean (`extras`)."""
         c1, c2, dx, dy = _offset(r, ray)
@@ -111,10 +99,6 @@ class Ewa:
         return [*slopes, a]
 
     # -- once a tile -------------------------------------------------------------------------------------------------
-
-    def least_strength(self, alpha_min: float) -> float:
-        """The opacity is the strength times exp(-rho^2 / 2)."""
-        return alpha_min
 
     def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution; 1.0001 is more than float32 rounds."""

@@ -34,20 +34,13 @@ if TYPE_CHECKING:
     from drgs.tracing.kernels import Ray
     from drgs.tracing.projection import Activated, Projected, Screen
 
-__all__ = ["Peak", "approach", "deviation", "times"]
+__all__ = ["AlphaStrength", "Peak", "approach", "deviation", "times"]
 
 _FAR = 3.0e38
 
 
-class Peak:
-    """a = alpha exp(-rho^2 / 2); peaks behind the origin of the ray do not count."""
-
-    name = "peak"
-    front_only = True
-    at_most_alpha = True
-    # The plane (u, v) of o' x d' in the axes that directions are stored along (6), R S^-1, R S and those axes (27).
-    extra = 33
-    by_tangents = False
+class AlphaStrength:
+    """What stands for alpha in the record is alpha itself, and x = strength exp(-rho^2 / 2) the opacity of a hit."""
 
     def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
         """Alpha itself."""
@@ -56,6 +49,25 @@ class Peak:
     def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
         """1 - alpha, without its cancellation."""
         return dr.select(logit >= 0, e, 1) / (1 + e)
+
+    def least_strength(self, alpha_min: float) -> float:
+        """The opacity is the strength times exp(-rho^2 / 2)."""
+        return alpha_min
+
+    def opacity(self, x: Float, u: Float | None) -> Float:
+        """x itself."""
+        return x
+
+
+class Peak(AlphaStrength):
+    """a = alpha exp(-rho^2 / 2); peaks behind the origin of the ray do not count."""
+
+    name = "peak"
+    front_only = True
+    at_most_alpha = True
+    # The plane (u, v) of o' x d' in the axes that directions are stored along (6), R S^-1, R S and those axes (27).
+    extra = 33
+    by_tangents = False
 
     # -- once a Gaussian and view ------------------------------------------------------------------------------------
 
@@ -136,10 +148,6 @@ class Peak:
     def _u_on_screen(self, r: list[Float], along: Float, inverse: Float) -> Float | None:
         return None
 
-    def opacity(self, x: Float, u: Float | None) -> Float:
-        """alpha exp(-rho^2 / 2)."""
-        return x
-
     def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """a times the derivatives of -rho^2 / 2 (module docstring)."""
         p, _, _, rho2 = self._peak(r, extra, ray, world)
@@ -162,10 +170,6 @@ class Peak:
         return [x * inverse for x in cross(q, d)], [x * root for x in d], u, rho2
 
     # -- once a tile -------------------------------------------------------------------------------------------------
-
-    def least_strength(self, alpha_min: float) -> float:
-        """The opacity is the strength times exp(-rho^2 / 2)."""
-        return alpha_min
 
     def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution, or (if only peaks in front count) all of it is behind."""
