@@ -34,7 +34,7 @@ from drgs.information.replay import Replay, by_probes
 from drgs.integrator import render_jvp
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
-from drgs.splats import SplatTensors, scene_of
+from drgs.splats import SplatScene, SplatTensors, scene_of
 
 __all__ = [
     "BLOCK",
@@ -95,42 +95,19 @@ def diagonal(
         ValueError: If a method, group, weight or tensor is unknown or wrong, a parameter is not finite, or the
             Gaussians of a scene are not as many in all views.
     """
-    if isinstance(gaussians, torch.Tensor):
-        raise ArgumentError(
-            "fisher.diagonal: tensors must be passed by name, got one by place; use means=..., quats=..."
-        )
-    if splats and (gaussians is not None or cameras is not None):
-        raise ArgumentError(
-            f"fisher.diagonal: it must get Gaussians and cameras or the tensors of both, got {next(iter(splats))} "
-            "besides; pass either"
-        )
-    backgrounds = []
+    backgrounds: list[tuple[float, ...]] = []
     weights, channels = _weights(channel_weights), 3
-    if splats:
+    if splats or isinstance(gaussians, torch.Tensor):
+        scene = _scene_of_tensors(gaussians, cameras, splats)
         settings = settings or RenderSettings.preset("gsplat")
-        scene = scene_of("fisher.diagonal", splats)
-        gaussians, cameras = scene.gaussians, scene.cameras
-        backgrounds, channels = scene.backgrounds, scene.channels
+        gaussians, cameras, backgrounds, channels = scene.gaussians, scene.cameras, scene.backgrounds, scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
     check_any_scene("fisher.diagonal", gaussians)
     cameras = _cameras("fisher.diagonal", cameras)
     seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
     check_scene("fisher.diagonal", seen, settings)
     settings = settings or RenderSettings.preset("exact")
-    if method not in METHODS:
-        raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    wanted = groups_of(seen, groups, gaussians)
-    own = {name: group for name, group in wanted.items() if group.owner == "scene"}
-    for name, group in own.items():
-        known = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
-        if method not in known:
-            raise ValueError(
-                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, known))}, got {method!r}; "
-                "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
-            )
-    if method == "fisherrf":
-        wanted = {name: group for name, group in wanted.items() if group.fisherrf}
-    network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
+    wanted = _checked_groups(groups_of(seen, groups, gaussians), method)
     total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
     for number, camera in enumerate(cameras):
         seen = gaussians_at("fisher.diagonal", gaussians, camera)
@@ -140,7 +117,9 @@ def diagonal(
             continue
         if backgrounds:  # every view has its own
             settings = settings.replace(background=backgrounds[number])
+        own = {name: group for name, group in wanted.items() if group.owner == "scene"}
         theirs = {name: group for name, group in wanted.items() if name not in own}
+        network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
         part: dict[str, torch.Tensor] = {}
         if method == "columns":
             part |= _by_columns(seen, camera, settings, theirs, weights)
@@ -155,6 +134,34 @@ def diagonal(
     if "sh" in total:
         total["sh"] = total["sh"][..., :channels]
     return total
+
+
+def _scene_of_tensors(gaussians: object, cameras: object, splats: SplatTensors) -> SplatScene:
+    """What `diagonal` is asked about by the tensors of `drgs.rasterization`, which must then be all that it gets."""
+    if isinstance(gaussians, torch.Tensor):
+        raise ArgumentError(
+            "fisher.diagonal: tensors must be passed by name, got one by place; use means=..., quats=..."
+        )
+    if gaussians is not None or cameras is not None:
+        raise ArgumentError(
+            f"fisher.diagonal: it must get Gaussians and cameras or the tensors of both, got {next(iter(splats))} "
+            "besides; pass either"
+        )
+    return scene_of("fisher.diagonal", splats)
+
+
+def _checked_groups(wanted: dict[str, Group], method: str) -> dict[str, Group]:
+    """Those of the wanted groups that a method has, which must know tensors of a scene where there are any."""
+    if method not in METHODS:
+        raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
+    for name, group in wanted.items():
+        known = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
+        if group.owner == "scene" and method not in known:
+            raise ValueError(
+                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, known))}, got {method!r}; "
+                "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
+            )
+    return {name: group for name, group in wanted.items() if method != "fisherrf" or group.fisherrf}
 
 
 @alone

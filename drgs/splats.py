@@ -21,6 +21,7 @@ from drgs.ellipsoids import Y_00, Gaussians
 from drgs.guards.arguments import ArgumentError
 
 __all__ = [
+    "SplatScene",
     "SplatTensors",
     "Splats",
     "cameras_of",
