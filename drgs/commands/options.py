@@ -8,13 +8,22 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
-from drgs.commands.overrides import check_color, parsed
-from drgs.fitting.config import ActiveConfig, Degree, FitConfig, InitPoints, MaskUse, PickPoints
-from drgs.information.choices import Criterion, Method, Policy
+from drgs.commands.option_groups import Around, Choosing, Common, Data, Informed, OutputPath, Settings, Split
+from drgs.commands.overrides import check_color
+from drgs.fitting.config import (
+    ActiveConfig,
+    Degree,
+    FeatureSize,
+    FitConfig,
+    InitPoints,
+    MaskUse,
+    PickPoints,
+    SemanticUse,
+)
 from drgs.settings import Preset, RenderSettings
 
 __all__ = [
@@ -32,107 +41,9 @@ __all__ = [
     "Tradeoff",
 ]
 
-_Output = Annotated[Path, arg(aliases=["-o"])]
-Split = Literal["all", "train", "test"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Common:
-    """Options that every command has."""
-
-    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb"] = "auto"
-    """Backend; auto follows DRGS_VARIANT, then CUDA if it works, else LLVM."""
-    threads: int | None = None
-    """Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core."""
-    quiet: bool = False
-    """Print neither progress nor results, which are in the files; only warnings and errors."""
-    debug: bool = False
-    """Show the traceback of an error."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Settings(_Common):
-    """Options of commands that render."""
-
-    preset: Preset = "exact"
-    """Render settings of a named system."""
-    overrides: Annotated[
-        tuple[str, ...],
-        arg(name="set", metavar="KEY=VALUE", help="Replace one render setting, e.g. order=ray."),
-        UseAppendAction,
-    ] = ()
-
-    def settings(self) -> RenderSettings:
-        """The `RenderSettings` that --preset and --set describe.
-
-        Raises:
-            ValueError: If an override is no KEY=VALUE, names no field or has the wrong type.
-        """
-        return RenderSettings.preset(self.preset, **self.replaced())
-
-    def replaced(self) -> dict[str, Any]:
-        """The fields that --set replaces.
-
-        Raises:
-            ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
-        """
-        return parsed(self.overrides)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Data:
-    """Options of commands that load data sets."""
-
-    strict: bool = False
-    """Refuse a data set that lists images which are not there; else at least 3 must be, and the others are left out."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Around:
-    """Options of commands that can make cameras around a scene; what is not given is as a run's photographs or the
-    known views have it, where there are any.
-    """
-
-    up: Literal["auto", "x", "y", "z", "minus-x", "minus-y", "minus-z"] = "auto"
-    """World direction that is up on an orbit or a dome; auto: as the photographs, else minus-y."""
-    center: tuple[float, float, float] | None = None
-    """World point that an orbit or a dome looks at; default as the photographs, else the middle of the Gaussians."""
-    distance: float | None = None
-    """From that point, in scene units; default the photographs' median, else so that all is in the frame."""
-    elevation: float | None = None
-    """Degrees of an orbit above its center; default the photographs' median, else 20."""
-    span: float | None = None
-    """Degrees of an orbit; default as the photographs (select, fisher: 360 if they look at a point), else 360."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Information(_Settings):
-    """Options of commands that compute Fisher information."""
-
-    method: Method = ActiveConfig.method
-    """How information is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
-    prior: float = ActiveConfig.prior
-    """How firmly every parameter counts as known beforehand (lambda); 0 leaves out what no training view has seen."""
-    relative_prior: bool = ActiveConfig.relative_prior
-    """lambda is --prior times the median information of a parameter's group, where it is not 0."""
-    info_pixels: int | None = ActiveConfig.info_pixels
-    """Information is computed on views of at most this many pixels; default as in the fit."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Policy(_Information):
-    """Options of commands that choose views."""
-
-    policy: Policy = ActiveConfig.policy
-    """How the next view is chosen (docs/information.md)."""
-    criterion: Criterion = ActiveConfig.criterion
-    """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
-    seed: int = 0
-    """Seed of everything random."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Info(_Common):
+class Info(Common):
     """Report backend, libLLVM, CUDA, threads and package versions."""
 
     json: bool = False
@@ -140,14 +51,14 @@ class Info(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(_Settings, Around, _Data):
+class Render(Settings, Around, Data):
     """Render a Gaussian PLY, or a finished run, to pictures or a video."""
 
     scene: Positional[Path]
     """A 3DGS point_cloud.ply or a run folder."""
     cameras: str = "orbit"
     """A data set, a run (its photographs' cameras), a cameras.json, or orbit."""
-    output: _Output = Path("out/render")
+    output: OutputPath = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None
     """Image width in pixels; default the camera's, of an orbit 640."""
@@ -170,12 +81,12 @@ class Render(_Settings, Around, _Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(_Policy, _Data):
+class Fit(Choosing, Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
     """A data set: COLMAP, transforms.json, LLFF, or a folder made by drgs sfm."""
-    output: _Output
+    output: OutputPath
     """The run folder."""
     preset: Preset = "fast"
     """Render settings of a named system. Train with what will be rendered with: gsplat for viewers of PLY files."""
@@ -201,6 +112,16 @@ class Fit(_Policy, _Data):
     """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
     background: tuple[float, float, float] = RenderSettings.background
     """RGB in [0, 1] behind everything."""
+    semantics: SemanticUse = FitConfig.semantics
+    """Fit features and a decoder, too, where the data set has maps of a teacher (auto), or never (ignore)."""
+    feature_width: int = FitConfig.feature_width
+    """Channels of the features; the decoder makes the teacher's of them."""
+    feature_weight: float = FitConfig.feature_weight
+    """Of the features' distance to the teacher's maps, against the photographs'."""
+    feature_resolution: FeatureSize = FitConfig.feature_resolution
+    """Features are rendered at the size of the image and then reduced, or at that of the teacher's map: faster."""
+    couple_features: bool = FitConfig.couple_features
+    """Let features move the geometry, too; else only colors do."""
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
     initial: int = ActiveConfig.initial
@@ -236,7 +157,7 @@ class Fit(_Policy, _Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Views(_Information, Around, _Data):
+class _Views(Informed, Around, Data):
     """Options of commands that compare views with known ones."""
 
     scene: Positional[Path]
@@ -250,14 +171,14 @@ class _Views(_Information, Around, _Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Select(_Policy, _Views):
+class Select(Choosing, _Views):
     """Rank cameras by what their views would add to a run, or to a Gaussian PLY."""
 
     candidates: str
     """A data set or a run (those of its views that are not known), a cameras.json, orbit, or dome."""
     k: Annotated[int, arg(aliases=["-k"])] = 1
     """Views to pick, each given the ones before."""
-    output: _Output = Path("out/select.json")
+    output: OutputPath = Path("out/select.json")
     """The JSON file."""
     preset: Preset = "fast"
     """Render settings of a named system; fast ranks as exact does, in a fraction of the time (docs)."""
@@ -269,7 +190,7 @@ class Fisher(_Views):
 
     cameras: str | None = None
     """Views to draw maps for: a data set, a run, a cameras.json, orbit, or dome; default the known ones."""
-    output: _Output = Path("out/fisher")
+    output: OutputPath = Path("out/fisher")
     """Folder for information.safetensors, fisher.json and the maps."""
     limit: int = 4
     """Maps of at most this many views, evenly spaced."""
@@ -278,7 +199,7 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seen(_Settings, Around, _Data):
+class _Seen(Settings, Around, Data):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Positional[Path]
@@ -311,7 +232,7 @@ class Crossval(_Seen):
     """Conventions that differ and known deviations fail, too, and so does a data set with images that are missing."""
     export: Path | None = None
     """Only write the scene, the cameras and cotangents to this .npz, for a rasterizer on another machine."""
-    output: _Output = Path("out/crossval")
+    output: OutputPath = Path("out/crossval")
     """Folder for report.html and crossval.json."""
 
 
@@ -325,12 +246,12 @@ class Tradeoff(_Seen):
     """Interleaved rounds of timing."""
     seconds: float = 300.0
     """For timing the leading settings on views as large as they are drawn; less time, smaller views."""
-    output: _Output = Path("out/tradeoff")
+    output: OutputPath = Path("out/tradeoff")
     """Folder for tradeoff.json, tradeoff.md and the plot."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Stress(_Common):
+class Stress(Common):
     """Run the extremes of the renderer on this machine against the float64 oracle and print their errors."""
 
     match: str = ""
@@ -340,7 +261,7 @@ class Stress(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Eval(_Common, _Data):
+class Eval(Common, Data):
     """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS when weights are given."""
 
     run: Positional[Path]
@@ -352,12 +273,12 @@ class Eval(_Common, _Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Sfm(_Common):
+class Sfm(Common):
     """Recover cameras and points from plain photographs (COLMAP on the CPU)."""
 
     images: Positional[Path]
     """A folder of photographs."""
-    output: _Output
+    output: OutputPath
     """Folder for the data set."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
@@ -370,22 +291,22 @@ class Sfm(_Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Demo(_Common):
+class Demo(Common):
     """Make a still life, fit it, render it and compare presets: a tour in minutes."""
 
-    output: _Output = Path("out/demo")
+    output: OutputPath = Path("out/demo")
     """Folder for pictures and tables."""
     quick: bool = False
     """Half a minute with poor pictures, to see that everything runs."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scene(_Common):
+class Scene(Common):
     """Make a data set by path tracing: a furnished room with labels and teacher features, or a still life."""
 
     name: Positional[Literal["room", "still_life"]]
     """What to make; the room has classes, depth, sparse points and features of a simulated teacher."""
-    output: _Output
+    output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str = "320x240"
     """WIDTHxHEIGHT of the images in pixels."""

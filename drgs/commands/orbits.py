@@ -27,7 +27,7 @@ from drgs.settings import RenderSettings
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drgs.commands.options import Around
+    from drgs.commands.option_groups import Around
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["UP", "Wish", "capture_orbit", "dome", "scene_orbit", "seen_distance"]

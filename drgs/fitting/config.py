@@ -13,12 +13,23 @@ from drgs.settings import RenderSettings
 if TYPE_CHECKING:
     from drgs.select import Scoring
 
-__all__ = ["ActiveConfig", "Degree", "FitConfig", "InitPoints", "MaskUse", "PickPoints"]
+__all__ = [
+    "ActiveConfig",
+    "Degree",
+    "FeatureSize",
+    "FitConfig",
+    "InitPoints",
+    "MaskUse",
+    "PickPoints",
+    "SemanticUse",
+]
 
 InitPoints = Literal["auto", "views", "all"]
 MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
 Degree = Literal[0, 1, 2, 3]
+SemanticUse = Literal["auto", "ignore"]
+FeatureSize = Literal["image", "teacher"]
 
 _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
@@ -32,6 +43,9 @@ _RANGES = {
     **dict.fromkeys(("ssim_weight", "sh_every", "refine_start", "refine_stop", "refine_every"), _SHARE),
     **dict.fromkeys(("min_opacity", "grow_until"), _SHARE),
     "dense_scale": (1e-6, 1e6),
+    "feature_width": (1, 4096),
+    "feature_weight": _WEIGHT,
+    **dict.fromkeys(("feature_rate", "decoder_rate"), _RATE),
     "jitter": (0.0, 1e3),
 }
 
@@ -70,6 +84,17 @@ class FitConfig:
         noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it
             cost 0.4 dB of held-out PSNR (28.0 against 28.4).
         jitter: Displacement of copies in their own standard deviations.
+        semantics: `auto` fits features and a decoder where the data set has maps of a teacher (Feature 3DGS [1]);
+            `ignore` never does, and reads none of them.
+        feature_width: Channels D of the features that are rendered; the decoder makes those of the teacher of them.
+        feature_weight: gamma, of the L1 distance between decoded features and the teacher's map.
+        feature_rate, decoder_rate: Learning rates of the features and of the decoder, as in [1].
+        couple_features: Let the feature image move the geometry, too; in [1] it reaches the features alone.
+        feature_resolution: Features are rendered at the size of the `image` and then reduced to the teacher's, as in
+            [1], or at the size of the `teacher`'s map.
+
+    Reference:
+        [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
     """
 
     settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
@@ -104,6 +129,13 @@ class FitConfig:
     grow_until: float = 0.5
     noise: float = 0.0
     jitter: float = 0.1
+    semantics: SemanticUse = "auto"
+    feature_width: int = 128
+    feature_weight: float = 1.0
+    feature_rate: float = 1e-3
+    decoder_rate: float = 1e-4
+    couple_features: bool = False
+    feature_resolution: FeatureSize = "image"
 
     def __post_init__(self) -> None:
         check_fields("fit", self, _RANGES)

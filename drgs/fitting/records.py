@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -78,12 +78,16 @@ class LoadedRun:
         record: How they were fitted.
         step: Of the checkpoint; None where only the PLY could be read.
         networks: What was fitted beside them, by name: what `torch.nn.Module.load_state_dict` takes.
+        decoder: `drgs.features.decoder.Decoder`, which makes a teacher's features of the Gaussians'; None without.
+        classes: `drgs.features.segmentation.Classes` of the data set that was fitted; None where it has none.
     """
 
     gaussians: Gaussians
     record: FitRecord
     step: int | None
     networks: dict[str, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
+    decoder: torch.nn.Module | None = None
+    classes: Any = None
 
 
 def load_run(run: Run) -> LoadedRun:

@@ -194,11 +194,12 @@ class Trainer:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
         free = ("save_every",)
-        new, old = config.to_json(), header["config"]
+        # What an older drgs did not know, it did as the defaults say.
+        new, old = config.to_json(), FitConfig().to_json() | header["config"]
         for key in new:
-            if key not in free and new[key] != old.get(key):
+            if key not in free and new[key] != old[key]:
                 raise ValueError(
-                    f"{where}: --resume must continue the same fit, {key} was {old.get(key)!r} and is {new[key]!r}; "
+                    f"{where}: --resume must continue the same fit, {key} was {old[key]!r} and is {new[key]!r}; "
                     "repeat the options or choose another run folder"
                 )
         if header["views"] != [frame.name for frame in frames]:
