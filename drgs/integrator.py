@@ -38,6 +38,7 @@ def render(
     camera: Camera | list[Camera] | tuple[Camera, ...],
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] | str = ("depth",),
+    couple_features: bool = True,
 ) -> Output:
     """Render a view, or several of one size.
 
@@ -48,6 +49,8 @@ def render(
         settings: Default `RenderSettings.preset("exact")`.
         outputs: What to compute besides rgb, alpha and features: any of `OUTPUTS`, or "all". What is not asked for
             costs nothing.
+        couple_features: Whether the feature image has derivatives by all that it depends on. If not, only by
+            `features`: what is learned about them moves no Gaussian (Zhou et al. 2024, Feature 3DGS).
     Returns:
         An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
@@ -62,14 +65,15 @@ def render(
     """
     if isinstance(camera, list | tuple):
         cameras, wanted = cameras_of_one_size("render", camera), _wanted(outputs)
-        return _batch([_view(gaussians, each, settings, wanted) for each in cameras])
-    return _view(gaussians, camera, settings, _wanted(outputs))
+        return _batch([_view(gaussians, each, settings, wanted, couple_features) for each in cameras])
+    return _view(gaussians, camera, settings, _wanted(outputs), couple_features)
 
 
-def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wanted: frozenset) -> Output:
+def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wanted: frozenset, couple: bool) -> Output:
+    must_be("render", "couple_features", couple, bool, "True or False")
     seen = gaussians_at("render", gaussians, camera)
     check_view("render", seen, camera, settings)
-    call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted)
+    call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted, couple=couple)
     with own_errors():
         return call.output(differentiable(call))
 
@@ -89,11 +93,13 @@ def render_jvp(
     tangents: Mapping[str, torch.Tensor],
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] | str = ("depth",),
+    couple_features: bool = True,
 ) -> Output:
     """Forward mode: how a view changes along tangents of its parameters.
 
     Args:
-        gaussians, camera, settings, outputs: As for `render` (median depth, count and visibility have no tangent).
+        gaussians, camera, settings, outputs, couple_features: As for `render` (median depth, count and visibility have
+            no tangent).
         tangents: Name -> tangent of the raw parameter, shaped like it, optionally with a leading axis K (the same
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
@@ -112,7 +118,7 @@ def render_jvp(
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
     settings = settings or RenderSettings.preset("exact")
     # The tangents are given: a graph of torch would lead nowhere.
-    call = Call(seen.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene)
+    call = Call(seen.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene, couple=couple_features)
     with own_errors():
         return push_forward(call, dict(tangents))
 
@@ -124,6 +130,7 @@ def render_rays(
     directions: torch.Tensor | np.ndarray,
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] | str = ("depth",),
+    couple_features: bool = True,
 ) -> Output:
     """Render arbitrary rays on the `bvh` traversal: fisheye, panoramas, lidar, thin lenses.
 
@@ -131,6 +138,7 @@ def render_rays(
         origins, directions: (..., 3) world frame; directions need not be normalized. Differentiable torch tensors or
             arrays.
         settings: Default `exact` on `bvh`. `order="center"` sorts by the distance to the first origin.
+        outputs, couple_features: As for `render`.
     Returns:
         An `Output` with the leading shape of the rays instead of (H, W).
     """
@@ -143,7 +151,7 @@ def render_rays(
     settings = settings or RenderSettings.preset("exact", traversal="bvh")
     if settings.traversal != "bvh":
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
-    call = Call(gaussians, None, settings, _wanted(outputs), rays=(origins, directions))
+    call = Call(gaussians, None, settings, _wanted(outputs), rays=(origins, directions), couple=couple_features)
     with own_errors():
         return call.output(differentiable(call))
 

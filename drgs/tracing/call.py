@@ -71,6 +71,7 @@ class Call:
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.
         rays: Origins and directions, (..., 3) each, instead of the camera's.
         scene: Where the Gaussians come from, if derivatives by its parameters are wanted instead of by theirs.
+        couple: As `couple_features` of `render`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, `w2c`
             (12 floats), rays where they are traced.
@@ -87,8 +88,10 @@ class Call:
         want: frozenset,
         rays=None,
         scene: DeformableScene | None = None,
+        couple: bool = True,
     ):
         self.lib, self.settings, self.camera, self.want = runtime.dr_types(), settings, camera, want
+        self.couple = couple
         if settings.traversal == "tiles" and camera.is_distorted:
             raise NotImplementedError(
                 f"render: traversal='tiles' must have a pinhole camera, got model {camera.model!r} with distortion; "
@@ -185,7 +188,7 @@ class Call:
             projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, coefficients)
             traversal = TileTraversal(lib, s, projected, pinhole, *size)
         basis, carried = self._carried(p, along_ray, traversal.world)
-        compositor = Compositor(lib, s, traversal, self.want, self.width, basis)
+        compositor = Compositor(lib, s, traversal, self.want, self.width, basis, self.couple)
         sh = lib.Float(p["sh"]) if along_ray else None
         features = lib.Float(p["features"]) if self.width else None
         return compositor, Arguments(projected.record, sh, features, carried)

@@ -7,11 +7,13 @@ each. `Composite` makes it one differentiable operation of Dr.Jit.
 
 from __future__ import annotations
 
+import dataclasses
+
 import drjit as dr
 
 from drgs.settings import RenderSettings
 from drgs.tracing.derivatives import Adjoint, Tangent
-from drgs.tracing.kernels import Channels, HitModel, Primal
+from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.walk import Part
@@ -33,6 +35,7 @@ class Compositor:
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.
         width: Feature channels.
         basis: Of the arrays that rays carry, how many are SH basis values.
+        couple: Derivatives of the feature image reach all that it depends on; else only the features.
     Attributes:
         certificate: After `forward`: rays, redone rays, entries listed.
         extra: After `forward`: outputs without a derivative.
@@ -40,10 +43,17 @@ class Compositor:
     """
 
     def __init__(
-        self, lib: Lib, settings: RenderSettings, traversal: Traversal, want: frozenset, width: int = 0, basis: int = 0
+        self,
+        lib: Lib,
+        settings: RenderSettings,
+        traversal: Traversal,
+        want: frozenset,
+        width: int = 0,
+        basis: int = 0,
+        couple: bool = True,
     ) -> None:
         self.lib, self.settings, self.traversal, self.want = lib, settings, traversal, want
-        self.width, self.basis, self.rays = width, basis, traversal.rays
+        self.width, self.basis, self.rays, self.couple = width, basis, traversal.rays, couple
         self.model = HitModel(lib, settings, traversal.world)
         self.certificate: dict = {}
         self.extra: dict = {}
@@ -87,9 +97,8 @@ class Compositor:
         self.finals = []
         for number, channels in enumerate(self.passes):
             first = number == 0
-            kernel = Primal(
-                self.model, channels, frozenset(want if first else want & {"replay"}), visibility if first else None
-            )
+            emit = _add_to(visibility) if first and visibility is not None else None
+            kernel = Primal(self.model, channels, frozenset(want if first else want & {"replay"}), emit)
             self.finals.append(self._primal(kernel, first))
             for part, states in self.finals[-1]:
                 self._write(out, channels, part, states)
@@ -121,9 +130,9 @@ class Compositor:
         """(part, final states) pairs; in exact order the first traversal decides which rays are redone."""
         parts, done = self._parts(kernel.channels), []
         for part in list(parts):
-            # Visibility is scattered on the way, so rays that turn out wrong must be known beforehand.
+            # Weights are scattered on the way, so rays that turn out wrong must be known beforehand.
             check = part.ordered and first
-            if check and kernel.visibility is not None:
+            if check and kernel.emit is not None:
                 probe = Primal(self.model, self._channels(), frozenset())
                 dr.eval(part.run(probe, check=True), part.failed)
                 parts += self._redo(part)
@@ -181,6 +190,9 @@ class Compositor:
                 # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
                 mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
+                    if channels.channels and not self.couple:
+                        self._feature_gradient(grads["features"], channels, part, cotangents, mode)
+                        continue
                     states = part.run(Adjoint(self.model, channels, grads, finals, cotangents, depth, mode))
                     for st, at, inside in zip(states, part.flat, part.inside, strict=True):
                         for total, x in zip(carried, st["carried"], strict=True):
@@ -194,6 +206,18 @@ class Compositor:
             for k in range(self.entries)
         ]
         return grads | ({"carried": carried} if carried else {})
+
+    def _feature_gradient(
+        self, grad: Float, channels: Channels, part: Part, cotangents: list[dict], mode: dr.ReduceMode
+    ) -> None:
+        """Add w times the cotangents of a feature pass to the gradient of its features: dL/df_i = sum w_i dL/dF."""
+
+        def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
+            base = index * self.width + channels.first
+            for c, cotangent in enumerate(cotangents[k]["sum"]):
+                dr.scatter_add(grad, w * cotangent, base + c, ok, mode=mode)
+
+        dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), emit)), grad)
 
     def _cotangent(self, g: dict, channels: Channels, at: UInt32, inside: Mask) -> dict:
         """What `Adjoint` needs of the images' cotangents at a ray's pixel."""
@@ -231,6 +255,10 @@ class Compositor:
         results = [self._images() for _ in buffers]
         for channels in self.passes:
             depth = self.want & {"depth"} if channels.color else frozenset()
+            if channels.channels and not self.couple:
+                for out, b in zip(results, rest, strict=True):
+                    self._feature_tangent(out, channels, b["features"])
+                continue
             for part in self._parts(channels):
                 own = [
                     [[dr.gather(lib.Float, v, at, inside) for v in per_tangent] for per_tangent in carried]
@@ -243,6 +271,14 @@ class Compositor:
                         self._write_tangent(out, channels, at, inside, d)
         return results
 
+    def _feature_tangent(self, out: dict, channels: Channels, features: Float) -> None:
+        """A feature pass of what the image says of the features alone: it is linear in them, sum w_i df_i."""
+        moved = dataclasses.replace(channels, buffers=self.buffers | {"features": features})
+        for part in self._parts(channels):
+            states = part.run(Primal(self.model, moved, frozenset()))
+            dr.eval(states)
+            self._write(out, channels, part, states)
+
     def _write_tangent(self, out: dict, channels: Channels, at: UInt32, inside: Mask, d: dict) -> None:
         """Scatter one tangent of a part's states into its images."""
         if channels.color:
@@ -254,6 +290,11 @@ class Compositor:
         first = 3 if channels.color else 0
         for k in range(channels.channels):
             dr.scatter(out["features"], d["sum"][first + k], at * self.width + channels.first + k, inside)
+
+
+def _add_to(total: Float) -> Emit:
+    """Sums up the weights of each Gaussian."""
+    return lambda index, k, place, w, ok: dr.scatter_add(total, w, index, ok)
 
 
 class Composite(dr.CustomOp):

@@ -12,6 +12,7 @@ derivatives.py and jacobian.py replay what is composited here.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import drjit as dr
 
@@ -22,7 +23,9 @@ from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.records import RECORD
 from drgs.tracing.responses import RESPONSES
 
-__all__ = ["Channels", "HitModel", "Primal", "Ray"]
+__all__ = ["Channels", "Emit", "HitModel", "Primal", "Ray"]
+
+Emit = Callable[[UInt32, int, list, Float, Mask], None]
 
 
 @dataclasses.dataclass
@@ -146,11 +149,11 @@ class Primal:
     Args:
         want: What to keep besides color and T: `depth`, `median`, `count`, and `replay`: sums in float64 and the place
             of the last composited hit, for the adjoint.
-        visibility: Float of width N that the weights are added to, or None.
+        emit: Told of every composited hit: `emit(Gaussian, shared ray, its place, weight, is hit)`; None without.
     """
 
-    def __init__(self, model: HitModel, channels: Channels, want: frozenset, visibility: Float | None = None) -> None:
-        self.m, self.channels, self.want, self.visibility = model, channels, want, visibility
+    def __init__(self, model: HitModel, channels: Channels, want: frozenset, emit: Emit | None = None) -> None:
+        self.m, self.channels, self.want, self.emit = model, channels, want, emit
 
     def init(self, k: int, alive: Mask, nowhere: list) -> dict:
         """State of a ray; the same for each shared one."""
@@ -176,7 +179,7 @@ class Primal:
         m, out = self.m, []
         any_active = active & (sum((s["alive"] for s in states), m.lib.UInt32(0)) != 0)
         loaded = self.channels.load(m.lib, index, rays[0], any_active)
-        for ray, st, place in zip(rays, states, places, strict=True):
+        for k, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
             a, depth, ok = m.hit(loaded["record"], ray, active & (st["alive"] != 0))
             T, rest = st["T"], st["T"] * (1 - a)
             if m.s.stop == "after":
@@ -201,8 +204,8 @@ class Primal:
                     new["alive"] = dr.select(new["count"] >= m.max_hits, 0, new["alive"])
             if "place" in st:
                 new["place"] = [dr.select(ok, p, q) for p, q in zip(place, st["place"], strict=True)]
-            if self.visibility is not None:
-                dr.scatter_add(self.visibility, w, index, ok)
+            if self.emit is not None:
+                self.emit(index, k, place, w, ok)
             out.append(new)
         return out
 
