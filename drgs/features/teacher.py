@@ -1,0 +1,141 @@
+"""Feature maps of a teacher on disk: what a network said about each cell of a photograph, read where it is touched.
+
+A file holds one tensor (C, h, w) as `torch.save` writes it, in half or single precision. The encoders of Feature 3DGS
+(Zhou et al., CVPR 2024) write half precision for LSeg, 512 channels at 480x360, and single precision for SAM, 256
+channels, cropped to the photograph: a view into a larger tensor, not contiguous. The map covers its whole photograph,
+whose shape it need not have.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.guards.foreign import refuse_foreign
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["check_finite", "map_name", "read_map", "used_map"]
+
+# `CxHxW` are the letters in the files of Feature 3DGS; numbers in their place must agree with the tensor.
+_NAME = re.compile(r"(.+)_fmap_(CxHxW|(\d+)x(\d+)x(\d+))\.pt")
+_ZIP = b"PK\x03\x04"
+_SHOWN = 120  # characters of torch's own message
+_finite: set[tuple[Path, int, int]] = set()  # files (path, size, time of change) that have been looked through
+
+
+def map_name(path: str | os.PathLike) -> str | None:
+    """The image's stem that a file's name says it is the map of, ``rgb_000`` of ``rgb_000_fmap_CxHxW.pt``.
+
+    Returns:
+        None if it is not named as a map.
+    """
+    found = _NAME.fullmatch(Path(path).name)
+    return found[1] if found else None
+
+
+def read_map(path: str | os.PathLike) -> torch.Tensor:
+    """A teacher's map (C, h, w), float16 or float32, memory-mapped: nothing but its header is read before it is used.
+
+    Writing into the tensor changes a private copy of the pages written to, never the file. Nothing in the file is
+    executed: only tensors are unpickled.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Not one plain tensor of three dimensions and one of these types, of another shape than the file's
+            name says, or cut short.
+    """
+    import torch
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a teacher's feature map, found none; check the path")
+    with path.open("rb") as file:
+        head = file.read(len(_ZIP))
+    if head != _ZIP:
+        refuse_foreign(path, "a teacher's feature map")
+        raise ValueError(
+            f"{path}: must be a zip file as torch.save writes it, got other bytes; save the tensor with torch.save"
+        )
+    _check_archive(path)
+    try:
+        value = torch.load(path, map_location="cpu", mmap=True, weights_only=True)
+    except pickle.UnpicklingError:
+        raise ValueError(
+            f"{path}: must hold one plain tensor, got other Python objects, which are never unpickled; "
+            "save the tensor alone"
+        ) from None
+    except Exception as error:  # torch's reader raises whatever its parts do: RuntimeError, KeyError, EOFError
+        text = " ".join(str(error).split())[:_SHOWN] or type(error).__name__
+        raise ValueError(
+            f"{path}: must hold one plain tensor, whole, torch says {text!r}; copy it again, or save the tensor alone"
+        ) from None
+    if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
+        kind = type(value).__name__ if not isinstance(value, torch.Tensor) else f"tensor of layout {value.layout}"
+        raise ValueError(f"{path}: must hold one plain tensor, got a {kind}; save the tensor alone")
+    value = value.detach()
+    if value.ndim != 3 or not value.numel():
+        raise ValueError(f"{path}: must hold a tensor (C, h, w), got shape {tuple(value.shape)}; save one map a file")
+    if value.dtype not in (torch.float16, torch.float32):
+        raise ValueError(f"{path}: must hold float16 or float32, got {value.dtype}; save tensor.half()")
+    named = _NAME.fullmatch(path.name)
+    if named and named[3] and tuple(map(int, named.groups()[2:])) != tuple(value.shape):
+        raise ValueError(f"{path}: must hold what its name says, {named[2]}, got {tuple(value.shape)}; rename it")
+    return value
+
+
+def _check_archive(path: Path) -> None:
+    """Refuse a zip file that ends early, or has compressed parts: mapped, their bytes would be taken for numbers."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            packed = [part.filename for part in archive.infolist() if part.compress_type != zipfile.ZIP_STORED]
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        raise ValueError(f"{path}: must be a whole file, got one without its index; copy it again") from None
+    if packed:
+        raise ValueError(f"{path}: must hold its tensor as it is, {packed[0]} is compressed; save it with torch.save")
+
+
+def check_finite(values: torch.Tensor, path: str | os.PathLike) -> None:
+    """Look through a map, one channel at a time.
+
+    Args:
+        values: (C, h, w), float16 or float32.
+        path: Of its file, for the message.
+
+    Raises:
+        ValueError: A value is NaN or infinite; names the first one's place.
+    """
+    for channel, plane in enumerate(values.detach().cpu().numpy()):
+        # Exponents of ones alone: several times as fast as numpy's isfinite in half precision.
+        bits, ones = (
+            (plane.view(np.uint16), 0x7C00) if plane.dtype == np.float16 else (plane.view(np.uint32), 0x7F800000)
+        )
+        bad = (bits & bits.dtype.type(ones)) == ones
+        if bad.any():
+            row, column = (int(i) for i in np.argwhere(bad)[0])
+            raise ValueError(
+                f"{path}: must be finite, got {plane[row, column]} at channel {channel}, row {row}, column {column}; "
+                "make this map again"
+            )
+
+
+def used_map(path: str | os.PathLike) -> torch.Tensor:
+    """`read_map`, looked through for NaN when a file, as it is now, is used for the first time in this process.
+
+    Raises:
+        FileNotFoundError, ValueError: As `read_map` and `check_finite`.
+    """
+    values = read_map(path)
+    state = os.stat(path)
+    key = Path(path).absolute(), state.st_size, state.st_mtime_ns
+    if key not in _finite:
+        check_finite(values, path)
+        _finite.add(key)
+    return values
