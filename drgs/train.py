@@ -106,7 +106,7 @@ def _fit(
     resume: bool,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
-    train, test = dataset.split(config.test_every)
+    train, test = dataset.split(config.test_every, config.test_offset)
     if train:
         check_parallax(train)
     plan = ActiveViews(active, train, config) if active else None
@@ -134,7 +134,7 @@ def _fit(
         "command": "fit",
         "data": str(Path(dataset.path).resolve()),
         "format": dataset.format,
-        "split_rule": dataset.split_rule(config.test_every),
+        "split_rule": dataset.split_rule(config.test_every, config.test_offset),
         "train": [frame.name for frame in frames],
         "test": [frame.name for frame in held_out],
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),

@@ -278,6 +278,44 @@ def test_initial_views_are_far_apart():
 
     assert initial_views([at(x) for x in (0.0, 1.0, 5.0, 2.6, 4.0)], 4) == [0, 2, 3, 1]
     assert initial_views([at(1.0)] * 3, 3) == [0, 1, 2]
+    assert initial_views([at(x) for x in (0.0, 1.0, 5.0, 2.6, 4.0)], 3, first=3) == [3, 0, 2]
+
+
+def test_the_seed_draws_the_first_view(still, tmp_path):
+    """Every view can come first and about as often as others, the same for the same seed; the picks of `random` are
+    those of a generator that the draw does not touch; selection.json and --resume know the rule.
+    """
+    train = lazily(still).split(4, 1)[0]
+    starts = [ActiveViews(plan(start="seed"), train, config(seed=seed)).chosen for seed in range(300)]
+    counts = np.bincount([chosen[0] for chosen in starts], minlength=len(train))
+    assert counts.min() > 300 / len(train) - 4 * np.sqrt(300 / len(train)), "four standard deviations of a fair draw"
+    assert all(chosen == initial_views([view.camera for view in train], 2, chosen[0]) for chosen in starts)
+    first = ActiveViews(plan(start="first"), train, config(seed=5))
+    drawn = ActiveViews(plan(start="seed"), train, config(seed=5))
+    assert (first.chosen[0], drawn.chosen) == (0, starts[5])
+    assert torch.equal(first.state()[0]["policy_rng"], drawn.state()[0]["policy_rng"])
+
+    seed = next(seed for seed, chosen in enumerate(starts) if chosen[0] != 0)
+    fields = {"max_steps": 10, "test_offset": 1, "seed": seed}
+    run, active = tmp_path / "run", plan(start="seed")
+    data = lazily(still, test_offset=1)
+    assert [view.name for view in data.split()[1]] == ["1", "5"]
+    fit(data, run, config(**fields), active=active, progress=False)
+    record = json.loads((run / "selection.json").read_text())
+    assert record["start"][0]["index"] == starts[seed][0] != 0
+    assert record["start"][0]["name"] == train[starts[seed][0]].name
+    assert record["start_rule"] == Run(run).config()["active"]["start"] == "seed"
+    assert Run(run).config()["fit"]["test_offset"] == 1
+    assert Run(run).config()["test"] == ["1", "5"]
+    for words, other in (
+        ("start was 'seed' and is 'first'", {"active": plan(), "config": config(**fields)}),
+        (
+            "the data set, --test-every or --test-offset has changed",
+            {"active": active, "config": config(**{**fields, "test_offset": 2})},
+        ),
+    ):
+        with pytest.raises(ValueError, match=words):
+            fit(lazily(still), run, other.pop("config"), **other, resume=True, progress=False)
 
 
 def test_selection_json_is_complete(still, tmp_path, monkeypatch):
@@ -432,7 +470,9 @@ def test_bad_resumes_are_refused(still, tmp_path):
         fit(lazily(still), tmp_path / "all", config(), active=plan(), resume=True, progress=False)
     fewer = lazily(still)
     fewer.views = fewer.views[:7]
-    with pytest.raises(ValueError, match="must have the same training views, the data set has changed"):
+    with pytest.raises(
+        ValueError, match="must have the same training views, the data set, --test-every or --test-offset has"
+    ):
         fit(fewer, tmp_path / "run", config(), active=plan(), resume=True, progress=False)
 
 

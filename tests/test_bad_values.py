@@ -67,6 +67,7 @@ def test_scalars_of_arrays_are_numbers():
         ("initial_opacity", 1.0),
         ("refine_every", -0.1),
         ("test_every", 1),
+        ("test_offset", 8),
         ("settings", {"order": "ray"}),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import warnings
 
@@ -276,6 +277,18 @@ def test_split_is_every_eighth_by_name():
     assert [view.name for view in dataset.split(test_every=5)[1]] == ["00", "05", "10", "15"]
     with pytest.raises(ValueError, match=r"test_every must be 0 \(none\) or >= 2, got 1"):
         dataset.split(test_every=1)
+    assert [view.name for view in dataset.split(8, 3)[1]] == ["03", "11"]
+    assert dataset.split_rule(8, 3) == "views sorted by name, index % 8 == 3 held out"
+    offset = Dataset("x", "test", views, test_offset=1)
+    assert [view.name for view in offset.split()[1]] == ["01", "09"]
+    assert [view.name for view in offset.split(test_every=5)[1]] == ["00", "05", "10", "15"]
+    for every, value in ((8, 8), (8, -1), (0, 1)):
+        with pytest.raises(ValueError, match=f"test_offset must be in 0..{max(every, 1) - 1} with .*, got {value}"):
+            dataset.split(every, value)
+    with pytest.raises(ValueError, match="test_offset must be the index of one of the 17 views, got 17; lower it"):
+        dataset.split(20, 17)
+    stated = [dataclasses.replace(view, split="test" if view.name < "02" else "train") for view in views]
+    assert [view.name for view in Dataset("x", "test", stated).split(8, 3)[1]] == ["00", "01"], "the files' own wins"
     assert len(Dataset("x", "test", views[:1]).split()[0]) == 1
 
 

@@ -1,6 +1,7 @@
 """What a command was given and which views its options name: each rule once, for every command."""
 
 import dataclasses
+import json
 import shutil
 
 import pytest
@@ -151,3 +152,16 @@ def test_known_views(place, text):
     assert {(camera.width, camera.height) for camera in known.cameras} == {(10, 10)}
     other = dataclasses.replace(args, info_pixels=16)
     assert known_views(text and str(place / text), other, shown).cameras[0].width == 4
+
+
+def test_a_split_is_the_runs_offset_included(place, tmp_path):
+    """`--split test` of a run that held out from another view on gives that run's test views."""
+    shutil.copytree(place / "run", tmp_path / "run")
+    path = tmp_path / "run/config.json"
+    config = json.loads(path.read_text())
+    config["fit"]["test_offset"] = 2
+    path.write_text(json.dumps(config))
+    _, its = given(tmp_path)
+    for text in (place / "data", tmp_path / "run"):
+        source = Source.of("--cameras", str(text))
+        assert [view.name for view in source.split(source.dataset(False), "test", its)] == ["2", "5", "8"]

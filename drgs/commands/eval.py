@@ -33,6 +33,7 @@ def run(args: Eval) -> None:
     dataset = data.load(
         recorded.data,
         test_every=config.test_every,
+        test_offset=config.test_offset,
         background=config.settings.background,
         lazy=recorded.is_active,
         points=False,

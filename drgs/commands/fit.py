@@ -28,6 +28,7 @@ def run(args: Fit) -> None:
     dataset = data.load(
         args.data,
         test_every=config.test_every,
+        test_offset=config.test_offset,
         background=config.settings.background,
         lazy=active is not None,
         points=active is None or config.init_points == "all",

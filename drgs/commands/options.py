@@ -23,6 +23,7 @@ from drgs.fitting.config import (
     MaskUse,
     PickPoints,
     SemanticUse,
+    Start,
 )
 from drgs.settings import Preset, RenderSettings
 
@@ -100,6 +101,8 @@ class Fit(Choosing, Data):
     """Initial points: of the training views (views) or of the data set (all); auto: all, or views if --views active."""
     test_every: int = FitConfig.test_every
     """Every n-th view, by name, is held out; 0 holds out none."""
+    test_offset: int = FitConfig.test_offset
+    """Index of the first of them, below --test-every; a split that the data set itself states wins over both."""
     sh_degree: Degree = FitConfig.sh_degree
     """Highest degree of the view-dependent color."""
     deterministic: bool = FitConfig.deterministic
@@ -125,7 +128,9 @@ class Fit(Choosing, Data):
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
     initial: int = ActiveConfig.initial
-    """Views at the start: the first one, then those farthest away."""
+    """Views at the start: that of --start, then those farthest away."""
+    start: Start = ActiveConfig.start
+    """The first of these: the first training view by name, or one that the seed draws."""
     add: int = ActiveConfig.add
     """Views to be chosen on the way, one at a time; others are not read."""
     every: int = ActiveConfig.every

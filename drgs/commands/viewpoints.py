@@ -103,11 +103,11 @@ class Source:
             ValueError: If there is none.
         """
         record = self.record or given.record
-        every = record.config.test_every if record else None
-        train, test = dataset.split(every)
+        held_out = (record.config.test_every, record.config.test_offset) if record else ()
+        train, test = dataset.split(*held_out)
         views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[part]
         if not views:
-            rule = dataset.split_rule(every)
+            rule = dataset.split_rule(*held_out)
             raise ValueError(f"{self.text}: split {part} must hold a view, holds none ({rule}); use --split all")
         return views
 

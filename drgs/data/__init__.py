@@ -22,6 +22,7 @@ def load(
     path: str | os.PathLike,
     *,
     test_every: int = 8,
+    test_offset: int = 0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     lazy: bool = False,
     points: bool = True,
@@ -37,6 +38,7 @@ def load(
     Args:
         path: folder or file.
         test_every: every how many views `Dataset.split` holds one out; 0 for none.
+        test_offset: index, by name, of the first view that is held out, below `test_every`.
         background: color in [0,1] that images with an alpha channel are composited on.
         lazy: open no image, mask or depth file at all: cameras have the size that the camera file states, until
             `View.checked` compares it with the image. Where intrinsics are angles and no size is stated (Blender), all
@@ -66,9 +68,10 @@ def load(
         loader = load_llff
     else:
         raise _nothing_found(path)
-    dataset = loader(path, background=background, test_every=test_every, lazy=lazy, points=points, strict=strict)
-    dataset.test_every = test_every
-    dataset.split()  # refuses a test_every that cannot be
+    held_out = {"test_every": test_every, "test_offset": test_offset}
+    dataset = loader(path, background=background, lazy=lazy, points=points, strict=strict, **held_out)
+    dataset.test_every, dataset.test_offset = test_every, test_offset
+    dataset.split()  # refuses numbers that cannot be
     return dataset
 
 

@@ -46,6 +46,7 @@ def load_transforms(
     path: Path,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     test_every: int = 8,
+    test_offset: int = 0,
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
@@ -60,7 +61,7 @@ def load_transforms(
     Args:
         path: the folder, or one JSON file.
         background: color that images with alpha are composited on.
-        test_every, lazy, points, strict: see `drgs.data.load`.
+        test_every, test_offset, lazy, points, strict: see `drgs.data.load`.
 
     Raises:
         FileNotFoundError: no such file, too few of the images that it names, or a mask or depth map is missing.
@@ -77,7 +78,7 @@ def load_transforms(
     dataset = Dataset(path, "transforms", [])
     rows = _listed(read, dataset)
     go_on_without(path, [view.image_path for view in dataset.absent], len(dataset.views), strict)
-    first = _FirstImage(dataset, test_every) if lazy else None
+    first = _FirstImage(dataset, test_every, test_offset) if lazy else None
     for file, data in read.items():
         sizes: dict[tuple[int, int], int] = {}
         for index, frame in enumerate(data["frames"]):
@@ -145,12 +146,12 @@ def _splits(file: Path, data: dict) -> list[str]:
 class _FirstImage:
     """Size of the first training image, read when it is first asked for."""
 
-    def __init__(self, dataset: Dataset, test_every: int) -> None:
-        self.dataset, self.test_every, self._size = dataset, test_every, None
+    def __init__(self, dataset: Dataset, test_every: int, test_offset: int) -> None:
+        self.dataset, self._held_out, self._size = dataset, (test_every, test_offset), None
 
     def size(self) -> tuple[int, int]:
         if self._size is None:
-            train = self.dataset.split(self.test_every)[0]
+            train = self.dataset.split(*self._held_out)[0]
             if not train:
                 raise FileNotFoundError(
                     f"{self.dataset.path}: the first training image must exist, found none; restore it"

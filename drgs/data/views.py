@@ -12,6 +12,7 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.checks import image_size, read_image, read_npy
+from drgs.data.splits import SplitRule
 
 __all__ = ["Dataset", "View", "check_parallax", "fit_to_image", "go_on_without", "make_unique"]
 
@@ -179,6 +180,7 @@ class Dataset:
         colors: (P,3) float32 in [0,1], or None.
         point_source: where the points come from, one line, empty without points.
         test_every: every how many views one is held out.
+        test_offset: index, by name, of the first view that is held out.
         absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
             alone, which therefore stays the same whatever is missing.
     """
@@ -191,39 +193,33 @@ class Dataset:
     point_source: str = ""
     test_every: int = 8
     absent: list[View] = dataclasses.field(default_factory=list)
+    test_offset: int = 0
 
-    def split(self, test_every: int | None = None) -> tuple[list[View], list[View]]:
+    def split(self, test_every: int | None = None, test_offset: int | None = None) -> tuple[list[View], list[View]]:
         """(train, test) views, both sorted by name, by the rule that `split_rule` names.
+
+        A split that the data set's own files state (`View.split`) wins over both numbers.
 
         Args:
             test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
+            test_offset: 2 holds out the 3rd view first; the data set's own number if left out, 0 if `test_every` is
+                given alone.
+        Raises:
+            ValueError: If a number is out of range, or the offset lies beyond the last view.
         """
-        listed = sorted([*self.views, *self.absent], key=lambda view: view.name)
-        if any(view.split for view in listed):
-            held_out = "test" if any(view.split == "test" for view in listed) else "val"
-            train = [view for view in listed if view.split not in ("val", "test")]
-            test = [view for view in listed if view.split == held_out]
-        else:
-            every = self._every(test_every)
-            train = [view for index, view in enumerate(listed) if every == 0 or index % every != 0]
-            test = listed[::every] if every else []
+        train, test = self._rule(test_every, test_offset).parts([*self.views, *self.absent])
         there = {id(view) for view in self.views}
         return [view for view in train if id(view) in there], [view for view in test if id(view) in there]
 
-    def split_rule(self, test_every: int | None = None) -> str:
+    def split_rule(self, test_every: int | None = None, test_offset: int | None = None) -> str:
         """The rule of `split` in words, to be recorded with results."""
-        if any(view.split for view in self.views):
-            return "as the data set's files say"
-        every = self._every(test_every)
-        if every == 0:
-            return "no view held out"
-        return f"views sorted by name, index % {every} == 0 held out"
+        return self._rule(test_every, test_offset).words()
 
-    def _every(self, test_every: int | None) -> int:
+    def _rule(self, test_every: int | None, test_offset: int | None) -> SplitRule:
+        if test_offset is None:
+            test_offset = self.test_offset if test_every is None else 0
         every = self.test_every if test_every is None else test_every
-        if every < 0 or every == 1:
-            raise ValueError(f"split: test_every must be 0 (none) or >= 2, got {every}; correct it")
-        return 0 if len(self.views) < 2 else every
+        return SplitRule.of([*self.views, *self.absent], len(self.views), every, test_offset)
 
 
 def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> None:

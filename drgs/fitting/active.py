@@ -41,6 +41,7 @@ SELECTION = "selection.json"
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
+_START = 0x57A7  # the stream of the view that a fit starts with, apart from all others of the same seed
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 
 
@@ -69,7 +70,8 @@ class ActiveViews:
                 f"{config.max_steps}, the last one would come at {active.add * active.every}; raise --max-steps"
             )
         self.active, self.views, self._config = active, list(views), config
-        self.chosen = initial_views([view.camera for view in views], active.initial)
+        first = _drawn(len(views), config.seed) if active.start == "seed" else 0
+        self.chosen = initial_views([view.camera for view in views], active.initial, first)
         self.picks: list[dict] = []
         self.pool_leak = config.init_points == "all"
         grows = {"auto": not self.pool_leak, "uncovered": True, "none": False}[active.pick_points]
@@ -209,6 +211,7 @@ class ActiveViews:
             "schema": SCHEMA,
             "command": "fit",
             **self.active.to_json(),
+            "start_rule": self.active.start,  # `start` are the views
             "seed": self._config.seed,
             "init_points": "all" if self.pool_leak else "views",
             "pool_leak": self.pool_leak,
@@ -233,15 +236,17 @@ class ActiveViews:
             ValueError: If the checkpoint chose by another rule, or from other views.
         """
         old, new = header["active"], self.active.to_json()
+        was = {**type(self.active)().to_json(), **old["config"]}  # of an earlier version: as the default does
         for key in new:
-            if new[key] != old["config"].get(key):
+            if new[key] != was[key]:
                 raise ValueError(
-                    f"{where}: --resume must continue the same fit, {key} was {old['config'].get(key)!r} and is "
+                    f"{where}: --resume must continue the same fit, {key} was {was[key]!r} and is "
                     f"{new[key]!r}; repeat the options or choose another run folder"
                 )
         if old["pool"] != [view.name for view in self.views]:
             raise ValueError(
-                f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
+                f"{where}: --resume must have the same training views, the data set, --test-every or --test-offset has "
+                "changed; repeat the options or choose another folder"
             )
         self.picks = old["picks"]
         self.chosen = self.chosen[: self.active.initial] + [pick["index"] for pick in self.picks]
@@ -263,17 +268,23 @@ class ActiveViews:
         return at_most(camera, self._config.max_pixels)
 
 
-def initial_views(cameras: list[Camera], count: int) -> list[int]:
-    """The first camera, then always the one whose center is farthest from all chosen ones; ties to the lower index.
+def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int]:
+    """One camera, then always the one whose center is farthest from all chosen ones; ties to the lower index.
 
     Args:
         cameras: At least `count`.
         count: At least 1.
+        first: Index of the one to begin with.
     """
     centers = np.stack([camera.center for camera in cameras])
-    chosen, distance = [0], np.linalg.norm(centers - centers[0], axis=1)
+    chosen, distance = [first], np.linalg.norm(centers - centers[first], axis=1)
     while len(chosen) < count:
         distance[chosen] = -1.0  # where all centers coincide, too, no view is chosen twice
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(centers - centers[chosen[-1]], axis=1))
     return chosen
+
+
+def _drawn(count: int, seed: int) -> int:
+    """Index in range(count), drawn by a seed; the generators of policies and of points begin with the seed alone."""
+    return int(np.random.default_rng([seed, _START]).integers(count))

@@ -22,11 +22,13 @@ __all__ = [
     "MaskUse",
     "PickPoints",
     "SemanticUse",
+    "Start",
 ]
 
 InitPoints = Literal["auto", "views", "all"]
 MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
+Start = Literal["first", "seed"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
 FeatureSize = Literal["image", "teacher"]
@@ -35,6 +37,7 @@ _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
     **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
     "test_every": (0, 10**9),
+    "test_offset": (0, 10**9),
     "seed": (0, 2**31 - 1),  # what COLMAP takes
     "means_rate": (1e-30, 1e6),  # their logarithms are interpolated
     **dict.fromkeys(("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate"), _RATE),
@@ -62,6 +65,8 @@ class FitConfig:
         init_points: `auto` (the data set's points, else `views`), `views` (only what the training views show) or, in
             an active fit, where `auto` is `views`, `all` (the data set's points, else what all its views show).
         test_every: Every n-th view by name is held out; 0 holds out none.
+        test_offset: Index of the first view that is held out, below `test_every`. A split that the data set's own files
+            state wins over both.
         seed: Of everything random.
         sh_degree: Highest degree of the view-dependent color.
         deterministic: One Dr.Jit thread, hence the same bits for the same seed.
@@ -103,6 +108,7 @@ class FitConfig:
     max_gaussians: int = 30_000
     init_points: InitPoints = "auto"
     test_every: int = 8
+    test_offset: int = 0
     seed: int = 0
     sh_degree: Degree = 3
     deterministic: bool = False
@@ -141,6 +147,11 @@ class FitConfig:
         check_fields("fit", self, _RANGES)
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
+        if self.test_offset >= max(self.test_every, 1):
+            raise ValueError(
+                f"fit: test_offset must be in 0..{max(self.test_every, 1) - 1} with test_every {self.test_every}, got "
+                f"{self.test_offset}; lower it"
+            )
 
     def start_of(self, dense: bool) -> tuple[float, float]:
         """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
@@ -171,7 +182,9 @@ class ActiveConfig:
         policy: A name in `drgs.select.POLICIES`.
         criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
         method: Of the diagonal, see `drgs.fisher.diagonal`.
-        initial: Views at the start: the first of the training split, then those farthest from all before.
+        initial: Views at the start: one by `start`, then those farthest from all before.
+        start: The first of them: `first` of the training split by name, or one of it drawn by the fit's `seed`, from a
+            generator of its own, so that no policy's draws depend on it.
         add: Views to be added, one at a time.
         every: Steps between two of them, and before the first.
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
@@ -187,6 +200,7 @@ class ActiveConfig:
     criterion: Criterion = "eig"
     method: Method = "exact"
     initial: int = 2
+    start: Start = "first"
     add: int = 10
     every: int = 200
     info_pixels: int | None = None
