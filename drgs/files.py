@@ -50,8 +50,9 @@ _SIZES = {
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
-_MAX_HEADER = 1 << 16
+_MAX_HEADER = 1 << 18  # bytes; some 9,000 columns
 _NORMALS = ("nx", "ny", "nz")
+_FEATURE = "semantic_"
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
@@ -59,8 +60,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
 
     Args:
         path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24 or 45 of them, channel by channel),
-            opacity (logit), scale_0..2 (log) and rot_0..3 (wxyz). Normals may be missing. Any other column is left
-            out with a warning in the log.
+            opacity (logit), scale_0..2 (log) and rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS
+            writes them. Normals and features may be missing. Any other column is left out with a warning in the log.
     Returns:
         float32 `Gaussians` with the file's bits.
     Raises:
@@ -76,7 +77,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
 
     path = check_path("load_ply", path)
     names = _check_ply(path)
-    rest = _rest_columns(path, names)
+    rest, features = _rest_columns(path, names), _feature_columns(path, names)
     columns = {
         "means": ("x", "y", "z"),
         "quats": tuple(f"rot_{i}" for i in range(4)),
@@ -91,7 +92,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
             f"{', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''} missing; "
             f"{_layout_hint(names)}"
         )
-    known = {name for group in columns.values() for name in group} | set(rest) | set(_NORMALS)
+    known = {name for group in columns.values() for name in group} | {*rest, *features, *_NORMALS}
     extra = [name for name in names if name not in known]
     if extra:
         shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
@@ -113,6 +114,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     if rest:
         higher = read(rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)
         sh = torch.cat([sh, higher], dim=1)
+    if features:
+        arrays["features"] = read(features)
     arrays["logit_opacities"] = arrays["logit_opacities"][:, 0]
     made = Gaussians(**arrays, sh=sh.contiguous())
     made.validate(str(path))
@@ -122,8 +125,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
 def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
     """Write Gaussians as INRIA's trainer does: binary little-endian float32, normals 0, the same order of columns.
 
-    `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32; features have no
-    place in this layout and are left out with a warning in the log.
+    `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32. Features, where there
+    are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.
 
     Raises:
         ValueError: If a parameter is not finite (the first index is named).
@@ -137,8 +140,6 @@ def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
     check_scene("save_ply", g, None)
     path = check_path("save_ply", path)
     g.validate("save_ply")
-    if g.features is not None:
-        _log.warning("%s: the 3DGS layout has no columns for features, they are left out", path)
     # A file holds values.
     fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
     means = fields["means"]
@@ -153,6 +154,7 @@ def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
         "opacity": fields["logit_opacities"],
         **{f"scale_{i}": fields["log_scales"][:, i] for i in range(3)},
         **{f"rot_{i}": fields["quats"][:, i] for i in range(4)},
+        **{f"{_FEATURE}{i}": x for i, x in enumerate(fields["features"].T if "features" in fields else ())},
     }
     vertex = np.empty(len(g), [(name, "<f4") for name in columns])
     for name, values in columns.items():
@@ -212,6 +214,19 @@ def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:
             "export it again"
         )
     return rest
+
+
+def _feature_columns(path: Path, names: list[str]) -> tuple[str, ...]:
+    """Columns of features, none missing; a label or the like of the same prefix is no feature."""
+    held = [name for name in names if name.startswith(_FEATURE) and name.removeprefix(_FEATURE).isdecimal()]
+    wanted = tuple(f"{_FEATURE}{i}" for i in range(len(held)))
+    if set(held) != set(wanted):
+        odd = next(name for name in wanted if name not in held)
+        raise ValueError(
+            f"{path}: features must be columns {_FEATURE}0, {_FEATURE}1, ... without a gap, got {len(held)} without "
+            f"{odd}; export it again"
+        )
+    return wanted
 
 
 def _layout_hint(names: list[str]) -> str:

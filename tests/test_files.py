@@ -83,14 +83,53 @@ def test_every_degree_round_trips_bit_for_bit(tmp_path, degree):
 
 def test_columns_in_any_order_without_normals_and_with_extras(tmp_path, rng, caplog):
     """gsplat's layout has no normals; columns of others are reported and left out; doubles are rounded."""
-    columns = [*BASE[::-1], "semantic_0"]
+    columns = [*BASE[::-1], "semantic_label", "7"]
     table = rng.standard_normal((4, len(columns)))
     write(tmp_path / "a.ply", header(columns, 4, "double"), table.astype("<f8").tobytes())
     with caplog.at_level(logging.WARNING):
         g = load_ply(tmp_path / "a.ply")
-    assert "left out 1 columns that are not 3DGS: semantic_0" in caplog.text
+    assert "left out 2 columns that are not 3DGS: semantic_label, 7" in caplog.text
     assert np.array_equal(g.means.numpy(), table[:, [columns.index(c) for c in "xyz"]].astype(np.float32))
     assert g.sh.shape == (4, 1, 3)
+
+
+@pytest.mark.parametrize("width", [1, 5, 512])
+def test_features_round_trip_bit_for_bit(tmp_path, width):
+    """Features follow the 3DGS columns as semantic_0, ..., in their order, and come back with the same bits; without
+    them the file is as it was.
+    """
+    g = gaussians(degree=1)
+    save_ply(g, tmp_path / "plain.ply")
+    features = torch.randn(len(g), width, generator=torch.Generator().manual_seed(1))
+    features[0, 0], features[1, 0] = -0.0, 1e-42
+    save_ply(g.replace(features=features), tmp_path / "a.ply")
+    back = load_ply(tmp_path / "a.ply")
+    assert torch.equal(back.features.view(torch.int32), features.view(torch.int32))
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    plain, rows = (tmp_path / "plain.ply").read_bytes().split(b"end_header\n", 1)
+    names = "".join(f"property float semantic_{i}\n" for i in range(width))
+    assert head.decode() == plain.decode() + names
+    table = np.frombuffer(body, "<f4").reshape(len(g), -1)
+    assert table[:, :-width].tobytes() == rows
+    assert load_ply(tmp_path / "plain.ply").features is None
+
+
+def test_features_of_doubtful_files(tmp_path):
+    """Columns of features with a gap, or for which the file has no bytes, are refused; any order is not."""
+    columns = [*BASE, "semantic_2", "semantic_0", "semantic_1"]
+    values = np.arange(len(columns), dtype="<f4")
+    write(tmp_path / "a.ply", header(columns), values.tobytes())
+    assert load_ply(tmp_path / "a.ply").features.tolist() == [[15, 16, 14]]
+    write(tmp_path / "a.ply", header([*BASE, "semantic_0", "semantic_2"]), values[:-1].tobytes())
+    with pytest.raises(ValueError, match=r"without a gap, got 2 without semantic_1"):
+        load_ply(tmp_path / "a.ply")
+    many = [*BASE, *(f"semantic_{i}" for i in range(512))]
+    write(tmp_path / "a.ply", header(many), values.tobytes())
+    with pytest.raises(ValueError, match=r"claims 1 vertex \(2104 bytes\), the file holds 68 bytes; it is truncated"):
+        load_ply(tmp_path / "a.ply")
+    write(tmp_path / "a.ply", header(columns), np.where(values == 15, np.nan, values).astype("<f4").tobytes())
+    with pytest.raises(ValueError, match="features must be finite"):
+        load_ply(tmp_path / "a.ply")
 
 
 def test_ascii_and_big_endian_files_load(tmp_path):
