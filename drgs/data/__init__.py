@@ -11,11 +11,12 @@ from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
 from drgs.data.points import added_points, initial_points, scene_extent
+from drgs.data.semantics import Semantics, attach
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.views import Dataset, View
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["Dataset", "View", "added_points", "initial_points", "load", "scene_extent"]
+__all__ = ["Dataset", "Semantics", "View", "added_points", "initial_points", "load", "scene_extent"]
 
 
 def load(
@@ -27,6 +28,7 @@ def load(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
+    semantics: bool = True,
 ) -> Dataset:
     """Load a data set; its format is found out from its files. No image is decoded.
 
@@ -47,6 +49,7 @@ def load(
             from all its images.
         strict: refuse a data set that lists images which are not there. By default at least 3 must be left; the
             missing ones are named in the log and held in `Dataset.absent`.
+        semantics: look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
 
     Raises:
         FileNotFoundError: nothing there, photos without poses, or too few of the photos.
@@ -72,6 +75,8 @@ def load(
     dataset = loader(path, background=background, lazy=lazy, points=points, strict=strict, **held_out)
     dataset.test_every, dataset.test_offset = test_every, test_offset
     dataset.split()  # refuses numbers that cannot be
+    if semantics:
+        attach(dataset, lazy)
     return dataset
 
 

@@ -1,26 +1,27 @@
-"""Views and data sets: cameras with images, masks and depth maps that are read when asked for."""
+"""Views and data sets: cameras with images, masks, depth and feature maps and labels that are read when asked for."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.checks import image_size, read_image, read_npy
+from drgs.data.semantics import Semantics, plain_labels
 from drgs.data.splits import SplitRule
+from drgs.data.undistortion import lens_maps, undistorted_map
+
+if TYPE_CHECKING:
+    import torch
 
 __all__ = ["Dataset", "View", "check_parallax", "fit_to_image", "go_on_without", "make_unique"]
 
 _ASPECT_TOLERANCE = 0.01
-# An undistorted border pixel may look this many pixels past the photo before it counts as unseen.
-_BORDER = 1.0
-# Of an undistorted image, the share that its photo did not see: ordinary lenses leave below a tenth in the corners.
-_LOST_WARNED, _LOST_MAX = 0.25, 0.9
 _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
 
@@ -39,6 +40,9 @@ class View:
         depth_scale: scene units in one unit of the depth file.
         background: color in [0,1] that images with an alpha channel are composited on.
         split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
+        label_path: image of the class of each pixel, or None.
+        teacher_path: feature map of a teacher, or None.
+        semantics: what their numbers mean, as in the data set; None without.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
@@ -51,6 +55,9 @@ class View:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     split: str = ""
     is_checked: bool = True
+    label_path: Path | None = None
+    teacher_path: Path | None = None
+    semantics: Semantics | None = dataclasses.field(default=None, repr=False)
 
     def checked(self) -> View:
         """The view with its camera at the size of its image file, whose header is read now if it has not been.
@@ -88,7 +95,7 @@ class View:
             alpha = data[..., 3:]
             data = data[..., :3] * alpha + (1 - alpha) * np.asarray(self.background, dtype=np.float32)
         if self.camera.is_distorted:
-            columns, rows, _ = _lens_maps(self.camera)
+            columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
         return _resize_area(data, *self._size(width, height))
@@ -99,7 +106,7 @@ class View:
         Pixels of an undistorted image that the photo did not see are 0, also where there is no mask
         file.
         """
-        if self.mask_path is None and not (self.camera.is_distorted and _lens_maps(self.camera)[2] is not None):
+        if self.mask_path is None and not (self.camera.is_distorted and lens_maps(self.camera)[2] is not None):
             return None
         if self.mask_path is None:
             data = np.ones((self.camera.height, self.camera.width), dtype=np.float32)
@@ -111,7 +118,7 @@ class View:
             data = raw.astype(np.float32) if raw.max() <= 1 else _unit_range(raw, self.mask_path)
             data = self._nearest(data, self.mask_path)
         if self.camera.is_distorted:
-            unseen = _lens_maps(self.camera)[2]
+            unseen = lens_maps(self.camera)[2]
             if unseen is not None:
                 data = np.where(unseen, np.float32(0), data)
         return _resize_area(data, *self._size(width, height))
@@ -132,10 +139,51 @@ class View:
         data = raw.astype(np.float32) * np.float32(self.depth_scale)
         data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
         data = self._nearest(data, self.depth_path)
-        if self.camera.is_distorted and _lens_maps(self.camera)[2] is not None:
-            data = np.where(_lens_maps(self.camera)[2], np.float32(0), data)
+        if self.camera.is_distorted and lens_maps(self.camera)[2] is not None:
+            data = np.where(lens_maps(self.camera)[2], np.float32(0), data)
         # Averaging depths across an edge, or with unknown zeros, would invent surfaces.
         return cv2.resize(data, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+    def labels(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
+        """(H,W) int64 classes: 0 where there is no label, k for ``semantics.classes.names[k - 1]``; undistorted,
+        nearest pixel; None if there is no label image.
+
+        Raises:
+            FileNotFoundError, ValueError: no label image, another shape than the photo's, or numbers of no class.
+        """
+        import cv2
+
+        if self.label_path is None:
+            return None
+        raw = plain_labels(self.label_path)
+        if self.semantics is None:  # no data set that says what numbers mean
+            labels = np.where(raw == np.iinfo(raw.dtype).max, 0, raw)
+        else:
+            labels = self.semantics.numbered(raw, self.label_path)
+        # OpenCV has no int64; float32 holds all numbers of 16 bits.
+        labels = self._nearest(labels.astype(np.float32), self.label_path)
+        if self.camera.is_distorted and lens_maps(self.camera)[2] is not None:
+            labels = np.where(lens_maps(self.camera)[2], np.float32(0), labels)
+        return cv2.resize(labels, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT).astype(np.int64)
+
+    def teacher(self) -> torch.Tensor | None:
+        """(C,h,w) feature map of the teacher, float16 or float32, memory-mapped; None if there is none.
+
+        The map covers the undistorted photo, whatever its size. Of a lens, cells are moved as pixels are, bilinearly,
+        in memory; cells that the photo did not see repeat its border (`mask` is 0 there). The first use of a file in
+        a process looks through it for NaN.
+
+        Raises:
+            FileNotFoundError, ValueError: no such map, or of other channels than the data set's.
+        """
+        from drgs.features.teacher import used_map
+
+        if self.teacher_path is None:
+            return None
+        values = used_map(self.teacher_path)
+        if self.semantics is not None:
+            self.semantics.check_channels(values, self.teacher_path)
+        return undistorted_map(values, self.camera) if self.camera.is_distorted else values
 
     def _size(self, width: int | None, height: int | None) -> tuple[int, int]:
         return width or self.camera.width, height or self.camera.height
@@ -163,7 +211,7 @@ class View:
         if (width, height) != size:
             data = cv2.resize(data, size, interpolation=cv2.INTER_NEAREST_EXACT)
         if self.camera.is_distorted:
-            columns, rows, _ = _lens_maps(self.camera)
+            columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return data
 
@@ -183,6 +231,7 @@ class Dataset:
         test_offset: index, by name, of the first view that is held out.
         absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
             alone, which therefore stays the same whatever is missing.
+        semantics: a teacher's maps, labels and classes, or None where there are none.
     """
 
     path: Path
@@ -194,6 +243,7 @@ class Dataset:
     test_every: int = 8
     absent: list[View] = dataclasses.field(default_factory=list)
     test_offset: int = 0
+    semantics: Semantics | None = None
 
     def split(self, test_every: int | None = None, test_offset: int | None = None) -> tuple[list[View], list[View]]:
         """(train, test) views, both sorted by name, by the rule that `split_rule` names.
@@ -336,53 +386,3 @@ def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
         return np.ascontiguousarray(data)
     shrinks = width <= data.shape[1] and height <= data.shape[0]
     return cv2.resize(data, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-
-
-def _lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the
-    photo did not see.
-
-    Raises:
-        ValueError: the photo saw next to nothing of its own undistorted image.
-    """
-    *maps, lost = _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
-    if lost > _LOST_MAX:
-        raise ValueError(
-            f"view {camera.name!r}: its lens must show what its undistorted image shows, {lost:.0%} of that lie "
-            f"outside the photo or where the lens folds back, got {camera.model} {camera.distortion}; "
-            "check the coefficients"
-        )
-    return tuple(maps)
-
-
-@functools.lru_cache(maxsize=8)
-def _cached_lens_maps(
-    K: bytes, width: int, height: int, model: str, distortion: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, float]:
-    """As `_lens_maps`, and the share of pixels that were not seen."""
-    matrix = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
-    lens = Camera(K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion)
-    rays = lens.undistorted().pixel_directions().reshape(-1, 3)
-    pixels = lens.project(rays)[0].reshape(height, width, 2)
-    x, y = pixels[..., 0], pixels[..., 1]
-    unseen = ~((x > -_BORDER) & (x < width + _BORDER) & (y > -_BORDER) & (y < height + _BORDER))
-    # Past the radius where the lens polynomial turns back, rays land on pixels that show something
-    # else.
-    radius = np.hypot(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]).reshape(height, width)
-    probe = np.linspace(0.0, radius.max(), 1024)
-    spread = lens.project(np.stack([probe, np.zeros(1024), np.ones(1024)], axis=-1))[0][:, 0]
-    folds = np.flatnonzero(np.diff(spread) <= 0)
-    if len(folds):
-        unseen |= radius > probe[folds[0]]
-    lost = float(unseen.mean())
-    if lost > _LOST_WARNED:
-        _log.warning(
-            "lens %s %s: %.0f%% of the undistorted image was not seen by the photo%s; check the coefficients",
-            model,
-            distortion,
-            100 * lost,
-            ", the lens folds back inside it" if len(folds) else "",
-        )
-    # OpenCV counts pixel centers at integers; its tables are float32.
-    table = np.clip(np.nan_to_num(pixels - 0.5, nan=-1e6), -1e6, 1e6).astype(np.float32)
-    return table[..., 0].copy(), table[..., 1].copy(), unseen if unseen.any() else None, lost

@@ -1,0 +1,356 @@
+"""What a data set says about classes: a teacher's feature maps and label images beside the photographs.
+
+Found by their names beside the folder of the images, in this order:
+
+- Teacher: ``rgb_feature_langseg/`` (LSeg), ``sam_embeddings/`` (SAM), as Feature 3DGS reads them.
+  ``NAME_fmap_CxHxW.pt`` belongs to the image of that name without its suffix, or up to the first dot of its name.
+- Labels: ``semantic_class/``, ``semantic/``, ``labels/``. ``NAME.png`` belongs to the image NAME, and as in Replica
+  ``semantic_class_7.png`` to the image ``rgb_7.png``. One channel of 8 or 16 bits, without loss (PNG, TIFF, BMP).
+- Numbers in the labels: ``classes.json``, ``classes.txt`` or ``info_semantic.json`` (`drgs.data.class_names`). 0 and
+  the largest number, 255 or 65535, are no label unless they are named there.
+- Classes in the teacher's space: ``text_embeddings.npy``, a row a class in the order of that file.
+
+Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+import re
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.data.checks import read_image, read_npy
+from drgs.data.class_names import CLASS_FILES, read_class_names
+from drgs.display.progress import Bar
+
+if TYPE_CHECKING:
+    import torch
+
+    from drgs.data.views import Dataset, View
+    from drgs.features.segmentation import Classes
+
+__all__ = ["LABEL_FOLDERS", "TEACHER_FOLDERS", "Semantics", "attach", "plain_labels"]
+
+TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
+LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
+_EMBEDDINGS = "text_embeddings.npy"
+_LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
+_IMAGE_FOLDERS = ("images", "rgb")
+_NUMBERED = re.compile(r"rgb_(\d+)")
+_NUMBERS = 1 << 16  # what a pixel of a label image can say
+_SHOWN = 5
+
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Semantics:
+    """What a data set says about classes. Nothing but folders has been looked at; files are opened by the properties.
+
+    Attributes:
+        teacher: Name of the folder of the teacher's maps, empty without.
+        labels: Name of the folder of the label images, empty without.
+        maps, label_images: The files of the views that have one, in the order of the views.
+        class_file, embedding_file: Files of names and text embeddings, or None.
+    """
+
+    teacher: str = ""
+    labels: str = ""
+    maps: tuple[Path, ...] = ()
+    label_images: tuple[Path, ...] = ()
+    class_file: Path | None = None
+    embedding_file: Path | None = None
+
+    @functools.cached_property
+    def channels(self) -> int | None:
+        """C of the teacher's maps, by the text embeddings if there are any, else by the first map; None without."""
+        if not self.maps:
+            return None
+        return self._embeddings.shape[1] if self._embeddings is not None else self._first.shape[0]
+
+    @functools.cached_property
+    def map_size(self) -> tuple[int, int] | None:
+        """(w, h) of the first map, by its header; None without."""
+        return (self._first.shape[2], self._first.shape[1]) if self.maps else None
+
+    @functools.cached_property
+    def classes(self) -> Classes | None:
+        """The classes, of which labels are the numbers from 1.
+
+        Where no file names them, they are called by the numbers that the label images hold (all of which are read), or
+        by the rows of the text embeddings. None where there is neither.
+
+        Raises:
+            FileNotFoundError, ValueError: A file that is none of its kind, or not as many embeddings as names.
+        """
+        from drgs.features.segmentation import Classes
+
+        names = tuple(self._numbers.values())
+        if not names:
+            return None
+        rows = self._embeddings
+        if rows is not None and len(rows) != len(names):
+            source = self.class_file or self.labels
+            raise ValueError(
+                f"{self.embedding_file}: must have a row for each of the {len(names)} classes of {source}, "
+                f"got {len(rows)}; make both from one list"
+            )
+        return Classes(names, rows)
+
+    def checked(self) -> Semantics:
+        """Itself, with the headers of all maps and the classes compared.
+
+        Raises:
+            FileNotFoundError, ValueError: A file that is none of its kind, or maps of several widths.
+        """
+        from drgs.features.teacher import read_map
+
+        for path in self.maps:
+            self.check_channels(read_map(path), path)
+        if self.maps:
+            _ = self.classes
+        elif self.class_file:  # labels alone: without a file, their numbers would be looked for in all of them
+            _ = self._numbers
+        return self
+
+    def check_channels(self, values: torch.Tensor, path: Path) -> None:
+        """Raise ValueError unless a map has the channels of the others."""
+        if values.shape[0] != self.channels:
+            like = self.embedding_file or self.maps[0]
+            raise ValueError(
+                f"{path}: must have {self.channels} channels as {like.name}, got {values.shape[0]}; "
+                "make all maps and embeddings with one teacher"
+            )
+
+    def numbered(self, raw: np.ndarray, path: Path) -> np.ndarray:
+        """Labels (H, W) int64 of what a label image holds.
+
+        Args:
+            raw: (H, W) uint8 or uint16.
+            path: Of the image, for the message.
+
+        Raises:
+            ValueError: Numbers that are no class.
+        """
+        table = self._table.copy()
+        last = np.iinfo(raw.dtype).max
+        table[last] = max(table[last], 0)
+        labels = table[raw]
+        if labels.min() < 0:
+            found = np.unique(raw[labels < 0])
+            shown = ", ".join(map(str, found[:_SHOWN])) + (", ..." if len(found) > _SHOWN else "")
+            raise ValueError(
+                f"{path}: must hold classes of {self.class_file or self.labels}, or 0 or {last} for none, "
+                f"got {shown}; name them there"
+            )
+        return labels
+
+    @functools.cached_property
+    def _table(self) -> np.ndarray:
+        """Label of each number that a pixel can say: -1 for those that are no class."""
+        table = np.full(_NUMBERS, -1, np.int64)
+        table[[0, *(number for number in self._void if 0 <= number < _NUMBERS)]] = 0
+        for label, number in enumerate(self._numbers, 1):
+            if 0 <= number < _NUMBERS:
+                table[number] = label
+        return table
+
+    @functools.cached_property
+    def _named(self) -> tuple[dict[int, str], set[int]]:
+        """Number -> name of the classes, and the numbers of what is none."""
+        if self.class_file is not None:
+            return read_class_names(self.class_file)
+        if self._embeddings is not None:
+            return {number: str(number) for number in range(1, len(self._embeddings) + 1)}, set()
+        return {int(number): str(number) for number in _numbers_in(self.label_images)}, set()
+
+    @property
+    def _numbers(self) -> dict[int, str]:
+        return self._named[0]
+
+    @property
+    def _void(self) -> set[int]:
+        return self._named[1]
+
+    @functools.cached_property
+    def _embeddings(self) -> torch.Tensor | None:
+        """(K, C) float32 of length 1 each, or None."""
+        if self.embedding_file is None:
+            return None
+        import torch
+
+        rows = read_npy(self.embedding_file)
+        if rows.ndim != 2 or rows.dtype.kind != "f" or 0 in rows.shape:
+            raise ValueError(
+                f"{self.embedding_file}: must be a row of floats a class, got shape {rows.shape} of {rows.dtype}; "
+                "save (classes, channels) floats"
+            )
+        lengths = np.linalg.norm(rows.astype(np.float64), axis=1)
+        bad = np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0)))
+        if len(bad):
+            raise ValueError(f"{self.embedding_file}: must be finite and not 0, row {bad[0]} is not; make it again")
+        return torch.from_numpy((rows / lengths[:, None]).astype(np.float32))
+
+    @functools.cached_property
+    def _first(self) -> torch.Tensor:
+        from drgs.features.teacher import read_map
+
+        return read_map(self.maps[0])
+
+
+def attach(dataset: Dataset, lazy: bool) -> None:
+    """Find the maps and labels of a data set's views and note them in `Dataset.semantics` and the views.
+
+    Args:
+        dataset: Loaded; without maps or labels it stays as it is.
+        lazy: Open none of the files; else headers of maps and the files of classes are read.
+
+    Raises:
+        FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
+    """
+    found: dict[str, Path] = {}
+    bases = _bases(dataset)
+    for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", LABEL_FOLDERS)):
+        folders = [base / name for name in names for base in bases if (base / name).is_dir()]
+        for folder in folders:
+            files = _maps(folder) if kind == "teacher" else _label_images(folder)
+            matched = _matched(dataset.views, folder, files)
+            if matched:
+                found[kind] = folder
+                for view, path in matched:
+                    setattr(view, f"{kind.removesuffix('s')}_path", path)
+                break
+            _explain(kind, folder, files, dataset.views)
+    if not found:
+        return
+    classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]
+    embeddings = [base / _EMBEDDINGS for base in bases if (base / _EMBEDDINGS).is_file()]
+    semantics = Semantics(
+        teacher=found["teacher"].name if "teacher" in found else "",
+        labels=found["labels"].name if "labels" in found else "",
+        maps=tuple(view.teacher_path for view in dataset.views if view.teacher_path),
+        label_images=tuple(view.label_path for view in dataset.views if view.label_path),
+        class_file=classes[0] if classes else None,
+        embedding_file=embeddings[0] if embeddings else None,
+    )
+    if "teacher" in found:
+        train = dataset.split()[0]
+        without = [view.name for view in train if view.teacher_path is None]
+        if without:
+            _log.warning(
+                "%s: %d of the %d training views have no map (%s); of these, only colors can be fitted",
+                found["teacher"],
+                len(without),
+                len(train),
+                ", ".join(without[:_SHOWN]) + (", ..." if len(without) > _SHOWN else ""),
+            )
+    for view in dataset.views:
+        view.semantics = semantics
+    dataset.semantics = semantics if lazy else semantics.checked()
+
+
+def plain_labels(path: Path) -> np.ndarray:
+    """A label image as stored, (H, W) uint8 or uint16.
+
+    Raises:
+        FileNotFoundError, ValueError: No image, or one of colors or floats.
+    """
+    raw = read_image(path)
+    if raw.ndim == 3 and (raw[..., :1] == raw[..., :3]).all():
+        raw = raw[..., 0]
+    if raw.ndim != 2:
+        raise ValueError(
+            f"{path}: a label image must have one channel of class numbers, got {raw.shape[2]} or a palette of colors; "
+            "convert it"
+        )
+    if raw.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: a label image must have 8 or 16 bits a pixel, got {raw.dtype}; convert it")
+    return raw
+
+
+def _bases(dataset: Dataset) -> list[Path]:
+    """Where the folders may be: in the data set, and beside its folder of images."""
+    path = dataset.path
+    bases = [path if path.is_dir() else path.parent]
+    image = next((view.image_path for view in dataset.views if view.image_path), None)
+    if image is not None:
+        bases += [folder.parent for folder in image.parents if folder.name in _IMAGE_FOLDERS][:1]
+    return list(dict.fromkeys(bases))
+
+
+def _maps(folder: Path) -> dict[str, Path]:
+    """Stem of the image, with its subfolder -> map."""
+    from drgs.features.teacher import map_name
+
+    return {
+        str(PurePosixPath(path.parent.relative_to(folder)) / name): path
+        for path in sorted(folder.rglob("*.pt"))
+        if (name := map_name(path))
+    }
+
+
+def _label_images(folder: Path) -> dict[str, Path]:
+    """Stem, with its subfolder -> label image."""
+    return {
+        str(PurePosixPath(path.relative_to(folder)).with_suffix("")): path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix.lower() in _LOSSLESS and not path.name.startswith(".")
+    }
+
+
+def _matched(views: list[View], folder: Path, files: dict[str, Path]) -> list[tuple[View, Path]]:
+    """The views that have a file, and which; ValueError if two have the same."""
+    matched: list[tuple[View, Path]] = []
+    owners: dict[Path, View] = {}
+    for view in views:
+        if view.image_path is None:
+            continue
+        stems = list(dict.fromkeys((view.image_path.stem, view.image_path.name.split(".")[0])))
+        if number := _NUMBERED.fullmatch(stems[0]):
+            stems += [f"{name}_{number[1]}" for name in dict.fromkeys((folder.name, LABEL_FOLDERS[0]))]
+        below = PurePosixPath(view.name).parent
+        path = next((files[key] for key in (*(str(below / stem) for stem in stems), *stems) if key in files), None)
+        if path is None:
+            continue
+        if path in owners:
+            raise ValueError(
+                f"{path}: must belong to one image, {owners[path].image_path} and {view.image_path} are both named so; "
+                "put them into subfolders as the images"
+            )
+        owners[path] = view
+        matched.append((view, path))
+    return matched
+
+
+def _explain(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:
+    """Say that a folder has no file for any view; maps of other images are refused."""
+    image = next((view.image_path.stem for view in views if view.image_path), "NAME")
+    if kind == "teacher" and files:
+        raise ValueError(
+            f"{folder}: must hold maps of this data set's images (as {image}_fmap_CxHxW.pt), found {len(files)} of "
+            f"others ({next(iter(files.values())).name}, ...); make them from these images, or move the folder away"
+        )
+    wanted = f"{image}_fmap_CxHxW.pt" if kind == "teacher" else f"{image}.png"
+    _log.warning("%s: has no file for any image (as %s); going on without", folder, wanted)
+
+
+def _numbers_in(paths: tuple[Path, ...]) -> list[int]:
+    """The numbers in label images, without 0 and the largest one."""
+    found: set[int] = set()
+    with Bar("classes in labels", len(paths)) as bar:
+        for path in paths:
+            raw = plain_labels(path)
+            found |= set(np.unique(raw).tolist()) - {0, np.iinfo(raw.dtype).max}
+            bar.advance()
+    if paths and not found:
+        _log.warning(
+            "%s: label images hold only 0 and the largest number, which are no class; name them in classes.txt beside "
+            "the folder (`0 background`, `255 object`)",
+            paths[0].parent,
+        )
+    return sorted(found)
