@@ -20,7 +20,7 @@ __all__ = ["NO_LABEL", "FeatureColors", "label_colors", "label_picture", "mask_p
 NO_LABEL = (40, 40, 40)
 """Color of pixels without a label."""
 _PERCENTILES = 1.0, 99.0
-_ROWS = 20_000  # samples of a basis: 41 MB of 512 channels; the three largest variances of a room need no more
+_ROWS = 5000  # samples of a basis: 20 MB of 512 channels in float64
 _INK, _BACK = (235, 235, 235), (18, 18, 18)
 _LINE, _SWATCH, _CHARACTER = 17, 12, 34  # pixels of a legend's line and of its square; characters of a name at most
 _EDGE = 0.35  # how much darker the border between two classes is
@@ -86,7 +86,7 @@ def _sample(maps: Iterable[torch.Tensor], rows: int) -> torch.Tensor:
     parts = []
     for features in maps:
         flat = features.detach().reshape(-1, features.shape[-1])
-        flat = flat[:: -(-len(flat) // rows) or 1].cpu().float()
+        flat = flat[:: max(1, -(-len(flat) // rows))].cpu().float()
         length = flat.norm(dim=1)
         good = torch.isfinite(length) & (length > 0)
         parts.append(flat[good] / length[good][:, None])
@@ -109,7 +109,7 @@ def label_colors(count: int) -> np.ndarray:
     grid = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), -1).reshape(-1, 3)
     grid = np.concatenate([np.array([NO_LABEL, (0, 0, 0), (255, 255, 255)], np.uint8), grid])
     lab = cv2.cvtColor(grid[None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
-    allowed = (lab[:, 0] > 35) & (lab[:, 0] < 92)
+    allowed = (lab[:, 0] > 35) & (lab[:, 0] < 92) & (np.hypot(lab[:, 1], lab[:, 2]) < 75)
     distance = np.min([np.linalg.norm(lab - lab[i], axis=1) for i in range(3)], axis=0)
     table = [grid[0]]
     for _ in range(count):
