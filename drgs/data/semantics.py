@@ -108,11 +108,11 @@ class Semantics:
         Raises:
             FileNotFoundError, ValueError: A file that is none of its kind, or maps of several widths.
         """
-        from drgs.features.teacher import read_map
-
-        for path in self.maps:
-            self.check_channels(read_map(path), path)
         if self.maps:
+            from drgs.features.teacher import read_map
+
+            for path in self.maps:
+                self.check_channels(read_map(path), path)
             _ = self.classes
         elif self.class_file:  # labels alone: without a file, their numbers would be looked for in all of them
             _ = self._numbers
