@@ -28,7 +28,7 @@ def check_numbers(values, where):
         ValueError: If one is not an integer in its range.
     """
     for name, value in values.items():
-        low = {"seed": 0, "width": 8, "height": 8}.get(name, 1)
+        low = {"seed": 0, "width": 8, "height": 8, "test_every": 2}.get(name, 1)
         if not isinstance(value, int) or not low <= value <= 16384:
             raise ValueError(
                 f"{where}: {name} must be an integer from {low} to 16384, got {value!r}; choose another {name}"

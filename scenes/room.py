@@ -2,7 +2,7 @@
 
 A seed decides the room's size, which walls have the window, the sofa and the door, the furniture, textures and colors.
 World: meters, +z up, floor at z = 0, room around the z axis. The camera goes twice around the middle at eye height and
-looks across the room, as one that is carried through it. Every fifth view, from the first, is for testing.
+looks across the room, as one that is carried through it. Every fifth view, from the first, is for testing by default.
 
 Files, in COLMAP's layout as Feature 3DGS reads it:
 
@@ -12,7 +12,8 @@ Files, in COLMAP's layout as Feature 3DGS reads it:
 - depth/depth_NNN.png: 16-bit z-depth in tenths of a millimeter,
 - rgb_feature_langseg/rgb_NNN_fmap_CxHxW.pt: the teacher's features (512, h, w) float16, `scenes.teacher`, with
   text_embeddings.npy, (classes, 512), and how often the teacher is right in teacher.json,
-- test_views.txt: names of the test views, the same that `drgs fit --test-every 5` holds out; params.json.
+- test_views.txt: names of the test views, those that `drgs fit --test-every 5` holds out (or the N of
+  `drgs scene room --test-every N`); params.json.
 """
 
 from __future__ import annotations
@@ -284,7 +285,7 @@ class _Views:
         depth = cv2.imread(depth, cv2.IMREAD_UNCHANGED) * output.DEPTH_UNIT
         return cv2.imread(image)[..., ::-1].copy(), depth, cv2.imread(labels, cv2.IMREAD_UNCHANGED)
 
-    def finish(self, poses):
+    def finish(self, poses, test_every):
         """What belongs to all views: the COLMAP model, names, and how good the teacher is."""
         folder, count = self.folder, len(poses)
         names = [self.paths(k)[0].name for k in range(count)]
@@ -296,11 +297,20 @@ class _Views:
         classes = {"unlabelled": 0, "classes": [{"id": k + 1, "name": name} for k, name in enumerate(CLASSES)]}
         (folder / "classes.json").write_text(json.dumps(classes, indent=1) + "\n")
         (folder / "teacher.json").write_text(json.dumps({"pixel_accuracy": right, "views": count}) + "\n")
-        (folder / "test_views.txt").write_text("".join(name + "\n" for name in names[::TEST_EVERY]))
+        (folder / "test_views.txt").write_text("".join(name + "\n" for name in names[::test_every]))
 
 
 def generate(
-    out_dir, views=75, width=320, height=240, spp=25, seed=0, teacher_width=80, teacher_height=60, progress=None
+    out_dir,
+    views=75,
+    width=320,
+    height=240,
+    spp=25,
+    seed=0,
+    teacher_width=80,
+    teacher_height=60,
+    test_every=TEST_EVERY,
+    progress=None,
 ) -> Path:
     """Makes the data set, unless `out_dir` already holds it; an interrupted call is continued.
 
@@ -311,11 +321,13 @@ def generate(
     Args:
         out_dir: Folder to make. Everything appears in it when it is complete; a kill loses the view that is being
             traced. One made here with other parameters is replaced; anything else that is not empty is refused.
-        views: Cameras along the way; every fifth is for testing.
+        views: Cameras along the way.
         width, height: Image size in pixels.
         spp: Light paths a pixel.
         seed: Of the room, the poses, the light paths, the sparse points and the teacher's errors.
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the images are.
+        test_every: Every how many of the views, from the first, one is for testing: drawn along the same way as the
+            others. 3 gives 25 of 75.
         progress: Called as progress(views done, views) after each view.
 
     Returns:
@@ -327,8 +339,8 @@ def generate(
     where = "scenes.room"
     values = {"views": views, "width": width, "height": height, "spp": spp, "seed": seed}
     values |= {"teacher_width": teacher_width, "teacher_height": teacher_height}
-    output.check_numbers(values, where)
-    parameters = {"scene": "room", "version": _VERSION, "test_every": TEST_EVERY, "depth_unit": output.DEPTH_UNIT}
+    output.check_numbers(values | {"test_every": test_every}, where)
+    parameters = {"scene": "room", "version": _VERSION, "test_every": test_every, "depth_unit": output.DEPTH_UNIT}
 
     def fill(folder):
         built, table = scene(seed)
@@ -336,6 +348,6 @@ def generate(
         size = min(teacher_width, width), min(teacher_height, height)
         work = _Views(folder, (width, height), size, spp, seed)
         work.trace(built, table, poses, progress)
-        work.finish(poses)
+        work.finish(poses, test_every)
 
     return output.publish(Path(out_dir), {**parameters, **values}, fill, where)

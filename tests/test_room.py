@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import scenes
 from drgs import cli, data
-from scenes import room, teacher
+from scenes import output, room, teacher
 from scenes.colmap import back_project, project, sparse_points
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 6
@@ -204,6 +205,15 @@ def test_seeds(built, made, tmp_path, monkeypatch):
     assert all((tmp_path / "set" / name).read_bytes() == (made / name).read_bytes() for name in files)
 
 
+def test_rooms_that_are_there_are_kept(tmp_path, monkeypatch):
+    """What the defaults are recorded as has not changed: a finished room of the same files is not made again."""
+    recorded = []
+    monkeypatch.setattr(output, "publish", lambda folder, parameters, fill, where: recorded.append(parameters))
+    room.generate(tmp_path / "a")
+    digest = hashlib.sha256(json.dumps(recorded[0], sort_keys=True).encode()).hexdigest()
+    assert digest == "42882fada0fa1a89f527fb6a7cce9a90c7739ecf6a1b4d229280818933fb837c"
+
+
 def test_command(built, tmp_path, monkeypatch, capsys):
     """`drgs scene room` writes a data set, says what to do next, and keeps a finished one."""
     monkeypatch.setattr(room, "scene", lambda seed: built)
@@ -221,11 +231,14 @@ def test_command(built, tmp_path, monkeypatch, capsys):
         "1",
         "--teacher-size",
         "12x8",
+        "--test-every",
+        "2",
     ]
     assert cli.main(command) == 0
     said = capsys.readouterr().out
-    assert "18 classes, 1 test views" in said
-    assert f"next: drgs fit {out} -o RUN --test-every 5" in said
+    assert "18 classes, 2 test views" in said
+    assert f"next: drgs fit {out} -o RUN --test-every 2" in said
+    assert (out / "test_views.txt").read_text().split() == ["rgb_000.png", "rgb_002.png"]
     assert teacher.load(out / "rgb_feature_langseg" / "rgb_001_fmap_CxHxW.pt").shape == (512, 8, 12)
     monkeypatch.setattr(room, "scene", lambda seed: pytest.fail("made again"))
     assert cli.main([*command, "--quiet"]) == 0
@@ -240,6 +253,7 @@ def test_command(built, tmp_path, monkeypatch, capsys):
         (["--views", "0"], "views must be an integer from 1"),
         (["--spp", "0"], "spp must be an integer from 1"),
         (["--teacher-size", "0x1"], "teacher_width must be an integer from 1"),
+        (["--test-every", "1"], "test_every must be an integer from 2"),
     ],
 )
 def test_bad_arguments(words, says, tmp_path, capsys):
@@ -254,6 +268,8 @@ def test_bad_arguments(words, says, tmp_path, capsys):
 def test_still_life_has_no_teacher(tmp_path, capsys):
     """An option of the room alone is refused for the still life, and a scene that is not there by name."""
     assert cli.main(["scene", "still_life", "-o", str(tmp_path / "x"), "--teacher-size", "8x8"]) == 2
+    assert "is for `drgs scene room`" in capsys.readouterr().err
+    assert cli.main(["scene", "still_life", "-o", str(tmp_path / "x"), "--test-every", "3"]) == 2
     assert "is for `drgs scene room`" in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:
         cli.main(["scene", "kitchen", "-o", str(tmp_path / "x")])

@@ -316,10 +316,12 @@ class Scene(Common):
     size: str = "320x240"
     """WIDTHxHEIGHT of the images in pixels."""
     views: int | None = None
-    """How many images; default 75 (room; every fifth is for testing) or 32 (still_life)."""
+    """How many images; default 75 (room) or 32 (still_life)."""
     seed: int = 0
     """Of shapes, textures, cameras, light paths and all errors that are made on purpose."""
     spp: int | None = None
     """Light paths a pixel; default 25 (room) or 30 (still_life)."""
     teacher_size: str | None = None
     """WIDTHxHEIGHT of the teacher's feature maps (room); default 80x60."""
+    test_every: int | None = None
+    """Every how many views one is for testing (room); default 5, 3 gives 25 of 75."""

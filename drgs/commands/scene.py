@@ -19,9 +19,11 @@ def run(args: Scene) -> None:
     """`drgs scene room -o DATA`."""
     numbers = {"seed": args.seed} | _pair("--size", args.size, "width", "height")
     numbers |= {name: value for name, value in (("views", args.views), ("spp", args.spp)) if value is not None}
+    for option, value in (("--teacher-size", args.teacher_size), ("--test-every", args.test_every)):
+        if value is not None and args.name != "room":
+            raise ValueError(f"{option}: is for `drgs scene room`, not for a still life; leave it out")
+    numbers |= {} if args.test_every is None else {"test_every": args.test_every}
     if args.teacher_size is not None:
-        if args.name != "room":
-            raise ValueError("--teacher-size: is for `drgs scene room`, a still life has no teacher; leave it out")
         numbers |= _pair("--teacher-size", args.teacher_size, "teacher_width", "teacher_height")
     try:
         maker = importlib.import_module(f"scenes.{args.name}")
@@ -37,7 +39,7 @@ def run(args: Scene) -> None:
         right = json.loads((folder / "teacher.json").read_text())["pixel_accuracy"]
         tested = len((folder / "test_views.txt").read_text().split())
         print(f"{len(maker.CLASSES)} classes, {tested} test views, teacher right at {100 * right:.1f} % of the pixels")
-        print(f"next: drgs fit {folder} -o RUN --test-every {maker.TEST_EVERY}")
+        print(f"next: drgs fit {folder} -o RUN --test-every {numbers.get('test_every', maker.TEST_EVERY)}")
     else:
         print(f"next: drgs fit {folder} -o RUN")
 
