@@ -23,7 +23,21 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
-from drgs.commands.options import Crossval, Demo, Eval, Fisher, Fit, Info, Render, Scene, Select, Sfm, Stress, Tradeoff
+from drgs.commands.options import (
+    Crossval,
+    Demo,
+    Eval,
+    Fisher,
+    Fit,
+    Info,
+    Query,
+    Render,
+    Scene,
+    Select,
+    Sfm,
+    Stress,
+    Tradeoff,
+)
 from drgs.display.progress import Bar
 from drgs.guards import interrupts
 
@@ -38,6 +52,7 @@ _OPTIONS = {
     "eval": Eval,
     "select": Select,
     "fisher": Fisher,
+    "query": Query,
     "crossval": Crossval,
     "tradeoff": Tradeoff,
     "stress": Stress,

@@ -12,8 +12,10 @@ from drgs.guards.foreign import refuse_foreign
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
+    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
     from drgs.ellipsoids import Gaussians
+    from drgs.features.decoder import Decoder
+    from drgs.features.segmentation import Classes
 
 __all__ = ["Given"]
 
@@ -28,15 +30,18 @@ class Given:
         record: How the run was fitted; None for a PLY.
         fields: Render settings that hold whatever the preset is: what --set says, over the background of the fit. A
             run was fitted over its background; over another one its edges show a halo.
+        decoder, classes: Of a run that was fitted with semantics; else None.
     """
 
     gaussians: Gaussians
     run: Run | None = None
     record: FitRecord | None = None
     fields: dict[str, Any] = dataclasses.field(default_factory=dict)
+    decoder: Decoder | None = None
+    classes: Classes | None = None
 
     @classmethod
-    def of(cls, args: Crossval | Fisher | Render | Select | Tradeoff) -> Given:
+    def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> Given:
         """What the command line names, and says about settings.
 
         Raises:
@@ -64,7 +69,7 @@ class Given:
             )
         run = Run(path)
         loaded = load_run(run)
-        return cls(loaded.gaussians, run, loaded.record)
+        return cls(loaded.gaussians, run, loaded.record, decoder=loaded.decoder, classes=loaded.classes)
 
     def settings(self, preset: str) -> RenderSettings:
         """How a command renders it with a preset."""

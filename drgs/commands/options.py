@@ -10,7 +10,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from drgs.commands.option_groups import Around, Choosing, Common, Data, Informed, OutputPath, Settings, Split
 from drgs.commands.overrides import check_color
@@ -34,6 +34,7 @@ __all__ = [
     "Fisher",
     "Fit",
     "Info",
+    "Query",
     "Render",
     "Scene",
     "Select",
@@ -253,6 +254,40 @@ class Tradeoff(_Seen):
     """For timing the leading settings on views as large as they are drawn; less time, smaller views."""
     output: OutputPath = Path("out/tradeoff")
     """Folder for tradeoff.json, tradeoff.md and the plot."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Query(Settings, Around, Data):
+    """Find what a text means: masks of views, and a PLY of the Gaussians that are it, or of all others."""
+
+    scene: Positional[Path]
+    """A run that was fitted with semantics, or a PLY with features."""
+    classes: Annotated[tuple[str, ...], arg(name="class", metavar="NAME"), UseAppendAction] = ()
+    """A class of the run; may be repeated."""
+    text_embedding: Path | None = None
+    """Embeddings of texts by the teacher's text encoder: .npy or .pt, of shape (C,) or (K, C)."""
+    threshold: float | None = None
+    """What the score must reach: of classes their probability, of embeddings the cosine; default the largest wins."""
+    temperature: float | None = None
+    """Cosines are divided by it before the softmax that makes probabilities of them; default 0.01, CLIP's."""
+    decoder: Path | None = None
+    """Decoder of a PLY, as Feature 3DGS writes it (decoder_chkpnt*.pth); a run has its own."""
+    remove: bool = False
+    """Write all Gaussians but the selected ones."""
+    preset: Preset = "fast"
+    """Render settings of a named system."""
+    cameras: str | None = None
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
+    split: Split = "all"
+    """Which views of a data set."""
+    limit: int = 4
+    """Masks of at most this many views, evenly spaced."""
+    max_pixels: int | None = None
+    """Views are reduced to at most this many pixels; default as in the fit."""
+    fov: float | None = None
+    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
+    output: OutputPath = Path("out/query")
+    """Folder for the masks, pictures, query.json, and selected.ply or (--remove) rest.ply."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.given import Given
-    from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
+    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
     from drgs.data import Dataset, View
 
 __all__ = [
@@ -116,7 +116,7 @@ class Source:
 
 
 def drawn_views(
-    args: Render | Crossval | Tradeoff,
+    args: Render | Crossval | Query | Tradeoff,
     text: str,
     given: Given,
     frames: int,
@@ -146,7 +146,7 @@ def drawn_views(
     return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{Path(text)} ({args.split})"
 
 
-def seen_views(args: Crossval | Tradeoff, given: Given) -> tuple[list[Camera], str]:
+def seen_views(args: Crossval | Query | Tradeoff, given: Given) -> tuple[list[Camera], str]:
     """At most `--limit` pinhole cameras of `--cameras`, as large as they are drawn; and where they come from in words.
 
     Raises:
@@ -158,7 +158,7 @@ def seen_views(args: Crossval | Tradeoff, given: Given) -> tuple[list[Camera], s
 
 
 def _drawn_orbit(
-    args: Render | Crossval | Tradeoff,
+    args: Render | Crossval | Query | Tradeoff,
     given: Given,
     frames: int,
     size: tuple[int | None, int | None],
@@ -325,7 +325,7 @@ def evenly(views: list, limit: int) -> list:
     return [views[i * len(views) // limit] for i in range(limit)]
 
 
-def check_counts(args: Crossval | Fisher | Select | Tradeoff) -> None:
+def check_counts(args: Crossval | Fisher | Query | Select | Tradeoff) -> None:
     """Raise ValueError unless the options that count views or pixels, and those of orbits, are in their ranges."""
     for option, high in (("count", _MAX_COUNT), ("limit", _MAX_COUNT), ("max_pixels", 10**9), ("info_pixels", 10**9)):
         value = getattr(args, option, None)
@@ -335,6 +335,6 @@ def check_counts(args: Crossval | Fisher | Select | Tradeoff) -> None:
     Wish.of(args)
 
 
-def _say(args: Render | Crossval | Tradeoff, text: str) -> None:
+def _say(args: Render | Crossval | Query | Tradeoff, text: str) -> None:
     if not args.quiet:
         print(text, flush=True)

@@ -22,7 +22,7 @@ from drgs.guards.foreign import refuse_foreign
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["check_finite", "map_name", "read_map", "used_map"]
+__all__ = ["check_finite", "map_name", "read_map", "read_tensor", "used_map"]
 
 # `CxHxW` are the letters in the files of Feature 3DGS; numbers in their place must agree with the tensor.
 _NAME = re.compile(r"(.+)_fmap_(CxHxW|(\d+)x(\d+)x(\d+))\.pt")
@@ -55,12 +55,37 @@ def read_map(path: str | os.PathLike) -> torch.Tensor:
     import torch
 
     path = Path(path)
+    value = read_tensor(path, "a teacher's feature map")
+    if value.ndim != 3 or not value.numel():
+        raise ValueError(f"{path}: must hold a tensor (C, h, w), got shape {tuple(value.shape)}; save one map a file")
+    if value.dtype not in (torch.float16, torch.float32):
+        raise ValueError(f"{path}: must hold float16 or float32, got {value.dtype}; save tensor.half()")
+    named = _NAME.fullmatch(path.name)
+    if named and named[3] and tuple(map(int, named.groups()[2:])) != tuple(value.shape):
+        raise ValueError(f"{path}: must hold what its name says, {named[2]}, got {tuple(value.shape)}; rename it")
+    return value
+
+
+def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch.Tensor:
+    """The one plain tensor of a file that `torch.save` wrote, memory-mapped; nothing in the file is executed.
+
+    Args:
+        path: The file.
+        what: What it must be, for the message.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Anything but one plain tensor, or cut short.
+    """
+    import torch
+
+    path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a teacher's feature map, found none; check the path")
+        raise FileNotFoundError(f"{path}: must be {what}, found none; check the path")
     with path.open("rb") as file:
         head = file.read(len(_ZIP))
     if head != _ZIP:
-        refuse_foreign(path, "a teacher's feature map")
+        refuse_foreign(path, what)
         raise ValueError(
             f"{path}: must be a zip file as torch.save writes it, got other bytes; save the tensor with torch.save"
         )
@@ -80,15 +105,7 @@ def read_map(path: str | os.PathLike) -> torch.Tensor:
     if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
         kind = type(value).__name__ if not isinstance(value, torch.Tensor) else f"tensor of layout {value.layout}"
         raise ValueError(f"{path}: must hold one plain tensor, got a {kind}; save the tensor alone")
-    value = value.detach()
-    if value.ndim != 3 or not value.numel():
-        raise ValueError(f"{path}: must hold a tensor (C, h, w), got shape {tuple(value.shape)}; save one map a file")
-    if value.dtype not in (torch.float16, torch.float32):
-        raise ValueError(f"{path}: must hold float16 or float32, got {value.dtype}; save tensor.half()")
-    named = _NAME.fullmatch(path.name)
-    if named and named[3] and tuple(map(int, named.groups()[2:])) != tuple(value.shape):
-        raise ValueError(f"{path}: must hold what its name says, {named[2]}, got {tuple(value.shape)}; rename it")
-    return value
+    return value.detach()
 
 
 def _check_archive(path: Path) -> None:

@@ -1,0 +1,177 @@
+"""`drgs query`: which Gaussians, and which pixels of views, are what a text means."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from drgs.commands.given import Given
+from drgs.commands.viewpoints import check_counts, seen_views
+from drgs.data.camera_lists import described
+from drgs.data.checks import read_npy
+from drgs.data.sizes import at_most
+from drgs.display import pictures
+from drgs.display.progress import Bar
+from drgs.features.decoder import load_decoder
+from drgs.features.pictures import mask_picture
+from drgs.features.query import TEMPERATURE, TextQuery
+from drgs.features.teacher import read_tensor
+from drgs.files import SCHEMA, save_ply, write_json
+from drgs.guards.outputs import claim
+from drgs.integrator import render
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.options import Query
+    from drgs.ellipsoids import Gaussians
+    from drgs.features.decoder import Decoder
+    from drgs.settings import RenderSettings
+
+__all__ = ["read_embeddings", "run"]
+
+_OPAQUE = 0.5  # a pixel is something where at least this much of the light stops
+
+
+def run(args: Query) -> None:
+    """`drgs query SCENE`."""
+    check_counts(args)
+    args.settings()  # refuses what cannot be, before anything is read
+    if bool(args.classes) == (args.text_embedding is not None):
+        got = "both" if args.classes else "neither"
+        raise ValueError(f"query: one of --class and --text-embedding must be given, got {got}; say what to look for")
+    ply = "rest.ply" if args.remove else "selected.ply"
+    inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
+    output = claim(args.output, "query", ["query.json", ply], inputs)
+    given = Given.of(args)
+    g, decoder = given.gaussians, _decoder(args, given)
+    query = _query(args, given)
+    with Bar("scores", show=not args.quiet):
+        score, selected = query.score(g.features, decoder)
+    count = int(selected.sum())
+    kept = g.take(~selected if args.remove else selected)
+    _refuse_nothing(len(g), count, float(score.max()) if len(g) else 0.0, query, args.remove)
+    cameras, source = seen_views(args, given)
+    pixels = args.max_pixels or (given.record.config.max_pixels if given.record else None)
+    if pixels is not None:
+        cameras = [at_most(camera, pixels) for camera in cameras]
+    names = pictures.file_names([camera.name for camera in cameras])
+    output.check(f"{name}.{kind}" for name in names for kind in ("mask.png", "png"))
+    views = []
+    with Bar("query", len(cameras), not args.quiet) as bar:
+        for camera, name in zip(cameras, names, strict=True):
+            views.append(_view(g, camera, given.settings(args.preset), query, decoder, args.output, name))
+            bar.advance()
+    save_ply(kept, args.output / ply)
+    report = {
+        "schema": SCHEMA,
+        "command": "query",
+        "scene": str(args.scene),
+        "wanted": list(args.classes) or str(args.text_embedding),
+        "score": query.score_name,
+        "rule": query.rule,
+        "threshold": query.threshold,
+        "temperature": None if query.others is None else query.temperature,
+        "gaussians": {"all": len(g), "selected": count, "written": len(kept)},
+        "file": ply,
+        "source": source,
+        "settings": dataclasses.asdict(given.settings(args.preset)),
+        "views": views,
+    }
+    write_json(args.output / "query.json", report)
+    if not args.quiet:
+        print(_summary(args, report))
+
+
+def read_embeddings(path: Path) -> torch.Tensor:
+    """(K, C) float32 text embeddings from a .npy or .pt file of (C,) or (K, C).
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it holds anything else; nothing in it is run.
+    """
+    vectors: Any = torch.from_numpy(read_npy(path)) if path.suffix.lower() == ".npy" else read_tensor(path)
+    if not vectors.is_floating_point() or vectors.ndim not in (1, 2) or 0 in vectors.shape:
+        raise ValueError(
+            f"{path}: text embeddings must be floats of shape (C,) or (K, C), got {vectors.dtype} of shape "
+            f"{tuple(vectors.shape)}; save one row a text"
+        )
+    return vectors.float().reshape(-1, vectors.shape[-1])
+
+
+def _decoder(args: Query, given: Given) -> Decoder | None:
+    """What decodes the features, or None where they are the teacher's own; ValueError where there are no features."""
+    g, decoder = given.gaussians, given.decoder
+    if g.features is None:
+        raise ValueError(
+            f"{args.scene}: must have semantic features, has none; fit a data set with a teacher's maps (drgs teach)"
+        )
+    if args.decoder is not None:
+        if decoder is not None:
+            raise ValueError(f"{args.decoder}: --decoder is for a PLY, {args.scene} has its own; leave it out")
+        decoder = load_decoder(args.decoder)
+    if decoder is not None and decoder.width != g.features.shape[1]:
+        raise ValueError(
+            f"{args.decoder or args.scene}: the decoder must take the {g.features.shape[1]} features of a Gaussian, "
+            f"takes {decoder.width}; name the one that was fitted with them"
+        )
+    return decoder
+
+
+def _query(args: Query, given: Given) -> TextQuery:
+    """What is looked for."""
+    temperature = TEMPERATURE if args.temperature is None else args.temperature
+    if args.text_embedding is not None:
+        vectors = read_embeddings(args.text_embedding)
+        return TextQuery.of_vectors(vectors, given.classes, args.threshold, temperature)
+    if given.classes is None:
+        raise ValueError(f"{args.scene}: has no classes to take --class from; use --text-embedding FILE")
+    return TextQuery.of_classes(given.classes, args.classes, args.threshold, temperature)
+
+
+def _refuse_nothing(total: int, selected: int, largest: float, query: TextQuery, remove: bool) -> None:
+    """Raise ValueError where the PLY would hold no Gaussian."""
+    if selected == 0:
+        raise ValueError(
+            f"query: a Gaussian must be selected, none of {total} is ({query.rule}; the largest {query.score_name} is "
+            f"{largest:.3g}); lower --threshold or look for something else"
+        )
+    if remove and selected == total:
+        raise ValueError(
+            f"query: a Gaussian must be left, all {total} are selected ({query.rule}); raise --threshold or leave "
+            "--remove out"
+        )
+
+
+def _view(
+    g: Gaussians,
+    camera: Camera,
+    settings: RenderSettings,
+    query: TextQuery,
+    decoder: Decoder | None,
+    folder: Path,
+    name: str,
+) -> dict:
+    """Mask and picture of a view, and its row of query.json."""
+    with torch.no_grad():  # a picture
+        out = render(g, camera, settings, ())
+    _, selected = query.score(out.features, decoder)
+    mask = (selected & (out.alpha.cpu() >= _OPAQUE)).numpy()
+    files = [f"{name}.mask.png", f"{name}.png"]
+    pictures.write_png(folder / files[0], mask[..., None].repeat(3, 2).astype("uint8") * 255)
+    pictures.write_png(folder / files[1], mask_picture(out.rgb.cpu().numpy(), mask))
+    return {"camera": described(camera), "files": files, "pixels": int(mask.sum()), "of": mask.size}
+
+
+def _summary(args: Query, report: dict) -> str:
+    counts, views = report["gaussians"], report["views"]
+    pixels, total = (sum(view[key] for view in views) for key in ("pixels", "of"))
+    wanted = ", ".join(args.classes) if args.classes else args.text_embedding.name
+    verb = "removed, the others are in" if args.remove else "in"
+    return (
+        f"{wanted} ({report['rule']}): {counts['selected']} of {counts['all']} Gaussians, {verb} "
+        f"{args.output / report['file']}; {pixels} of {total} pixels ({pixels / max(total, 1):.1%}) of {len(views)} "
+        "views"
+    )

@@ -1,0 +1,166 @@
+"""What belongs to a text: a score for every Gaussian, and every pixel, by its decoded feature.
+
+Two scores, named with every result:
+
+    cosine        the largest cosine with a wanted vector; what reaches the threshold is selected
+    probability   of the wanted vectors together, by a softmax of cosines / temperature over them and all the others;
+                  what reaches the threshold is selected, or without one, where a wanted vector has the largest cosine
+                  of all, whatever the temperature
+
+Feature 3DGS takes a softmax without a temperature: cosines differ by tenths, so that its probabilities are nearly alike
+and its thresholds (0.198 for five names) say little. CLIP multiplies its cosines by 100 before the softmax that it is
+trained with; that is the temperature 0.01 here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+
+from drgs.features.decoder import Decoder
+from drgs.features.segmentation import Classes, cosines, unit_rows
+
+__all__ = ["TEMPERATURE", "TextQuery"]
+
+TEMPERATURE = 0.01
+"""1 / 100, CLIP's own (Radford et al. 2021, section 2.5)."""
+_ALIKE = 0.999  # cosine from which a class and what is wanted mean the same, and do not compete
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TextQuery:
+    """Vectors that are wanted, and what else something could be.
+
+    Attributes:
+        wanted: (Q, C) float32 of length 1.
+        others: (O, C) alike, or None: the score is the cosine, not the probability.
+        threshold: Of the score; None: the largest cosine of all must be a wanted one.
+        temperature: Of the softmax.
+    """
+
+    wanted: torch.Tensor
+    others: torch.Tensor | None = None
+    threshold: float | None = None
+    temperature: float = TEMPERATURE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "wanted", unit_rows(self.wanted, "query: the wanted vectors"))
+        if self.others is not None:
+            object.__setattr__(self, "others", unit_rows(self.others, "query: the other vectors"))
+            if self.others.shape[1] != self.channels:
+                raise ValueError(
+                    f"query: what is wanted must have the {self.others.shape[1]} channels of the classes, got "
+                    f"{self.channels}; take both from one text encoder"
+                )
+        if self.threshold is None and self.others is None:
+            raise ValueError("query: a threshold must be given where nothing else competes; choose a cosine")
+        low = -1.0 if self.others is None else 0.0
+        if self.threshold is not None and not low <= self.threshold <= 1:
+            raise ValueError(
+                f"query: the threshold of a {self.score_name} must be in [{low:g}, 1], got {self.threshold}; correct it"
+            )
+        if not (math.isfinite(self.temperature) and self.temperature > 0):
+            raise ValueError(f"query: the temperature must be a number > 0, got {self.temperature}; correct it")
+
+    @classmethod
+    def of_classes(
+        cls,
+        classes: Classes,
+        names: Sequence[str],
+        threshold: float | None = None,
+        temperature: float = TEMPERATURE,
+    ) -> TextQuery:
+        """Some of the classes against all others; of all classes by the cosine.
+
+        Raises:
+            ValueError: If a name is no class's (all are listed), or the classes have no embeddings.
+        """
+        labels = {label for name in names for label in classes.labels_of(name)}
+        if classes.embeddings is None:
+            raise ValueError("query: the classes must have text embeddings, have names only; use --text-embedding")
+        rows = [label - 1 for label in sorted(labels)]
+        others = [k for k in range(len(classes)) if k not in rows]
+        competing = classes.embeddings[others] if others else None
+        return cls(classes.embeddings[rows], competing, threshold, temperature)
+
+    @classmethod
+    def of_vectors(
+        cls,
+        vectors: torch.Tensor,
+        classes: Classes | None = None,
+        threshold: float | None = None,
+        temperature: float = TEMPERATURE,
+    ) -> TextQuery:
+        """Text embeddings: with a threshold by their cosine; without one against the classes.
+
+        Args:
+            vectors: (C,) or (Q, C).
+            classes: What competes, but for those that mean the same (cosine >= 0.999).
+            threshold, temperature: See `TextQuery`.
+        Raises:
+            ValueError: If there is neither a threshold nor a class that competes.
+        """
+        wanted = unit_rows(vectors[None] if vectors.ndim == 1 else vectors, "query: text embeddings")
+        if threshold is not None:
+            return cls(wanted, None, threshold, temperature)
+        if classes is None or classes.embeddings is None:
+            raise ValueError(
+                "query: --threshold must be given, as there are no classes with embeddings to compare with; choose a "
+                "cosine"
+            )
+        competing = classes.vectors(wanted.shape[1])
+        competing = competing[(competing @ wanted.T).amax(1) < _ALIKE]
+        if not len(competing):
+            raise ValueError("query: --threshold must be given, every class means the same; choose a cosine")
+        return cls(wanted, competing, None, temperature)
+
+    @property
+    def channels(self) -> int:
+        """C of the vectors."""
+        return self.wanted.shape[1]
+
+    @property
+    def score_name(self) -> str:
+        """`cosine` or `probability`."""
+        return "cosine" if self.others is None else "probability"
+
+    @property
+    def rule(self) -> str:
+        """What is selected, in words."""
+        if self.others is None:
+            return f"cosine >= {self.threshold:g}"
+        if self.threshold is None:
+            return f"largest cosine of {len(self.wanted) + len(self.others)} texts"
+        rivals = len(self.wanted) + len(self.others)
+        return f"probability >= {self.threshold:g} (softmax over {rivals} texts, temperature {self.temperature:g})"
+
+    def score(self, features: torch.Tensor, decoder: Decoder | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """The score of each feature, and whether it is selected.
+
+        Args:
+            features: (..., C); with a decoder (..., D) before it.
+            decoder: What takes D to C.
+        Returns:
+            (...) float32 and (...) bool, on the CPU.
+        Raises:
+            ValueError: If widths differ, or a feature is not finite.
+        """
+        channels = features.shape[-1] if decoder is None else decoder.channels
+        if channels != self.channels:
+            raise ValueError(
+                f"query: text embeddings must have the {channels} channels of the decoded features, got "
+                f"{self.channels}; take those of the teacher's own text encoder"
+            )
+        wanted = len(self.wanted)
+        if self.others is None:
+            score = cosines(features, self.wanted, decoder).amax(-1)
+            assert self.threshold is not None  # or it would have been refused
+            return score, score >= self.threshold
+        found = cosines(features, torch.cat([self.wanted, self.others]), decoder)
+        score = torch.softmax(found / self.temperature, -1)[..., :wanted].sum(-1)
+        if self.threshold is not None:
+            return score, score >= self.threshold
+        return score, found[..., :wanted].amax(-1) > found[..., wanted:].amax(-1)
