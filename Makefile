@@ -4,10 +4,11 @@
 # PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
 # PIP_FLAGS   more options for pip. On Linux, plain PyPI has torch with CUDA (gigabytes); for the CPU build:
 #             make PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" setup
+# PYTEST_FLAGS  what pytest is told: two processes, a file of tests each       make PYTEST_FLAGS="-x --slow" test
 
 PYTHON ?= python3
 PIP_FLAGS ?=
-PYTEST_FLAGS ?= -q
+PYTEST_FLAGS ?= -q -n 2 --dist loadfile
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed
