@@ -11,7 +11,7 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,8 +26,11 @@ from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.parts import parts_of
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.rows import GaussianRows
+from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
+from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
@@ -92,7 +95,7 @@ def fit(
     """
     config = config or FitConfig()
     runtime.backend()  # sets torch's threads too, at first use
-    threads = _one_thread() if config.deterministic else contextlib.nullcontext()
+    threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         return _fit(dataset, out_dir, config, active, parts, resume)
 
@@ -111,6 +114,9 @@ def _fit(
         check_parallax(train)
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
+    # Parts of a caller's own say themselves what is fitted to what.
+    begun = [plan.views[i] for i in plan.chosen] if plan else train
+    taught = SemanticRecord.of(dataset, config, begun) if parts is None else None
     tensors, header = last_checkpoint(run) if resume else (None, None)
     if tensors is not None and header is not None:
         was, now = ("active" if x else "all" for x in (header.get("active"), plan))
@@ -121,14 +127,16 @@ def _fit(
             )
         if plan:
             plan.restore(tensors, header, str(run.path))
+        check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
     frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
     held_out = load_frames(test, config.max_pixels, config.mask)
     if tensors is not None and header is not None:
-        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), parts)
+        made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
+        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made)
         seconds, source = header["seconds"], header["point_source"]
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source = _start(dataset, views, frames, config, parts, plan is not None, room)
+        trainer, source = _start(dataset, views, frames, config, parts, taught, plan is not None, room)
         seconds = 0.0
     recorded = {
         "command": "fit",
@@ -141,6 +149,7 @@ def _fit(
         "masks": sorted({_mask_kind(frame) for frame in frames}),
         "points": source,
         **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
+        **({"semantics": taught.to_json()} if taught else {}),
         "fit": config.to_json(),
     }
     if plan:
@@ -151,11 +160,13 @@ def _fit(
         }
     _check_pictures(out_dir, config.max_steps, held_out)
     run.start(recorded, resume=resume)
+    if taught and dataset.semantics:
+        taught.write_embeddings(run.path, dataset.semantics.classes)
     if plan:
         plan.write(run)  # forgets picks that no checkpoint knows of
     run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.rows))
-    loop = _Loop(run, trainer, held_out, source, seconds, plan)
-    with _fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
+    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught)
+    with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
     result = metrics.evaluate(scene, held_out, config.settings, pictures=run.renders / "test")
@@ -184,6 +195,7 @@ def _start(
     frames: list[Frame],
     config: FitConfig,
     parts: Parts | None,
+    taught: SemanticRecord | None,
     strict: bool,
     reserved: int,
 ) -> tuple[Trainer, str]:
@@ -201,9 +213,12 @@ def _start(
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
     dense = not given and any(view.depth_path is not None for view in views)
-    model = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense))
+    width, channels = (taught.width, taught.channels) if taught else (0, None)
+    model = GaussianRows.from_points(
+        torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense), features=width
+    )
     _log.info("%d initial points: %s", len(points), source)
-    return Trainer(config, frames, model, extent, parts), source
+    return Trainer(config, frames, model, extent, parts or parts_of(config, extent, channels)), source
 
 
 def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame]) -> None:
@@ -234,9 +249,10 @@ class _Loop:
         source: str,
         seconds: float,
         plan: ActiveViews | None,
+        taught: SemanticRecord | None,
     ) -> None:
         self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
-        self.seconds, self.plan = seconds, plan
+        self.seconds, self.plan, self.taught = seconds, plan, taught
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
@@ -281,6 +297,7 @@ class _Loop:
         tensors, header = self.trainer.state()
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
         header |= {"seconds": self.seconds, "point_source": self.source}
+        header |= {"semantics": self.taught.to_json()} if self.taught else {}
         if self.plan:
             more_tensors, more_header = self.plan.state()
             tensors, header = tensors | more_tensors, header | more_header
@@ -346,35 +363,6 @@ class _Loop:
         shown = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
         total = trainer.config.max_steps
         bar.note(f"step {done} of {total}: {len(trainer.rows)} Gaussians{shown}, {self.seconds:.0f} s")
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One Dr.Jit thread: additions of several come in any order, and float additions do not commute with that."""
-    import drjit as dr
-
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(threads)
-
-
-@contextlib.contextmanager
-def _fewer_torch_threads() -> Iterator[None]:
-    """Half of torch's threads while fitting.
-
-    Between its operations OpenMP's threads spin and take cores from Dr.Jit's, and each operation waits for the last of
-    them: with all of them, a step on two cores takes 0.10 s instead of 0.07 s (banana, 130,000 pixels), and five times
-    as long once other processes run.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(max(1, threads // 2))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _mask_kind(frame: Frame) -> str:

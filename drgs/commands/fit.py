@@ -33,6 +33,7 @@ def run(args: Fit) -> None:
         lazy=active is not None,
         points=active is None or config.init_points == "all",
         strict=args.strict,
+        semantics=config.semantics != "ignore",
     )
     result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
     if args.quiet:

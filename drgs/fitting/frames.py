@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
     from drgs.data import View
 
 __all__ = ["Frame", "load_frames"]
+
+_Map = Callable[[], torch.Tensor]
+_Labels = Callable[[], np.ndarray]
 
 _FLOAT_CACHE = 2 << 30  # bytes of images kept as float32; beyond it they are kept as 8 bits
 
@@ -30,6 +35,8 @@ class Frame:
         pixels: (H, W, 3) float32 in [0, 1], or uint8.
         mask: (H, W) float32 in [0, 1], or None.
         is_object: Whether nothing but background is outside the mask.
+        teacher: Reads the (C, h, w) map of a teacher, which covers the view at a size of its own; None: there is none.
+        labels: Reads the (H, W) int64 labels of the pixels, 0 for none; None: there are none.
     """
 
     name: str
@@ -37,6 +44,8 @@ class Frame:
     pixels: torch.Tensor
     mask: torch.Tensor | None = None
     is_object: bool = False
+    teacher: _Map | None = None
+    labels: _Labels | None = None
 
     def image(self) -> torch.Tensor:
         """(H, W, 3) float32 in [0, 1]."""
@@ -75,6 +84,8 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
                 pixels=pixels if is_float else (pixels * 255).round().to(torch.uint8),
                 mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
                 is_object=mask == "object" or (mask == "auto" and view.mask_path is not None),
+                teacher=cast("_Map | None", None if view.teacher_path is None else view.teacher),
+                labels=cast("_Labels | None", view.label_path and functools.partial(view.labels, width, height)),
             )
         )
         bar.advance()

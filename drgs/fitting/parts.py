@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
 from drgs.fitting.losses import LossTerm, terms_of
 from drgs.fitting.networks import Network, Rate
 from drgs.fitting.rows import GaussianRows
+
+if TYPE_CHECKING:
+    from drgs.fitting.frames import Frame
 
 __all__ = ["Parts", "means_rate", "parts_of"]
 
@@ -23,16 +27,27 @@ class Parts:
         rates: Learning rates by the name of the tensor in `GaussianRows`.
         networks: What is fitted beside the Gaussians, and called by terms or by the scene.
         scene: What is rendered of the rows: their Gaussians, or a scene that has others at the time of a view.
+        shows_features: Whether the features, if there are any, are rendered with the colors of a photograph; default
+            always. Terms get the Gaussians with their features either way.
+        couple_features: Whether gradients of the features that are rendered reach the geometry.
     """
 
     terms: Sequence[LossTerm]
     rates: Mapping[str, Rate]
     networks: Sequence[Network] = ()
     scene: Callable[[GaussianRows], Scene] = GaussianRows.gaussians
+    shows_features: Callable[[Frame], bool] | None = None
+    couple_features: bool = True
 
 
-def parts_of(config: FitConfig, extent: float) -> Parts:
-    """The parts of a plain fit with a config; the `extent` of the scene is its unit of length."""
+def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> Parts:
+    """The parts of a fit with a config.
+
+    Args:
+        config: Of the fit.
+        extent: Of the scene, its unit of length.
+        channels: Of the maps of a teacher, to which features and a decoder are fitted; None: no features.
+    """
     rates: dict[str, Rate] = {
         "means": lambda part: means_rate(config, part) * extent,
         "quats": config.rotation_rate,
@@ -41,7 +56,12 @@ def parts_of(config: FitConfig, extent: float) -> Parts:
         "sh_dc": config.dc_rate,
         "sh_rest": config.rest_rate,
     }
-    return Parts(terms_of(config, extent), rates)
+    parts = Parts(terms_of(config, extent), rates)
+    if channels is None:
+        return parts
+    from drgs.fitting.semantics import with_features
+
+    return with_features(parts, config, channels)
 
 
 def means_rate(config: FitConfig, part: float) -> float:

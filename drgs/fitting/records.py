@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -17,10 +17,13 @@ from drgs.files import load_ply, load_state
 from drgs.fitting.config import FitConfig
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
+from drgs.fitting.semantic_record import SemanticRecord
 from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
+    from drgs.features.decoder import Decoder
+    from drgs.features.segmentation import Classes
     from drgs.files import Run
 
 __all__ = [
@@ -60,6 +63,7 @@ class FitRecord:
         train, test: Names of the views of the two splits; of an active run, `train` are those it began with.
         config: How it was fitted.
         is_active: Whether views were chosen during the fit.
+        semantics: What its features were fitted to; None where it has none.
     """
 
     data: Path
@@ -67,6 +71,7 @@ class FitRecord:
     test: tuple[str, ...]
     config: FitConfig
     is_active: bool
+    semantics: SemanticRecord | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,16 +83,17 @@ class LoadedRun:
         record: How they were fitted.
         step: Of the checkpoint; None where only the PLY could be read.
         networks: What was fitted beside them, by name: what `torch.nn.Module.load_state_dict` takes.
-        decoder: `drgs.features.decoder.Decoder`, which makes a teacher's features of the Gaussians'; None without.
-        classes: `drgs.features.segmentation.Classes` of the data set that was fitted; None where it has none.
+        decoder: What makes a teacher's features of the Gaussians'; None where it has none, or only the PLY could be
+            read.
+        classes: What the data set that was fitted calls things; None where it does not.
     """
 
     gaussians: Gaussians
     record: FitRecord
     step: int | None
     networks: dict[str, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
-    decoder: torch.nn.Module | None = None
-    classes: Any = None
+    decoder: Decoder | None = None
+    classes: Classes | None = None
 
 
 def load_run(run: Run) -> LoadedRun:
@@ -98,14 +104,19 @@ def load_run(run: Run) -> LoadedRun:
 
     Raises:
         FileNotFoundError: If it is no run folder, or has neither a checkpoint nor a PLY.
-        ValueError: If config.json is damaged, or everything else.
+        ValueError: If config.json or the classes' embeddings are damaged, or everything else.
     """
     record = fit_record(run)
+    known, decoder = record.semantics, None
+    classes = None if known is None else known.read_classes(run.path)
     try:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
         gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # to be looked at, not to be fitted
         gaussians.validate(str(run.state))
+        networks = saved_networks(tensors, header)
+        if known is not None:
+            decoder = known.decoder(networks, gaussians, str(run.state))
     except (FileNotFoundError, ValueError) as error:
         if not run.point_cloud.is_file():
             if run.state.exists():
@@ -116,7 +127,7 @@ def load_run(run: Run) -> LoadedRun:
             ) from None
         gaussians = load_ply(run.point_cloud)
         _log.warning("%s; %s is taken instead", str(error).partition(";")[0], run.point_cloud.name)
-        return LoadedRun(gaussians, record, None)
+        return LoadedRun(gaussians, record, None, classes=classes)
     if run.point_cloud.is_file() and not _shows(run.point_cloud, gaussians):
         _log.warning(
             "%s: does not hold what %s holds, was edited or written later; the checkpoint is taken, name the PLY to "
@@ -124,7 +135,7 @@ def load_run(run: Run) -> LoadedRun:
             run.point_cloud,
             run.state.name,
         )
-    return LoadedRun(gaussians, record, header["step"], saved_networks(tensors, header))
+    return LoadedRun(gaussians, record, header["step"], networks, decoder, classes)
 
 
 def _shows(path: Path, gaussians: Gaussians) -> bool:
@@ -171,7 +182,12 @@ def fit_record(run: Run) -> FitRecord:
     except (ValueError, NotImplementedError) as error:
         raise ValueError(f"{where}: {error}; {advice}") from None
     return FitRecord(
-        Path(config["data"]), tuple(config["train"]), tuple(config["test"]), fit, bool(config.get("active"))
+        Path(config["data"]),
+        tuple(config["train"]),
+        tuple(config["test"]),
+        fit,
+        bool(config.get("active")),
+        SemanticRecord.from_json(config.get("semantics"), f"{where}: semantics"),
     )
 
 

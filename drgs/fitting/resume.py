@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from drgs.files import load_state
 from drgs.fitting.records import check_checkpoint, is_fit_config
+from drgs.fitting.semantic_record import EMBEDDINGS
 from drgs.guards.outputs import claim, replacing
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ FILES = (
     "log.jsonl",
     "metrics.json",
     "selection.json",
+    EMBEDDINGS,
     "point_cloud.ply",
     *_CHECKPOINTS,
 )

@@ -35,7 +35,7 @@ class GaussianRows:
 
     @classmethod
     def from_points(
-        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0
+        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0, features: int = 0
     ) -> GaussianRows:
         """One isotropic Gaussian a point, as wide as the points around it are far apart.
 
@@ -44,6 +44,7 @@ class GaussianRows:
             colors: (N, 3) in [0, 1].
             opacity: Of all of them.
             scale: Times the root of the mean squared distance to the three nearest points.
+            features: Their number D a Gaussian, 0 at the start.
         """
         n = len(points)
         quats = torch.zeros(n, 4)
@@ -56,6 +57,7 @@ class GaussianRows:
                 "logit_opacities": torch.full((n,), math.log(opacity / (1 - opacity))),
                 "sh_dc": ((colors.float() - 0.5) * (1 / Y_00))[:, None, :],
                 "sh_rest": torch.zeros(n, 0, 3),
+                **({"features": torch.zeros(n, features)} if features else {}),
             }
         )
 

@@ -120,8 +120,7 @@ class Trainer:
         events = self._prepare(done)
         frame = self.frames[self._next_view()]
         gaussians = self.parts.scene(rows).at(frame.camera.time)
-        outputs = {name: None for term in self.parts.terms for name in term.outputs}  # each once, in their order
-        out = render(gaussians, frame.camera, config.settings, outputs=tuple(outputs))
+        out = self._shown(gaussians, frame)
         loss, terms = self._loss(out, frame, gaussians)
         optimizers = [rows.optimizer, *(network.optimizer for network in self.parts.networks)]
         for optimizer in optimizers:
@@ -258,6 +257,20 @@ class Trainer:
             self._queue = torch.randperm(len(self.frames), generator=self._generator)
         view, self._queue = int(self._queue[0]), self._queue[1:].clone()
         return view
+
+    def _shown(self, gaussians: Gaussians, frame: Frame) -> Output:
+        """What the terms need to see of the Gaussians in a photograph's view."""
+        parts = self.parts
+        if gaussians.features is not None and parts.shows_features and not parts.shows_features(frame):
+            gaussians = gaussians.replace(features=None)
+        outputs = {name: None for term in parts.terms for name in term.outputs}  # each once, in their order
+        return render(
+            gaussians,
+            frame.camera,
+            self.config.settings,
+            outputs=tuple(outputs),
+            couple_features=parts.couple_features,
+        )
 
     def _loss(self, out: Output, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, dict[str, float]]:
         """The sum of the terms that a view has, and each of them by name."""

@@ -1,0 +1,117 @@
+"""Features of Gaussians and their decoder, fitted to the maps of a teacher beside the colors, as Feature 3DGS does.
+
+The features of a Gaussian begin at 0, the decoder as torch makes it: where all features are 0 the decoder's weights
+have no gradient yet, but its bias and the features have, and once these have moved the weights follow.
+
+What is outside a mask has no say, of whichever kind the mask is: a teacher has features for the surroundings of an
+object, too, and where nothing is drawn the decoder could answer them by its bias alone.
+
+Reference:
+    [1] Zhou et al., "Feature 3DGS: Supercharging 3D Gaussian Splatting to Enable Distilled Feature Fields", CVPR 2024;
+        orders and rates as in its code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+
+from drgs.features.decoder import Decoder
+from drgs.fitting.networks import Network
+from drgs.integrator import render
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.config import FeatureSize, FitConfig
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.parts import Parts
+    from drgs.integrator import Output
+    from drgs.settings import RenderSettings
+
+__all__ = ["FeatureDistance", "with_features"]
+
+_INSIDE = 0.5  # share of a cell of the teacher's map that the mask must keep
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureDistance:
+    """gamma times the mean L1 distance between decoded features and the teacher's map, over channels and cells.
+
+    Attributes:
+        decoder: From the Gaussians' features to the teacher's.
+        weight: gamma.
+        settings: As the colors are rendered with.
+        size: `image`: of the features in `output`, reduced to the size of the map bilinearly, corners on corners, as in
+            [1]; it mixes the 2 x 2 pixels around each cell's place, hence before the decoder, which is linear and mixes
+            channels: the same numbers from fewer products. `teacher`: a ray through the middle of each cell.
+        couple: Whether gradients reach the geometry where features are rendered here.
+    """
+
+    decoder: Decoder
+    weight: float
+    settings: RenderSettings
+    size: FeatureSize
+    couple: bool
+    name: ClassVar[str] = "features"
+    outputs: ClassVar[tuple[str, ...]] = ()
+
+    def is_shown(self, frame: Frame) -> bool:
+        """Whether the features are to be rendered with the colors of a photograph."""
+        return frame.teacher is not None and self.size == "image"
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """See `LossTerm`; None without a map, and where the mask keeps nothing of it."""
+        if frame.teacher is None:
+            return None
+        target = frame.teacher()
+        channels, height, width = target.shape
+        if channels != self.decoder.channels:
+            raise ValueError(
+                f"view {frame.name!r}: the teacher's map must have {self.decoder.channels} channels as the others, got "
+                f"{channels}; make it again"
+            )
+        shown = self._shown(output, frame, gaussians, width, height).reshape(height * width, -1)
+        cells = target.reshape(channels, height * width).T
+        if frame.mask is not None:
+            kept = torch.nn.functional.interpolate(frame.mask[None, None], (height, width), mode="area").flatten()
+            kept = kept > _INSIDE
+            if not bool(kept.any()):
+                return None
+            shown, cells = shown[kept], cells[kept]
+        return self.weight * (self.decoder(shown) - cells).abs().mean()
+
+    def _shown(self, output: Output, frame: Frame, gaussians: Gaussians, width: int, height: int) -> torch.Tensor:
+        """(h, w, D) features at the size of the teacher's map."""
+        if self.size == "image":
+            assert output.features is not None  # `is_shown` asked for them
+            planes = output.features.permute(2, 0, 1)[None]  # as it lies, channels last
+            small = torch.nn.functional.interpolate(planes, (height, width), mode="bilinear", align_corners=True)
+            return small[0].permute(1, 2, 0)
+        # Constants but for the features: what an uncoupled derivative needs not compute.
+        seen = gaussians if self.couple else gaussians.detach().replace(features=gaussians.features)
+        shown = render(seen, frame.camera.resized(width, height), self.settings, outputs=()).features
+        assert shown is not None
+        return shown
+
+
+def with_features(parts: Parts, config: FitConfig, channels: int) -> Parts:
+    """The parts of a fit, with features and a decoder to `channels` of a teacher.
+
+    The decoder's first weights are those of torch, drawn by the config's seed; torch's own generator stays as it was.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        decoder = Decoder(config.feature_width, channels)
+    term = FeatureDistance(
+        decoder, config.feature_weight, config.settings, config.feature_resolution, config.couple_features
+    )
+    return dataclasses.replace(
+        parts,
+        terms=[*parts.terms, term],
+        rates={**parts.rates, "features": config.feature_rate},
+        networks=[*parts.networks, Network("decoder", decoder, config.decoder_rate)],
+        shows_features=term.is_shown,
+        couple_features=config.couple_features,
+    )

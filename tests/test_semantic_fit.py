@@ -1,0 +1,328 @@
+"""Features and a decoder that are fitted to a teacher's maps beside the colors, and the run folder that keeps them."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import torch
+from test_train import FAST, SIZE, config, dataset, masked, scene  # noqa: F401 (a fixture)
+
+import drgs
+from drgs.data.semantics import Semantics
+from drgs.display.pictures import write_png
+from drgs.features.segmentation import Classes, classify
+from drgs.files import Run
+from drgs.fitting import trainer as trainer_module
+from drgs.fitting.active import ActiveViews
+from drgs.fitting.config import ActiveConfig
+from drgs.fitting.frames import load_frames
+from drgs.fitting.parts import parts_of
+from drgs.fitting.records import load_run
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.threads import one_thread
+from drgs.fitting.trainer import Trainer
+from drgs.train import fit
+
+WIDTH, CHANNELS, CLASSES, MAP = 4, 6, 3, 16
+SHORT = {"feature_width": WIDTH, "feature_rate": 0.1, "decoder_rate": 0.03}  # rates of thousands of steps would crawl
+GEOMETRY = ("means", "quats", "log_scales", "logit_opacities", "sh_dc")
+
+
+def embeddings():
+    """(K, C) unit rows, far from each other."""
+    return torch.eye(CLASSES, CHANNELS)
+
+
+@pytest.fixture(scope="module")
+def taught(dataset, tmp_path_factory):  # noqa: F811
+    """The data set with the maps of a perfect teacher, 16x16, and labels: the classes of its Gaussians go by height."""
+    folder = tmp_path_factory.mktemp("taught")
+    (folder / "rgb_feature_langseg").mkdir()
+    g = scene()
+    of_gaussians = torch.bucketize(g.means[:, 1].contiguous(), torch.tensor([-0.15, 0.15]))
+    g = g.replace(features=embeddings()[of_gaussians])
+    views = []
+    for view in dataset.views:
+        shown = drgs.render(g, view.camera, FAST).features
+        labels = torch.where(shown.sum(2) > 0.5, shown.argmax(2) + 1, 0)
+        write_png(folder / "semantic_class" / f"{view.name}.png", (labels / 255)[..., None].repeat(1, 1, 3).numpy())
+        planes = shown.permute(2, 0, 1)
+        small = torch.nn.functional.interpolate(planes[None], (MAP, MAP), mode="bilinear", align_corners=True)[0]
+        path = folder / "rgb_feature_langseg" / f"{view.name}_fmap_CxHxW.pt"
+        torch.save(small.half(), path)
+        label = folder / "semantic_class" / f"{view.name}.png"
+        views.append(dataclasses.replace(view, teacher_path=path, label_path=label))
+    np.save(folder / "text_embeddings.npy", embeddings().numpy())
+    (folder / "classes.txt").write_text("ground\nmiddle\nsky\n")
+    known = Semantics(
+        teacher="rgb_feature_langseg",
+        labels="semantic_class",
+        maps=tuple(view.teacher_path for view in views),
+        label_images=tuple(view.label_path for view in views),
+        class_file=folder / "classes.txt",
+        embedding_file=folder / "text_embeddings.npy",
+    )
+    for view in views:
+        view.semantics = known
+    return dataclasses.replace(dataset, views=views, semantics=known)
+
+
+def semantic_trainer(data, **fields):
+    """A fit of features at its first step."""
+    cfg = config(**{**SHORT, "max_steps": 40, **fields})
+    frames = load_frames(data.split()[0], cfg.max_pixels, cfg.mask)
+    points, colors = torch.from_numpy(data.points), torch.from_numpy(data.colors)
+    rows = GaussianRows.from_points(points, colors, features=cfg.feature_width)
+    return Trainer(cfg, frames, rows, 3.0, parts_of(cfg, 3.0, CHANNELS))
+
+
+def decoder_of(trainer):
+    return trainer.parts.networks[0].module
+
+
+def test_all_learn_from_features_of_zero(taught):
+    """With all features 0 the first step moves features and the decoder's bias, and the second its weights, too."""
+    trainer = semantic_trainer(taught)
+    decoder = decoder_of(trainer)
+    weight, bias = decoder.matrix.detach().clone(), decoder.conv.bias.detach().clone()
+    assert not trainer.rows.tensors["features"].any()
+    trainer.step()
+    assert trainer.rows.tensors["features"].any()
+    assert not torch.equal(decoder.conv.bias, bias)
+    assert torch.equal(decoder.matrix, weight)
+    trainer.step()
+    assert not torch.equal(decoder.matrix, weight)
+
+
+@pytest.mark.parametrize("size", ["image", "teacher"])
+def test_features_tell_the_teachers_classes(taught, size):
+    """40 steps with the true geometry halve the term, and three quarters of the pixels of a view that has not been
+    fitted have their class (0.83 when this was written); the most frequent class would be right in half of them.
+    """
+    trainer, true = semantic_trainer(taught, feature_resolution=size), scene().parameters()
+    rows = {**true, "sh_dc": true["sh"], "sh_rest": torch.zeros(40, 0, 3), "features": torch.zeros(40, WIDTH)}
+    del rows["sh"]
+    trainer.rows = GaussianRows(rows)
+    terms = [trainer.step().terms["features"] for _ in range(40)]
+    assert np.mean(terms[-8:]) < 0.5 * np.mean(terms[:2])
+    (frame, *_) = load_frames(taught.split()[1], 10**6)
+    labels = torch.from_numpy(frame.labels())
+    shown = drgs.render(trainer.gaussians(), frame.camera, FAST).features
+    found = classify(shown, Classes(("a", "b", "c"), embeddings()), decoder_of(trainer))
+    assert float((found == labels)[labels > 0].float().mean()) > 0.75
+
+
+@pytest.mark.parametrize("size", ["image", "teacher"])
+def test_features_leave_the_geometry_alone(taught, size):
+    """Uncoupled, the gradients of everything but features are those of a fit of colors, to the bit; coupled, not."""
+    grads = []
+    for fields in ({}, {"couple_features": True}):
+        trainer = semantic_trainer(taught, feature_resolution=size, **fields)
+        # Features of 0 have no gradient with respect to where they are.
+        trainer.rows.tensors["features"].data.normal_(generator=torch.Generator().manual_seed(1))
+        with one_thread():
+            trainer.step()
+        grads.append({name: trainer.rows.tensors[name].grad for name in GEOMETRY})
+    plain = semantic_trainer(taught)
+    plain.parts = parts_of(plain.config, 3.0)
+    plain.rows = GaussianRows({k: x for k, x in plain.rows.tensors.items() if k != "features"})
+    with one_thread():
+        plain.step()
+    for name in GEOMETRY:
+        assert torch.equal(grads[0][name], plain.rows.tensors[name].grad), name
+    for name in ("means", "log_scales", "logit_opacities"):
+        assert not torch.equal(grads[1][name], grads[0][name]), name
+
+
+def test_views_without_a_map_show_no_features(taught, monkeypatch):
+    """Where a photograph has no map there is no term, no map is read, and features are not rendered."""
+    views = [
+        dataclasses.replace(view, teacher_path=None if i % 2 else view.teacher_path)
+        for i, view in enumerate(taught.views)
+    ]
+    trainer = semantic_trainer(dataclasses.replace(taught, views=views))
+    seen = []
+
+    def spy(gaussians, camera, *rest, **options):
+        seen.append((camera.name, gaussians.features is not None))
+        return render(gaussians, camera, *rest, **options)
+
+    render = trainer_module.render
+    monkeypatch.setattr(trainer_module, "render", spy)
+    with_map = {view.name for view in views if view.teacher_path}
+    for _ in range(8):
+        step = trainer.step()
+        assert ("features" in step.terms) == (step.view in with_map)
+    assert seen
+    assert all(shown == (name in with_map) for name, shown in seen)
+    assert {shown for _, shown in seen} == {True, False}
+
+
+def test_outside_a_mask_a_teacher_has_no_say(taught):
+    """What the map says where the mask keeps nothing does not change the term; where it keeps all, it does."""
+    trainer = semantic_trainer(taught)
+    term, frame = trainer.parts.terms[-1], trainer.frames[0]
+    trainer.rows.tensors["features"].data.normal_(generator=torch.Generator().manual_seed(1))
+    g = trainer.gaussians()
+    shown = drgs.render(g, frame.camera, FAST)
+    values = frame.teacher().float()
+    left = torch.zeros(SIZE, SIZE)
+    left[:, : SIZE // 2] = 1
+
+    def at(column, mask):
+        other = values.clone()
+        other[:, :, column] += 5
+        return float(term(shown, dataclasses.replace(frame, mask=mask, teacher=lambda: other), g))
+
+    plain = float(term(shown, dataclasses.replace(frame, mask=left), g))
+    assert at(MAP - 1, left) == plain
+    assert at(0, left) > plain
+    assert term(shown, dataclasses.replace(frame, mask=0 * left), g) is None
+
+
+def test_without_a_teacher_no_feature_code_runs(dataset, taught, tmp_path, monkeypatch):  # noqa: F811
+    """A data set without maps, and one whose maps are to be ignored, are fitted without importing anything of
+    features, to the same bits, and leave the same files.
+    """
+    for name in ("features", "features.decoder", "features.segmentation", "features.teacher", "fitting.semantics"):
+        monkeypatch.setitem(sys.modules, f"drgs.{name}", None)  # importing it raises ImportError
+    fields = {"max_steps": 6, "save_every": 3, "deterministic": True}
+    plain = fit(dataset, tmp_path / "plain", config(**fields), progress=False)
+    ignored = fit(taught, tmp_path / "ignored", config(**fields, semantics="ignore"), progress=False)
+    for name, x in plain.gaussians.parameters().items():
+        assert torch.equal(x, ignored.gaussians.parameters()[name]), name
+    assert "features" not in plain.gaussians.parameters()
+    files = [{p.relative_to(r).as_posix() for p in r.rglob("*")} for r in (plain.run.path, ignored.run.path)]
+    assert files[0] == files[1]
+    loaded = load_run(ignored.run)
+    assert (loaded.decoder, loaded.classes, loaded.record.semantics) == (None, None, None)
+
+
+FIT = {**SHORT, "max_steps": 6, "save_every": 3, "deterministic": True, "refine_start": 0.2, "refine_every": 0.3}
+
+
+@pytest.fixture(scope="module")
+def run(taught, tmp_path_factory):
+    """A finished run with features."""
+    return fit(taught, tmp_path_factory.mktemp("runs") / "run", config(**FIT), progress=False)
+
+
+def test_a_run_keeps_its_decoder_and_classes(run, taught):
+    """config.json names teacher, classes and widths; the decoder and the classes' embeddings come back as they were."""
+    loaded = load_run(run.run)
+    record = run.run.config()["semantics"]
+    assert record == {
+        "teacher": "rgb_feature_langseg",
+        "labels": "semantic_class",
+        "channels": CHANNELS,
+        "width": WIDTH,
+        "map_size": [MAP, MAP],
+        "classes": ["ground", "middle", "sky"],
+        "embeddings": True,
+    }
+    assert loaded.gaussians.features.shape == (len(loaded.gaussians), WIDTH)
+    assert loaded.record.semantics.to_json() == record
+    assert (loaded.decoder.width, loaded.decoder.channels) == (WIDTH, CHANNELS)
+    assert torch.equal(loaded.decoder.matrix, loaded.networks["decoder"]["conv.weight"][:, :, 0, 0])
+    assert loaded.classes.names == taught.semantics.classes.names
+    assert torch.equal(loaded.classes.embeddings, embeddings())
+
+
+def test_a_resumed_fit_has_the_same_bits(run, taught, tmp_path, monkeypatch):
+    """Interrupted halfway and resumed: features, decoder and all moments are those of a whole fit."""
+    step, count = Trainer.step, 0
+
+    def three(self):
+        nonlocal count
+        if count == 3:
+            raise KeyboardInterrupt
+        count += 1
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", three)
+    with pytest.raises(KeyboardInterrupt):
+        fit(taught, tmp_path / "run", config(**FIT), progress=False)
+    monkeypatch.undo()
+    torch.manual_seed(99)  # where torch's own generator stands does not matter
+    again = fit(taught, tmp_path / "run", config(**FIT), resume=True, progress=False)
+    one, other = (drgs.files.load_state(r.run.state)[0] for r in (run, again))
+    assert {name for name in one if name.startswith("decoder.adam.conv.weight")}
+    assert one.keys() == other.keys()
+    assert all(torch.equal(x, other[name]) for name, x in one.items())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"feature_width": 5}, "width of its semantics was 4 and is 5"),
+        ({"semantics": "ignore"}, "teacher of its semantics was 'rgb_feature_langseg' and is None"),
+        ({"teacher": "sam_embeddings"}, "teacher of its semantics was 'rgb_feature_langseg' and is 'sam_embeddings'"),
+        ({"class_file": None}, "classes of its semantics was"),
+    ],
+)
+def test_another_teacher_is_not_resumed(run, taught, change, message):
+    """A fit goes on with the teacher, classes and width that it began with, or says in one line what differs."""
+    known = {key: x for key, x in change.items() if key in ("teacher", "class_file")}
+    data = dataclasses.replace(taught, semantics=dataclasses.replace(taught.semantics, **known))
+    fields = {key: x for key, x in change.items() if key not in known}
+    with pytest.raises(ValueError, match=message) as error:
+        fit(data, run.run.path, config(**{**FIT, **fields}), resume=True, progress=False)
+    assert "\n" not in str(error.value)
+
+
+def test_a_damaged_record_is_refused(run, tmp_path):
+    """Embeddings of other classes, missing ones, and a decoder that does not go with config.json: one line each."""
+    import json
+    import shutil
+
+    def copied(change):
+        folder = tmp_path / "copy"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(run.run.path, folder)
+        change(folder)
+        with pytest.raises((ValueError, FileNotFoundError)) as error:
+            load_run(Run(folder))
+        assert "\n" not in str(error.value)
+        return str(error.value)
+
+    def edited(**fields):
+        def change(folder):
+            path = folder / "config.json"
+            value = json.loads(path.read_text())
+            value["semantics"] |= fields
+            path.write_text(json.dumps(value))
+
+        return change
+
+    assert "found none" in copied(lambda folder: (folder / "text_embeddings.npy").unlink())
+    wrong = np.zeros((CLASSES, CHANNELS + 1), np.float32)
+    assert "a row for each class" in copied(lambda folder: np.save(folder / "text_embeddings.npy", wrong))
+    assert "finite and not 0" in copied(lambda folder: np.save(folder / "text_embeddings.npy", wrong[:, 1:]))
+    assert "must be >= 1" in copied(edited(width=0))
+    assert "classes" in copied(edited(classes=3))
+
+    def alone(folder):
+        edited(channels=7, embeddings=False)(folder)
+        (folder / "point_cloud.ply").unlink()
+
+    assert "the decoder must take 4 features to 7 channels" in copied(alone)
+
+
+def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkeypatch):
+    """Of views that were not chosen neither map nor labels are opened, and those that were have a feature term."""
+    opened = set()
+    real = torch.load
+
+    def load(path, *rest, **options):
+        opened.add(path.name.split("_")[0])
+        return real(path, *rest, **options)
+
+    monkeypatch.setattr(torch, "load", load)
+    data = dataclasses.replace(taught, semantics=dataclasses.replace(taught.semantics))  # nothing cached
+    active = ActiveConfig(policy="random", add=2, every=2)
+    done = fit(data, tmp_path / "run", config(**FIT, test_every=0), active=active, progress=False)
+    plan = ActiveViews(active, data.split(0)[0], config(**FIT))
+    assert len(plan.views) == 9
+    assert opened == set(done.metrics["fitted"])
+    assert load_run(done.run).decoder is not None
