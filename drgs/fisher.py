@@ -10,6 +10,10 @@ J^T J of the Jacobian J of S (Gauss-Newton; no photograph is needed). Parameters
     sh (N, K, 3)             the direction that colors are evaluated at moves with the mean
     features (N,)            every channel of a feature has the same information, sum_p w_p^2
 
+With `semantics` the features that are composited are part of the image, decoded: y = [RGB; sqrt(gamma) W F]. Then they
+tell about means, rotations, log-scales and opacities, too (coupled), and a channel of a feature has gamma tr(W^T W) / D
+sum_p w_p^2 on average. Without, they tell about themselves only (uncoupled).
+
 Sources: Jiang et al. 2024 (FisherRF) for the criterion, with what its code computes instead under method "fisherrf";
 Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering
 (replay.py, jacobian.py).
@@ -30,7 +34,9 @@ from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_any_scene, check_scene, check_view, gaussians_at
 from drgs.information.groups import GROUPS, Group, Information, groups_of, scene_groups
 from drgs.information.jacobian import GEOMETRY
-from drgs.information.replay import Replay, by_probes
+from drgs.information.probes import by_probes
+from drgs.information.replay import Replay
+from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render_jvp
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
@@ -41,6 +47,7 @@ __all__ = [
     "GROUPS",
     "Information",
     "Prior",
+    "SemanticMetric",
     "blocks",
     "coverage",
     "diagonal",
@@ -65,6 +72,7 @@ def diagonal(
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     probes: int = 16,
     seed: int = 0,
+    semantics: SemanticMetric | None = None,
     **splats: Unpack[SplatTensors],
 ) -> Information:
     """The diagonal of J^T J, summed over views.
@@ -83,6 +91,8 @@ def diagonal(
             `probes`), also where its Gaussians have the same name; `rotations` are then those of its `quats`.
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
         probes, seed: Of method `probes`.
+        semantics: The metric in which features tell about the geometry; None: they do not (`exact`, `columns`,
+            `probes`; only `exact` makes use of its `estimate`).
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
             `height`, and maybe `sh_degree` and `backgrounds`.
@@ -107,7 +117,9 @@ def diagonal(
     seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
     check_scene("fisher.diagonal", seen, settings)
     settings = settings or RenderSettings.preset("exact")
-    wanted = _checked_groups(groups_of(seen, groups, gaussians), method)
+    wanted = _checked_groups(groups_of(seen, groups, gaussians), method, semantics)
+    if semantics is not None:
+        semantics.check("fisher.diagonal", seen)
     total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
     for number, camera in enumerate(cameras):
         seen = gaussians_at("fisher.diagonal", gaussians, camera)
@@ -122,13 +134,15 @@ def diagonal(
         network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
         part: dict[str, torch.Tensor] = {}
         if method == "columns":
-            part |= _by_columns(seen, camera, settings, theirs, weights)
-            part |= _by_columns(seen, camera, settings, own, weights, network)
+            part |= _by_columns(seen, camera, settings, theirs, weights, semantics)
+            part |= _by_columns(seen, camera, settings, own, weights, semantics, network)
         elif method == "probes":
-            part |= by_probes(seen, camera, settings, theirs, weights, probes, seed + number)
-            part |= by_probes(seen, camera, settings, own, weights, probes, seed + number, network) if own else {}
+            draw = (probes, seed + number)
+            part |= by_probes(seen, camera, settings, theirs, weights, *draw, semantics)
+            part |= by_probes(seen, camera, settings, own, weights, *draw, semantics, network) if own else {}
         else:
-            part |= Replay(seen, camera, settings).diagonal(wanted, weights, method == "fisherrf")
+            replay = Replay(seen, camera, settings, semantics=semantics)
+            part |= replay.diagonal(wanted, weights, method == "fisherrf")
         for name in wanted:
             total[name] += part[name]
     if "sh" in total:
@@ -150,10 +164,12 @@ def _scene_of_tensors(gaussians: object, cameras: object, splats: SplatTensors) 
     return scene_of("fisher.diagonal", splats)
 
 
-def _checked_groups(wanted: dict[str, Group], method: str) -> dict[str, Group]:
+def _checked_groups(wanted: dict[str, Group], method: str, semantics: SemanticMetric | None) -> dict[str, Group]:
     """Those of the wanted groups that a method has, which must know tensors of a scene where there are any."""
     if method not in METHODS:
         raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
+    if semantics is not None and method == "fisherrf":
+        raise ValueError("fisher.diagonal: method fisherrf must have no semantics, got some; it is about colors only")
     for name, group in wanted.items():
         known = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
         if group.owner == "scene" and method not in known:
@@ -170,11 +186,12 @@ def blocks(
     cameras: Camera | Sequence[Camera],
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
 ) -> torch.Tensor:
     """One dense block of J^T J for every Gaussian, summed over views.
 
     Args:
-        gaussians, cameras, settings, channel_weights: As for `diagonal`.
+        gaussians, cameras, settings, channel_weights, semantics: As for `diagonal`.
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
@@ -185,8 +202,10 @@ def blocks(
     for camera in cameras:
         seen = gaussians_at("fisher.blocks", gaussians, camera)
         _check_same("fisher.blocks", "blocks", total, (len(seen), BLOCK, BLOCK))
+        if semantics is not None:
+            semantics.check("fisher.blocks", seen)
         if len(seen):
-            total += Replay(seen, camera, settings).blocks(_weights(channel_weights))
+            total += Replay(seen, camera, settings, semantics=semantics).blocks(_weights(channel_weights))
     return total
 
 
@@ -213,20 +232,24 @@ def variance_map(
     weights: Information,
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
 ) -> torch.Tensor:
     """(H, W) float32: sum over channels and parameters k of J_pk^2 weights_k.
 
-    With weights 1 / (H_k + lambda) this is the predictive variance of a pixel, high where it is uncertain.
+    With weights 1 / (H_k + lambda) this is the predictive variance of a pixel, high where it is uncertain. With
+    semantics it is that of the pixel's color and decoded features together; with channel weights 0, of the latter.
 
     Args:
-        gaussians, camera, settings, channel_weights: As for `diagonal`.
+        gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
     check_view("fisher.variance_map", seen, camera, settings)
     must_be("fisher.variance_map", "weights", weights, Mapping, "group -> tensor, as fisher.diagonal returns")
     settings = settings or RenderSettings.preset("exact")
-    known = {name: group for name, group in groups_of(seen).items() if group.spread}
+    if semantics is not None:
+        semantics.check("fisher.variance_map", seen)
+    known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
     for name, x in weights.items():
         if name not in known:
             raise ValueError(f"fisher.variance_map: weights must be of {', '.join(known)}, got {name!r}")
@@ -235,7 +258,7 @@ def variance_map(
             raise ValueError(f"fisher.variance_map: weights of {name} must have shape {shape}, got {tuple(x.shape)}")
     if not len(seen):
         return torch.zeros(camera.height, camera.width)
-    return Replay(seen, camera, settings).variance(weights, _weights(channel_weights))
+    return Replay(seen, camera, settings, semantics=semantics).variance(weights, _weights(channel_weights))
 
 
 def jacobian_columns(
@@ -350,18 +373,25 @@ def _by_columns(
     settings: RenderSettings,
     wanted: Mapping[str, Group],
     weights: Sequence[float],
+    semantics: SemanticMetric | None,
     scene: Scene | None = None,
 ) -> Information:
     """From every column of the Jacobian, of Gaussians or of the scene that they come from."""
     result = {}
-    width = 0 if gaussians.features is None else gaussians.features.shape[1]
-    scale = torch.tensor([*weights, *[1.0] * width], dtype=torch.float64)
+    scale = torch.tensor(weights, dtype=torch.float64)
     for name, group in wanted.items():
         shape, squares = group.tangent(gaussians), []
         rows = np.argwhere(np.ones(shape))
         for start in range(0, len(rows), _BATCH):
             index = {name: rows[start : start + _BATCH]}
             columns = jacobian_columns(scene or gaussians, camera, index, settings).double()
-            squares.append((columns.square() * scale)[..., slice(*group.outputs)].sum((1, 2, 3)))
+            told = torch.zeros(len(columns), dtype=torch.float64)
+            if group.outputs == (0, 3):
+                told += (columns[..., :3].square() * scale).sum((1, 2, 3))
+            if semantics is not None:
+                told += semantics.squares(columns[..., 3:]).sum((1, 2))
+            elif group.outputs != (0, 3):
+                told += columns[..., 3:].square().sum((1, 2, 3))
+            squares.append(told)
         result[name] = group.merge(torch.cat(squares).reshape(shape).cpu())
     return result

@@ -100,7 +100,8 @@ GROUPS = {
     "features": Group(
         shape=lambda g: (len(g),),
         entries=(GEOMETRY,),
-        collect=lambda sums, replay, weights: sums[:, 0],
+        collect=lambda sums, replay, weights: sums[:, 0] * replay.feature_scale,
+        spread=lambda values, replay: values[:, None] * replay.feature_scale,
         input="features",
         columns=lambda g: tuple(g.features.shape),
         outputs=(3, None),

@@ -1,9 +1,10 @@
 """The rows of the Jacobian, hit by hit, and sums of their squares and products.
 
 With the notation of kernels.py, dC_c = T (c_c - B_c) da + w dc_c, where B_c lies behind the hit: what a parameter does
-to a channel is summed up, then squared. The derivatives da of a hit's opacity by the geometry of its Gaussian are
-closed forms of the responses (`tracing/responses/`, where they are derived); dc by the mean is the same for all hits of
-a Gaussian (replay.py).
+to a channel is summed up, then squared. Channels are those that were composited: colors, whose c moves with the mean
+and behind which there is a background, then any number of others, for which dc = 0 and the background is 0. The
+derivatives da of a hit's opacity by the geometry of its Gaussian are closed forms of the responses
+(`tracing/responses/`, where they are derived); dc by the mean is the same for all hits of a Gaussian (replay.py).
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ class Row(NamedTuple):
         slopes: d a / d geometry; None without geometry.
         g: Per channel, dC / da, 0 where the ray has no such hit; None without geometry.
         w: Weight of the hit, 0 likewise.
-        turned: (channel, axis) w dc/dmu, or None where the color does not depend on the mean.
-        color: RGB of the Gaussian on this ray; None where the sink does not need it.
+        turned: (color, axis) w dc/dmu, or None where the color does not depend on the mean.
+        color: RGB of the Gaussian on this ray, then its other channels; None where the sink does not need them.
         basis: SH basis along the ray; empty where SH are evaluated towards the mean.
     """
 
@@ -95,7 +96,9 @@ class Rows:
         """State of shared ray k: what is left of each channel behind the last hit."""
         lib, final = self.m.lib, self.finals[k]
         D = lib.Float64
-        rest = [dr.fma(D(b), D(final["T"]), D(x)) for x, b in zip(final["sum"][:3], self.m.background, strict=True)]
+        backgrounds = self.m.background if self.channels.color else []
+        rest = [dr.fma(D(b), D(final["T"]), D(x)) for x, b in zip(final["sum"], backgrounds, strict=False)]
+        rest += [D(x) for x in final["sum"][len(rest) :]]
         nothing = final["place"][0] == nowhere[0]
         state = {"T": lib.Float(1), "rest": rest, "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0)}
         return {**state, **self.sink.init()}
@@ -148,14 +151,14 @@ class Rows:
 def _entry(slopes: list[Float], g: list[Float], turned: list[list[Float]] | None, j: int, c: int) -> Float:
     """dC_c / d(geometry j)."""
     value = g[c] * slopes[j]
-    return value + turned[c][j] if turned and j < 3 else value
+    return value + turned[c][j] if turned and j < 3 and c < len(turned) else value
 
 
 class Diagonal:
     """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, then by band and channel.
 
     Args:
-        weights: Of the channels.
+        weights: Of the channels: colors first, where they are composited.
         entries: Those that are wanted.
         bands: SH coefficients whose sums (w Y_k)^2 over the rays where a channel is not clamped are wanted as well:
             where SH are evaluated along each ray, they are no multiple of sum w^2.
@@ -203,12 +206,18 @@ def weighted_squares(row: Row, j: int, weights: Sequence[float], summed: bool = 
     """sum_c weight_c (dC_c / d(geometry j))^2."""
     slopes, g, turned = row.slopes, row.g, row.turned
     if summed:
-        value = sum(_entry(slopes, g, turned, j, c) for c in range(3))
+        value = sum(_entry(slopes, g, turned, j, c) for c in range(len(g)))
         return value * value
     if turned and j < 3:
-        entries = [_entry(slopes, g, turned, j, c) for c in range(3)]
-        return sum(x * x * weight for x, weight in zip(entries, weights, strict=True))
+        entries = [_entry(slopes, g, turned, j, c) for c in range(len(turned))]
+        value = sum(x * x * weight for x, weight in zip(entries, weights, strict=False))
+        return value + slopes[j] * slopes[j] * _uncolored(row, weights) if len(g) > len(turned) else value
     return slopes[j] * slopes[j] * sum(x * x * weight for x, weight in zip(g, weights, strict=True))
+
+
+def _uncolored(row: Row, weights: Sequence[float]) -> Float:
+    """sum_c weight_c (dC_c / da)^2 over the channels behind the colors."""
+    return sum(x * x * weight for x, weight in zip(row.g[3:], weights[3:], strict=True))
 
 
 class Blocks:
@@ -228,9 +237,11 @@ class Blocks:
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""
-        full = []
+        full, others = [], []
         for row in rows:
-            for c in range(3):
+            if len(row.g) > 3:
+                others.append((row.slopes, _uncolored(row, self.weights)))
+            for c in range(3 if any(self.weights[:3]) else 0):
                 entries = [_entry(row.slopes, row.g, row.turned, j, c) for j in range(GEOMETRY)]
                 # d color / d sh_0, 0 where the color is clamped.
                 lit = dr.select(row.color[c] > 0, row.w * Y_00, 0)
@@ -241,6 +252,8 @@ class Blocks:
                 for weight, entries in full:
                     if entries[i] is not None and entries[j] is not None:
                         total = dr.fma(weight * entries[i], entries[j], total)
+                for slopes, squares in others if i < GEOMETRY else ():
+                    total = dr.fma(slopes[i] * slopes[j], squares, total)
                 at = index * self.WIDTH + (i * (i + 1) // 2 + j)
                 dr.scatter_add(self.buffer, total, at, hits, mode=self.mode)
         return states
@@ -250,15 +263,18 @@ class Variance:
     """Per pixel, the sum over parameters of squared derivatives times a weight of each.
 
     Args:
-        buffer: 16 floats a Gaussian: the weights of the geometry, then of w^2 in each channel.
-        weights: Of the channels.
+        buffer: 16 floats a Gaussian: the weights of the geometry, then of w^2 in each color, then of w^2 itself.
+        weights: Of the channels: colors first.
         light: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
+        plain: Whether there are weights of w^2 itself.
     """
 
     needs_color = False
 
-    def __init__(self, buffer: Float, weights: Sequence[float], light: Float | None = None) -> None:
-        self.buffer, self.weights, self.light = buffer, weights, light
+    def __init__(
+        self, buffer: Float, weights: Sequence[float], light: Float | None = None, plain: bool = False
+    ) -> None:
+        self.buffer, self.weights, self.light, self.plain = buffer, weights, light, plain
 
     def init(self) -> dict:
         """The sum along a ray."""
@@ -278,7 +294,10 @@ class Variance:
             for k, weight in enumerate(light):
                 band, c = row.basis[k // 3], k % 3
                 shares[c] = shares[c] + dr.select(row.color[c] > 0, band * band * weight, 0)
-            total += row.w * row.w * sum(x * weight for x, weight in zip(shares, self.weights, strict=True))
+            colors = sum(x * weight for x, weight in zip(shares, self.weights, strict=False))
+            if self.plain:
+                colors += v[GEOMETRY + 3]
+            total += row.w * row.w * colors
             new = dict(state)
             new["variance"] = state["variance"] + total
             out.append(new)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 import torch
 
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
-from drgs.tracing.bridge import own_errors, to_drjit
+from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.pose import quaternion_product
@@ -18,24 +18,58 @@ from drgs.tracing.protocols import Float
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.ellipsoids import DeformableScene, Gaussians
+    from drgs.ellipsoids import Gaussians
+    from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
+    from drgs.tracing.kernels import Channels
     from drgs.tracing.protocols import Sink
     from drgs.tracing.walk import Part
 
-__all__ = ["Replay", "by_probes"]
+__all__ = ["Replay"]
+
+_BESIDE = 16  # semantic channels of one traversal, beside the colors
+
+
+class Walk(NamedTuple):
+    """Rays of one traversal, to be walked again.
+
+    Attributes:
+        first: It is the traversal whose colors weigh.
+        weights: Of its channels: three colors, then semantic channels.
+        channels: What it composited.
+        part, finals: The rays, and their final states.
+    """
+
+    first: bool
+    weights: list[float]
+    channels: Channels
+    part: Part
+    finals: list[dict]
 
 
 class Replay:
     """A view rendered once, to be replayed for information."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RenderSettings, geometry: bool = True) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RenderSettings,
+        geometry: bool = True,
+        semantics: SemanticMetric | None = None,
+    ) -> None:
         # Without a graph of torch: information is a number, and its derivatives are taken here.
-        self.call = call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset())
+        slices: list[torch.Tensor | None] = [None]
+        if semantics is not None and geometry and (channels := semantics.channels(gaussians.features)).shape[1]:
+            slices = list(channels.split(_BESIDE, 1))
+        self.semantics, self.slices = semantics, slices
+        seen = gaussians.detach().replace(features=slices[0])
+        self.call = call = Call(seen, camera, settings, frozenset())
         self.lib, self.settings, self.count = call.lib, settings, len(gaussians)
         lib = self.lib
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         self.compositor, arguments = call.prepare(self.inputs)
+        self.compositor.beside = call.width
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
             self.compositor.forward(*arguments, keep=True)
         p = {name: x.array for name, x in self.inputs.items()}
@@ -115,26 +149,51 @@ class Replay:
             dr.disable_grad(inputs[name])
         return moved
 
-    def _replay(self, part: Part, finals: list[dict], sink: Sink) -> list[dict]:
-        """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
-        c = self.compositor
-        return part.run(Rows(c.model, c.passes[0], self.extras, sink, finals, self.color))
+    def _walks(self, weights: Sequence[float]) -> Iterator[Walk]:
+        """Each part of each traversal.
 
-    def _summed(self, sink_of: Callable[[dr.ReduceMode], Diagonal | Blocks], width: int) -> torch.Tensor:
-        """(N, width) float64: what `sink_of(reduce mode)` sums up in its `buffer`, over all parts."""
+        The first has the colors and a slice of the semantic channels. Each other slice has the colors beside it, too,
+        for that costs little; there they weigh nothing.
+        """
+        compositor, gamma = self.compositor, self.semantics.weight if self.semantics else 0.0
+        for number, features in enumerate(self.slices):
+            count = 0 if features is None else features.shape[1]
+            channels, done = compositor.passes[0], compositor.finals[0]
+            if number:
+                assert features is not None  # only the first slice may be none at all
+                channels, done = compositor.again(to_drjit(self.lib, features.reshape(-1)).array, count)
+            for part, finals in done:
+                yield Walk(
+                    number == 0, [*(weights if number == 0 else [0.0] * 3), *[gamma] * count], channels, part, finals
+                )
+
+    def _replay(self, walk: Walk, sink: Sink) -> list[dict]:
+        """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
+        rows = Rows(self.compositor.model, walk.channels, self.extras, sink, walk.finals, self.color)
+        return walk.part.run(rows)
+
+    def _summed(
+        self, sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks], width: int, weights: Sequence[float]
+    ) -> torch.Tensor:
+        """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks."""
         total = torch.zeros(self.count, width, dtype=torch.float64)
-        for part, finals in self.compositor.finals[0]:
+        for walk in self._walks(weights):
             # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
-            sink = sink_of(dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local)
-            dr.eval(self._replay(part, finals, sink), sink.buffer)
-            total += _torch(sink.buffer).reshape(total.shape)
+            sink = sink_of(walk, dr.ReduceMode.Direct if walk.part.ordered else dr.ReduceMode.Local)
+            dr.eval(self._replay(walk, sink), sink.buffer)
+            found = _torch(sink.buffer).reshape(self.count, -1)
+            total[:, : found.shape[1]] += found
         return total
 
     def sums(self, entries: Sequence[int], weights: Sequence[float], summed: bool = False) -> torch.Tensor:
         """(N, 11) float64: squares of the geometry, and sum w^2; those of SH along each ray are kept in `light`."""
         bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
-        made = lambda mode: Diagonal(self.lib, self.count, weights, entries, mode, bands, summed)  # noqa: E731
-        total = self._summed(made, GEOMETRY + 1 + 3 * bands)
+
+        def made(walk: Walk, mode: dr.ReduceMode) -> Diagonal:
+            own = entries if walk.first else [k for k in entries if k < GEOMETRY]
+            return Diagonal(self.lib, self.count, walk.weights, own, mode, bands if walk.first else 0, summed)
+
+        total = self._summed(made, GEOMETRY + 1 + 3 * bands, weights)
         self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
         return total[:, : GEOMETRY + 1]
 
@@ -152,7 +211,8 @@ class Replay:
     def blocks(self, weights: Sequence[float]) -> torch.Tensor:
         """`blocks` of one view."""
         lib, size = self.lib, Blocks.SIZE
-        total = self._summed(lambda mode: Blocks(lib, self.count, weights, mode), Blocks.WIDTH)
+        made = lambda walk, mode: Blocks(lib, self.count, walk.weights, mode)  # noqa: E731
+        total = self._summed(made, Blocks.WIDTH, weights)
         row, column = torch.tril_indices(size, size)
         full = torch.zeros(self.count, size, size, dtype=torch.float64)
         full[:, row, column] = total
@@ -167,19 +227,21 @@ class Replay:
             group = GROUPS[name]
             assert group.spread is not None, name  # `variance_map` has refused the others
             spread = group.spread(values.double().cpu(), self)
-            # Squared weights w^2 are of one channel each.
-            first = group.entries[0]
+            # Squared weights w^2 are of one color each, then of all other channels.
+            first = GEOMETRY + 3 if name == "features" else group.entries[0]
             table[:, first : first + spread.shape[1]] = spread
         if not torch.isfinite(table).all():
             raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
         buffer = to_drjit(lib, table.float().reshape(-1).to(self.call.home)).array
         image = dr.zeros(lib.Float, self.call.pixels)
         light = None if self.light is None else to_drjit(lib, self.light.float().reshape(-1).to(self.call.home)).array
-        for part, finals in self.compositor.finals[0]:
-            states = self._replay(part, finals, Variance(buffer, weights, light))
-            for state, at, inside in zip(states, part.flat, part.inside, strict=True):
-                dr.scatter(image, state["variance"], at, inside)
-        dr.eval(image)
+        for walk in self._walks(weights):
+            sink = Variance(
+                buffer, walk.weights, light if walk.first else None, walk.first and "features" in information
+            )
+            for state, at, inside in zip(self._replay(walk, sink), walk.part.flat, walk.part.inside, strict=True):
+                dr.scatter_add(image, state["variance"], at, inside)
+            dr.eval(image)
         return image.torch().cpu().reshape(self.call.shape)
 
     def sh_information(self, squares: torch.Tensor) -> torch.Tensor:
@@ -188,6 +250,11 @@ class Replay:
             return self.light
         basis, lit = self._squared_basis()
         return squares[:, :, None] * basis[:, :, None] * lit[:, None, :]
+
+    @property
+    def feature_scale(self) -> float:
+        """What sum w^2 is multiplied by to be the information about a channel of the features."""
+        return 1.0 if self.semantics is None else self.semantics.scale
 
     def sh_spread(self, weights: torch.Tensor) -> torch.Tensor:
         """(N, 3) weights of w^2 in each channel, from (N, K, 3) of SH; along rays they stay with the pixel."""
@@ -200,61 +267,6 @@ class Replay:
     def _squared_basis(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(N, K) squares of the SH basis towards the Gaussians, and (N, 3) 1 where a channel is above 0, else 0."""
         return torch.stack([_torch(x) for x in self.basis], 1).square(), torch.stack([_torch(x) for x in self.lit], 1)
-
-
-@own_errors()
-def by_probes(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RenderSettings,
-    groups: dict,
-    weights: Sequence[float],
-    probes: int,
-    seed: int,
-    scene: DeformableScene | None = None,
-) -> Information:
-    """Mean of (J^T v)^2 over Rademacher images v of RGB; what only other channels tell about is exact.
-
-    Args:
-        scene: Where the Gaussians come from: all groups are of this scene then.
-    """
-    if probes < 1:
-        raise ValueError(f"fisher.diagonal: probes must be >= 1, got {probes}")
-    other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
-    groups = {name: group for name, group in groups.items() if name not in other}
-    total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
-    # Without a graph of torch, as in `Replay`.
-    call = Call(gaussians.detach().replace(features=None), camera, settings, frozenset(), scene=scene)
-    lib, generator = call.lib, torch.Generator().manual_seed(seed)
-    inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
-    dr.enable_grad([inputs[group.input] for group in groups.values()])
-    compositor, arguments = call.prepare(inputs)
-    # The compositor's adjoint is called by hand: of the graph only what leads to its arguments is recorded.
-    with dr.suspend_grad():
-        record, sh, features, carried = dr.detach(list(arguments))
-        compositor.forward(record, sh, features, carried, keep=True)
-    attached = {"record": arguments.record, "sh": arguments.sh}
-    root = torch.tensor(weights).sqrt()
-    for _ in range(probes if groups else 0):
-        sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1
-        cotangent = {"rgb": (sign * root).reshape(-1), "alpha": torch.zeros(call.pixels)}
-        g = {name: to_drjit(lib, x.to(call.home)).array for name, x in cotangent.items()}
-        grads = compositor.adjoint(g)
-        found = [(attached[name], grads[name]) for name in attached if attached[name] is not None]
-        for x, slope in found:
-            dr.set_grad(x, slope)
-        dr.enqueue(dr.ADMode.Backward, [x for x, _ in found])
-        # The graph is used again by the next probe.
-        dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
-        for name, group in groups.items():
-            slope = dr.grad(inputs[group.input]).torch().double().cpu()
-            total[name] += group.pull(slope, call.inputs[group.input].double().cpu()).square()
-        for group in groups.values():
-            dr.set_grad(inputs[group.input], 0)
-    result = {name: x / probes for name, x in total.items()}
-    if other:
-        result |= Replay(gaussians, camera, settings, geometry=False).diagonal(other, weights, False)
-    return result
 
 
 def _unit(k: int) -> list[float]:

@@ -40,7 +40,10 @@ class Compositor:
         certificate: After `forward`: rays, redone rays, entries listed.
         extra: After `forward`: outputs without a derivative.
         finals: After `forward`: per traversal, (part, final states) pairs.
+        beside: Feature channels that the first traversal composites beside the colors; set it before `forward`.
     """
+
+    beside = 0
 
     def __init__(
         self,
@@ -82,12 +85,13 @@ class Compositor:
         dr.eval(self.buffers, carried)
         view.start(self.model, self.buffers["record"], carried, self.basis)
         self.certificate.update(view.certificate)
-        self.passes = [self._channels(color=True)]
-        self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in range(0, self.width, CHUNK)]
+        self.passes = [self._channels(0, self.beside, color=True)]
+        chunks = range(self.beside, self.width, CHUNK)
+        self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
         # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
         share = 4 if self.settings.order == "center" and not view.world and not self.basis else 1
         self.color_parts = view.parts(share)
-        self.feature_parts = view.parts(1) if self.width and share != 1 else self.color_parts
+        self.feature_parts = view.parts(1) if chunks and share != 1 else self.color_parts
         out = self._images()
         for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
             if name in self.want:
@@ -110,6 +114,15 @@ class Compositor:
         dr.eval(out, self.extra)
         return out
 
+    def again(self, features: Float, count: int) -> tuple[Channels, list[tuple[Part, list[dict]]]]:
+        """Another traversal after `forward`, with the colors beside other features: as `passes` and `finals` hold it.
+
+        Args:
+            features: Flat (N count), all of them composited.
+        """
+        channels = Channels({**self.buffers, "features": features}, count, 0, count, True)
+        return channels, self._primal(Primal(self.model, channels, frozenset({"replay"})), first=False)
+
     def _channels(self, first: int = 0, channels: int = 0, color: bool = False) -> Channels:
         return Channels(self.buffers, self.width, first, channels, color)
 
@@ -124,7 +137,7 @@ class Compositor:
         return out
 
     def _parts(self, channels: Channels) -> list[Part]:
-        return self.feature_parts if channels.channels else self.color_parts
+        return self.color_parts if channels.color or not channels.channels else self.feature_parts
 
     def _primal(self, kernel: Primal, first: bool) -> list[tuple[Part, list[dict]]]:
         """(part, final states) pairs; in exact order the first traversal decides which rays are redone."""
@@ -170,8 +183,8 @@ class Compositor:
                 dr.scatter(out["alpha"], lib.Float(st["alpha"]), at, inside)
                 for name in self.want & {"depth", "median", "count"}:
                     dr.scatter(out[name], type(out[name])(st[name]), at, inside)
-            for k in range(channels.channels):
-                dr.scatter(out["features"], sums[k], at * self.width + channels.first + k, inside)
+            for k, x in enumerate(sums[3 if channels.color else 0 :]):
+                dr.scatter(out["features"], x, at * self.width + channels.first + k, inside)
 
     # -- reverse -----------------------------------------------------------------------------------------------------
 

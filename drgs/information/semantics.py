@@ -1,0 +1,160 @@
+"""How much a difference of features counts: the metric of a frozen decoder, and scalar channels that sum up to it.
+
+A pixel's features F = sum_i w_i f_i are decoded to W F + b. With unit noise in every decoded channel, what the feature
+image says about a parameter theta is sum_p (dF_p/dtheta)^T M (dF_p/dtheta), M = W^T W; the bias is a constant. Features
+have no direction and no background, so for the geometry of Gaussian i the derivative at a hit is
+(da/dtheta) T (f_i - B_i), with B_i the features composited behind it, and only the square of one length is needed:
+q = T^2 (f_i - B_i)^T M (f_i - B_i).
+
+Everything here turns that length into a sum of squares of K scalar channels a Gaussian, which the replay composites
+beside the colors: (f - B)^T M (f - B) = sum_k (y_k - B(y)_k)^2 with y = P^T f, as compositing is linear.
+
+    exact      P P^T = M: one channel for each direction that the decoder sees
+    collapsed  P = L S / sqrt(K), M = L L^T, S random signs (rank, K): the sum's expected value is right
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+
+from drgs.guards.arguments import must_be
+from drgs.information.choices import Estimate
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["SemanticMetric"]
+
+_RANK = 1e-12  # of the largest eigenvalue: below, float64 rounding of W^T W
+
+
+class _Decodes(Protocol):
+    """What a metric can be made of."""
+
+    def metric(self) -> torch.Tensor:
+        """(D, D) W^T W."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SemanticMetric:
+    """The metric in which features count, frozen: no information is about the decoder's weights.
+
+    Two are equal if they give the same numbers.
+
+    Attributes:
+        matrix: (D, D) float64, symmetric and positive semidefinite: W^T W of the decoder.
+        weight: gamma, the inverse noise variance of a decoded channel, where that of a color is 1.
+        estimate: `exact` or `collapsed` (the module's text).
+        samples: Channels of `collapsed`.
+        seed: Of its signs: the same for all views that are compared.
+    Raises:
+        ValueError: If a value is out of range, or the matrix is no metric.
+    """
+
+    matrix: torch.Tensor
+    weight: float = 1.0
+    estimate: Estimate = "collapsed"
+    samples: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        must_be("SemanticMetric", "matrix", self.matrix, torch.Tensor, "e.g. decoder.metric()")
+        M = self.matrix.detach().to("cpu", torch.float64, copy=True)
+        if M.ndim != 2 or M.shape[0] != M.shape[1] or not len(M):
+            raise ValueError(
+                f"SemanticMetric: matrix must be (D, D) with D >= 1, got {tuple(M.shape)}; use decoder.metric()"
+            )
+        if not torch.isfinite(M).all():
+            raise ValueError("SemanticMetric: matrix must be finite, got NaN or Inf; check the decoder")
+        if float((M - M.T).abs().max()) > 1e-6 * float(M.abs().max()):
+            raise ValueError("SemanticMetric: matrix must be symmetric, got one that is not; use W.T @ W")
+        object.__setattr__(self, "matrix", 0.5 * (M + M.T))
+        if not (isinstance(self.weight, int | float) and 0 < self.weight < float("inf")):
+            raise ValueError(f"SemanticMetric: weight must be a finite number > 0, got {self.weight!r}; try 1")
+        if self.estimate not in ("exact", "collapsed"):
+            raise ValueError(f"SemanticMetric: estimate must be exact or collapsed, got {self.estimate!r}; choose one")
+        if not (isinstance(self.samples, int) and self.samples >= 1):
+            raise ValueError(f"SemanticMetric: samples must be a whole number >= 1, got {self.samples!r}; try 4")
+        if not (isinstance(self.seed, int) and 0 <= self.seed < 1 << 63):
+            raise ValueError(f"SemanticMetric: seed must be a whole number >= 0, got {self.seed!r}; try 0")
+        self._factor  # noqa: B018  refuses what is not positive semidefinite
+
+    @classmethod
+    def of(cls, decoder: _Decodes | None, width: int, **fields) -> SemanticMetric:
+        """Of a decoder as it is now; without one of the features themselves, `width` channels that count alike."""
+        return cls(torch.eye(width, dtype=torch.float64) if decoder is None else decoder.metric(), **fields)
+
+    @property
+    def width(self) -> int:
+        """D, channels of a feature."""
+        return len(self.matrix)
+
+    @property
+    def scale(self) -> float:
+        """Information about a channel of a feature per sum w^2, on average over the channels: gamma tr(M) / D."""
+        return self.weight * float(self.matrix.trace()) / self.width
+
+    @functools.cached_property
+    def _factor(self) -> torch.Tensor:
+        """(D, rank) L with L L^T = M, without the directions that the decoder does not see."""
+        values, vectors = torch.linalg.eigh(self.matrix)
+        top = float(values[-1])
+        if float(values[0]) < -1e-6 * max(top, 0.0) or top < 0:
+            raise ValueError(
+                f"SemanticMetric: matrix must be positive semidefinite, got an eigenvalue of {float(values[0]):.3g}; "
+                "use W.T @ W"
+            )
+        seen = values > _RANK * self.width * top
+        return vectors[:, seen] * values[seen].sqrt()
+
+    def directions(self) -> torch.Tensor:
+        """(D, K) P: a feature's channels are P^T f."""
+        L = self._factor
+        if self.estimate == "exact" or self.samples >= L.shape[1]:
+            return L
+        generator = torch.Generator().manual_seed(self.seed)
+        signs = torch.randint(0, 2, (self.samples, L.shape[1]), generator=generator).double() * 2 - 1
+        return L @ signs.T / self.samples**0.5
+
+    def channels(self, features: torch.Tensor) -> torch.Tensor:
+        """(N, K) float32 scalars of (N, D) features, whose squared differences add up to that of the features."""
+        return (features.detach().double().cpu() @ self.directions()).float().to(features.device)
+
+    def squares(self, features: torch.Tensor) -> torch.Tensor:
+        """(...) gamma f^T M f of (..., D) features, exactly."""
+        return self.weight * (features.double().cpu() @ self._factor).square().sum(-1)
+
+    def cotangent(self, pixels: int, generator: torch.Generator) -> torch.Tensor:
+        """(pixels, D) float32 sqrt(gamma) L v of random signs v, a sign a pixel and direction that the decoder sees."""
+        L = self._factor
+        signs = torch.randint(0, 2, (pixels, L.shape[1]), generator=generator).double() * 2 - 1
+        return (self.weight**0.5 * signs @ L.T).float()
+
+    def check(self, where: str, gaussians: Gaussians) -> None:
+        """Raise ValueError unless the Gaussians have features of this width."""
+        if gaussians.features is None:
+            raise ValueError(f"{where}: semantics must be of a scene with features, got one without; drop semantics")
+        if gaussians.features.shape[1] != self.width:
+            raise ValueError(
+                f"{where}: semantics must be of the width of the features, {gaussians.features.shape[1]}, got "
+                f"{self.width}; use the decoder of this scene"
+            )
+
+    def to_json(self) -> dict:
+        """What a report says of it; not the matrix."""
+        sampled = {"samples": self.samples, "seed": self.seed} if self.estimate == "collapsed" else {}
+        return {"estimate": self.estimate, **sampled, "gamma": self.weight, "width": self.width}
+
+    def _value(self) -> tuple:
+        numbers = (self.weight, self.estimate, self.samples, self.seed)
+        return (self.matrix.numpy().tobytes(), *numbers)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SemanticMetric) and self._value() == other._value()
+
+    def __hash__(self) -> int:
+        return hash(self._value())
