@@ -6,6 +6,7 @@ Policies whose scores depend on what has been picked are greedy: take the best, 
 
     fisher      `criterion` of the Fisher information (gain.py)
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
+    moments     variance of the features along the rays (Magic Moments), averaged over pixels
     coverage    sum_i Wc_i / (W_i + lambda), W = sum over pixels of w^2: how much is seen that was seen little
     farthest    the camera center farthest from those there are
     uniform     evenly spaced among the views sorted by name
@@ -33,6 +34,7 @@ from drgs.guards.doors import camera_list, check_any_scene
 from drgs.information.cache import Cache
 from drgs.information.greedy import ViewInformation, greedy
 from drgs.information.pool import Pick, Pool, Scoring, Selection
+from drgs.information.semantics import SemanticMetric
 
 __all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
 
@@ -78,7 +80,7 @@ def select(
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
         **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
-            `groups`; None is the default.
+            `groups`, `blocks`, `semantics`; None is the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, or information is negative, NaN
             or infinite.
@@ -128,17 +130,34 @@ def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:
 
 
 def fisher(pool: Pool) -> Selection:
-    """Largest gain of Fisher information."""
-    if pool.scoring.criterion == "block_logdet":
-        return _greedy(pool, "blocks")
-    return _greedy(pool, "diagonal", method=pool.scoring.method, groups=pool.scoring.groups)
+    """Largest gain of Fisher information, of the blocks of the image that the scoring names."""
+    scoring, metric = pool.scoring, None
+    blocks: tuple[str, ...] = ()
+    options: dict[str, Hashable] = {}  # none where colors are all there is
+    without: tuple[str, ...] = ("features",)
+    if pool.information is None:  # else it knows by itself what it is about
+        seen = pool.scene.at(pool.candidates[0].time)
+        blocks = scoring.blocks_of(seen)
+        if "semantic" in blocks:
+            options["semantics"] = metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
+            without = ()
+        if "geometry" not in blocks:
+            options["channel_weights"], without = (0.0, 0.0, 0.0), ("sh",)
+    if scoring.criterion == "block_logdet":
+        selection = _greedy(pool, "blocks", (), **options)
+    else:
+        selection = _greedy(pool, "diagonal", without, method=scoring.method, groups=scoring.groups, **options)
+    selection.blocks, selection.semantics = list(blocks), metric.to_json() if metric else None
+    return selection
 
 
 def fisherrf(pool: Pool) -> Selection:
-    """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations."""
+    """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations and no features."""
     prior, weights = pool.scoring.prior, _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
-    return _greedy(_scored(pool, criterion="eig", prior=prior, weights=weights), "diagonal", method="fisherrf")
+    return _greedy(
+        _scored(pool, criterion="eig", prior=prior, weights=weights), "diagonal", ("features",), method="fisherrf"
+    )
 
 
 def coverage(pool: Pool) -> Selection:
@@ -147,12 +166,13 @@ def coverage(pool: Pool) -> Selection:
     return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), "coverage")
 
 
-def _greedy(pool: Pool, function: str, **options: Hashable) -> Selection:
+def _greedy(pool: Pool, function: str, without: tuple[str, ...] = (), **options: Hashable) -> Selection:
     """`greedy` by what a function of `drgs.fisher` computes of each view, or by the pool's own information.
 
     Args:
         pool: Whose scoring says how much it counts.
         function: Its name; where it returns one tensor, that is a group of the same name.
+        without: Groups that do not count.
         **options: Of the function, besides scene, camera and settings.
     """
     settings = pool.scoring.settings
@@ -163,11 +183,13 @@ def _greedy(pool: Pool, function: str, **options: Hashable) -> Selection:
         # `diagonal` also knows the parameters that a scene computes its Gaussians from.
         scene = pool.scene if function == "diagonal" else pool.scene.at(camera.time)
         found = getattr(fisher, function)(scene, camera, settings, **options)
-        return {function: found} if isinstance(found, torch.Tensor) else found
+        if isinstance(found, torch.Tensor):
+            return {function: found}
+        return {name: x for name, x in found.items() if name not in without}
 
     if pool.information:
         return greedy(pool, ViewInformation(pool, pool.information, (pool.information, settings)))
-    return greedy(pool, ViewInformation(pool, compute, (function, settings, *sorted(options.items()))))
+    return greedy(pool, ViewInformation(pool, compute, (function, settings, without, *sorted(options.items()))))
 
 
 def _scored(pool: Pool, **fields: Any) -> Pool:
@@ -177,6 +199,28 @@ def _scored(pool: Pool, **fields: Any) -> Pool:
 
 def _without_rotations(groups: Mapping[str, float]) -> dict[str, float]:
     return {name: x for name, x in groups.items() if name != "rotations"}
+
+
+def moments(pool: Pool) -> Selection:
+    """Largest variance of the features along the rays, on average over pixels; of colors where there are no features.
+
+    It needs no training views, and picks do not change it: k picks are the k best, whatever they share.
+    """
+    from drgs.information.moments import moments_map  # loads Dr.Jit, which the policies below need not have
+
+    scores = []
+    for number, camera in enumerate(pool.candidates, 1):
+        found = moments_map(pool.scene.at(camera.time), camera, pool.scoring.settings)
+        scores.append(float(found.double().mean()))
+        if pool.progress:
+            pool.progress(number, len(pool.candidates))
+    order = sorted(range(len(scores)), key=lambda i: -scores[i])  # stable: ties by index
+    picks = []
+    for place, i in enumerate(order[: pool.k]):
+        margin = scores[i] - scores[order[place + 1]] if place + 1 < len(order) else None
+        picks.append(pool.pick(i, scores[i], margin=margin))
+    notes = ["moments rank candidates one by one: picks do not take each other into account"] if pool.k > 1 else []
+    return Selection(picks, scores, evaluations=len(scores), notes=notes)
 
 
 # -------------------------------------------------- policies that look at poses only, or at nothing
@@ -245,6 +289,7 @@ POLICIES: dict[str, Callable[[Pool], Selection]] = {
     "fisher": fisher,
     "fisherrf": fisherrf,
     "coverage": coverage,
+    "moments": moments,
     "farthest": farthest,
     "uniform": uniform,
     "random": random,

@@ -9,7 +9,7 @@ from drgs import reference
 from drgs.lab.accuracy import entry_error as error
 from drgs.lab.accuracy import jacobian, squares, turn, twist_basis
 
-__all__ = ["GROUPS", "error", "jacobian", "pose_jacobian", "scene", "squares", "stacked", "turn"]
+__all__ = ["GROUPS", "error", "feature_jacobian", "jacobian", "pose_jacobian", "scene", "squares", "stacked", "turn"]
 
 GROUPS = ("means", "rotations", "log_scales", "logit_opacities", "sh")
 
@@ -28,6 +28,18 @@ def stacked(J: dict) -> torch.Tensor:
     """(3 P, N, 13): the order of `fisher.blocks`."""
     base = J["sh"][:, :, 0]
     return torch.cat([J["means"], J["rotations"], J["log_scales"], J["logit_opacities"][..., None], base], -1)
+
+
+def feature_jacobian(g, out) -> dict[str, torch.Tensor]:
+    """Group of the geometry -> (P D, parameters...) derivative of the oracle's feature image."""
+    names = ["means", "quats", "log_scales", "logit_opacities"]
+    flat = out.features.reshape(-1)
+    rows = torch.autograd.grad(
+        flat, [getattr(g, name) for name in names], torch.eye(len(flat), dtype=flat.dtype), True, is_grads_batched=True
+    )
+    J = {name: x.double() for name, x in zip(names, rows, strict=True)}
+    J["rotations"] = turn(g.quats.detach().double(), J.pop("quats"))
+    return J
 
 
 def pose_jacobian(cam, out) -> torch.Tensor:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
+    from drgs.information.semantics import SemanticMetric
 
 __all__ = ["Given"]
 
@@ -74,6 +75,12 @@ class Given:
     def settings(self, preset: str) -> RenderSettings:
         """How a command renders it with a preset."""
         return RenderSettings.preset(preset, **self.fields)
+
+    def semantics(self) -> SemanticMetric | None:
+        """The metric of its decoder, in which features tell about the geometry; None without a decoder."""
+        from drgs.information.semantics import SemanticMetric  # not for those that ask for no information
+
+        return None if self.decoder is None else SemanticMetric(self.decoder.metric())
 
     @property
     def background(self) -> tuple[float, float, float]:

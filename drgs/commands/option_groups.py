@@ -7,16 +7,26 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from drgs.commands.overrides import parsed
 from drgs.fitting.config import ActiveConfig
-from drgs.information.choices import Criterion, Method, Policy
+from drgs.information.choices import Block, Criterion, Method, Policy
 from drgs.settings import Preset, RenderSettings
 
 __all__ = ["Around", "Choosing", "Common", "Data", "Informed", "OutputPath", "Settings", "Split"]
 
 OutputPath = Annotated[Path, arg(aliases=["-o"])]
 Split = Literal["all", "train", "test"]
+
+# One text, `geometry,semantic`; what is none of the names is refused where the blocks are used.
+_BLOCKS: Any = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="BLOCK,BLOCK",
+    instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
+    is_instance=lambda x: x is None or isinstance(x, tuple),
+    str_from_instance=lambda x: ["all there is" if x is None else ",".join(x)],
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,6 +110,8 @@ class Informed(Settings):
     """lambda is --prior times the median information of a parameter's group, where it is not 0."""
     info_pixels: int | None = ActiveConfig.info_pixels
     """Information is computed on views of at most this many pixels; default as in the fit."""
+    blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
+    """What of an image tells: geometry (its colors), semantic (its features), or geometry,semantic; default all."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -34,6 +34,8 @@ def run(args: Select) -> None:
     prior = Prior(value=args.prior, relative=args.relative_prior)
     given = Given.of(args)
     settings = given.settings(args.preset)
+    semantics = given.semantics()
+    scoring = Scoring(args.criterion, settings, args.method, prior, blocks=args.blocks, semantics=semantics)
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
@@ -43,7 +45,7 @@ def run(args: Select) -> None:
             known.cameras,
             args.k,
             args.policy,
-            scoring=Scoring(args.criterion, settings, args.method, prior),
+            scoring=scoring,
             rng=torch.Generator().manual_seed(args.seed),
             progress=bar.update,
         )
@@ -58,6 +60,8 @@ def run(args: Select) -> None:
         "criterion": args.criterion if args.policy == "fisher" else None,
         "method": args.method,
         "prior": {"value": args.prior, "relative": args.relative_prior},
+        "blocks": selection.blocks,
+        "semantics": selection.semantics,
         "seed": args.seed,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,

@@ -150,21 +150,26 @@ class ActiveViews:
         """Whether a view is to be added before step `step` (from 0)."""
         return len(self.picks) < min(self.active.add, step // self.active.every)
 
-    def pick(self, scene: Scene, frames: list[Frame], step: int) -> tuple[Frame, dict]:
+    def pick(
+        self, scene: Scene, frames: list[Frame], step: int, decoder: torch.nn.Module | None = None
+    ) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
         Args:
             scene: As it is now, seen by each view at its time.
             frames: The photographs seen so far; of these, too, only the cameras matter.
             step: Steps done.
+            decoder: Of the features as it is now, `drgs.features.decoder.Decoder`, whose metric they count in.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """
+        from drgs.information.semantics import SemanticMetric
         from drgs.select import select
 
         active = self.active
         left = [i for i in range(len(self.views)) if i not in self.chosen]
         pixels = active.info_pixels or self._config.max_pixels
+        semantics = None if decoder is None else SemanticMetric(decoder.metric())
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
                 scene,
@@ -172,7 +177,7 @@ class ActiveViews:
                 [at_most(frame.camera, pixels) for frame in frames],
                 1,
                 active.policy,
-                scoring=active.scoring(self._config.settings),
+                scoring=active.scoring(self._config.settings, semantics),
                 rng=self._generator,
                 progress=bar.update,
             )
@@ -192,6 +197,8 @@ class ActiveViews:
             "policy": active.policy,
             "criterion": active.criterion if active.policy == "fisher" else None,
             "prior": {"value": active.prior, "relative": active.relative_prior},
+            "blocks": selection.blocks,
+            "semantics": selection.semantics,
             "gaussians": len(scene.at(frames[0].camera.time)),
             "left_out": selection.left_out,
             "notes": selection.notes,

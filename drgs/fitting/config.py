@@ -7,10 +7,11 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from drgs.guards.arguments import check_fields, must_be
-from drgs.information.choices import Criterion, Method, Policy
+from drgs.information.choices import Block, Criterion, Method, Policy, checked_blocks
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
+    from drgs.information.semantics import SemanticMetric
     from drgs.select import Scoring
 
 __all__ = [
@@ -194,6 +195,7 @@ class ActiveConfig:
             Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
             evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
             initial points of the whole data set, else `uncovered`.
+        blocks: What of an image counts in policy `fisher`, as in `drgs.select.Scoring`; None: all that the fit has.
     """
 
     policy: Policy = "fisher"
@@ -207,25 +209,34 @@ class ActiveConfig:
     prior: float = 1e-6
     relative_prior: bool = False
     pick_points: PickPoints = "auto"
+    blocks: tuple[Block, ...] | None = None
 
     def __post_init__(self) -> None:
         from drgs.gain import Prior
 
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
+        if self.blocks is not None:
+            object.__setattr__(self, "blocks", checked_blocks("active", self.blocks))
         count = (1, 10**9)
         ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
         check_fields("active", self, ranges)
         Prior(value=self.prior)
 
-    def scoring(self, settings: RenderSettings) -> Scoring:
+    def scoring(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
         """As `drgs.select` takes it, for views that are rendered with these settings."""
         from drgs.gain import Prior
         from drgs.select import Scoring
 
-        prior = Prior(value=self.prior, relative=self.relative_prior)
-        return Scoring(criterion=self.criterion, settings=settings, method=self.method, prior=prior)
+        return Scoring(
+            criterion=self.criterion,
+            settings=settings,
+            method=self.method,
+            prior=Prior(value=self.prior, relative=self.relative_prior),
+            blocks=self.blocks,
+            semantics=semantics,
+        )
 
     def to_json(self) -> dict:
         """As config.json, selection.json and the checkpoint hold it."""
-        return dataclasses.asdict(self)
+        return json.loads(json.dumps(dataclasses.asdict(self)))

@@ -147,6 +147,10 @@ class Trainer:
         psnr = psnr_of(mse) if math.isfinite(mse) else None
         return StepResult(float(loss.detach()), terms, psnr, frame.name, events)  # told, not optimized
 
+    def network(self, name: str) -> torch.nn.Module | None:
+        """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
+        return next((network.module for network in self.parts.networks if network.name == name), None)
+
     def gaussians(self) -> Gaussians:
         """The Gaussians of the rows as they are, without a graph: those of a scene that moves are at rest."""
         return self.rows.gaussians().detach()

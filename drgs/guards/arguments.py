@@ -94,6 +94,13 @@ def _checked(value: Any, hint: Any, low: float, high: float) -> tuple[Any, str |
             return None, None
         checked, problem = _checked(value, next(kind for kind in kinds if kind is not type(None)), low, high)
         return checked, f"{problem}, or None" if problem else None
+    if typing.get_origin(hint) is typing.Literal:
+        return value, None if value in kinds else f"one of {', '.join(map(str, kinds))}"
+    if typing.get_origin(hint) is tuple and kinds[-1] is Ellipsis:
+        if not isinstance(value, list | tuple):
+            return value, "a tuple"
+        problems = (_checked(x, kinds[0], low, high)[1] for x in value)
+        return tuple(value), next((f"a tuple, each {problem}" for problem in problems if problem), None)
     if typing.get_origin(hint) is tuple:
         listed = value.tolist() if hasattr(value, "tolist") else value
         if isinstance(listed, list | tuple) and len(listed) == len(kinds):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import typing
+from collections.abc import Sequence
 from typing import Literal
 
-__all__ = ["METHODS", "Block", "Criterion", "Estimate", "Method", "Policy"]
+__all__ = ["BLOCK_NAMES", "METHODS", "Block", "Criterion", "Estimate", "Method", "Policy", "checked_blocks"]
 
 Criterion = Literal["eig", "logdet", "trace_cov", "block_logdet"]
 """The names in `drgs.gain.CRITERIA`, where the functions are; the first is the default everywhere."""
@@ -20,6 +21,25 @@ METHODS: tuple[Method, ...] = typing.get_args(Method)
 
 Block = Literal["geometry", "semantic"]
 """Parts of an image that can tell about a scene: its colors, and its features."""
+
+BLOCK_NAMES: tuple[Block, ...] = typing.get_args(Block)
+"""In the order in which results name them."""
+
+
+def checked_blocks(where: str, names: Sequence[str]) -> tuple[Block, ...]:
+    """The blocks that are named, each once and in their order.
+
+    Raises:
+        ValueError: If one is unknown, or none is named.
+    """
+    known = ", ".join(BLOCK_NAMES)
+    if not isinstance(names, tuple | list) or not names:
+        raise ValueError(f"{where}: blocks must be a tuple of one or more of {known}, got {names!r}; correct it")
+    for name in names:
+        if name not in BLOCK_NAMES:
+            raise ValueError(f"{where}: blocks must be among {known}, got {name!r}; correct it")
+    return tuple(name for name in BLOCK_NAMES if name in names)
+
 
 Estimate = Literal["collapsed", "exact"]
 """How `drgs.fisher.SemanticMetric` sums over the channels of decoded features; the first is the default everywhere."""

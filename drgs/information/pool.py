@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import Scene
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
 from drgs.information.cache import Cache
+from drgs.information.choices import BLOCK_NAMES, Block, checked_blocks
+from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
 
 __all__ = ["Pick", "Pool", "Scoring", "Selection"]
@@ -29,8 +31,12 @@ class Scoring:
         weights: Group -> factor, 1 where none is given; of `fisher` and `fisherrf` only.
         groups: Of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that Gaussians have. Of
             `fisher` only, not of `block_logdet`. Those of a scene's network need method `columns` or `probes`.
+        blocks: What of an image tells: `geometry`, its colors, about all but the features, `semantic`, its decoded
+            features, about the features and, coupled, about the geometry, or both. None: all that the scene has
+            (method `fisherrf` knows colors only). Of `fisher` only.
+        semantics: The metric of the block `semantic`; None: that of features as they are stored, all channels alike.
     Raises:
-        ValueError: If a criterion or method is unknown, or something else is of the wrong kind.
+        ValueError: If a criterion, method or block is unknown, or something else is of the wrong kind.
     """
 
     criterion: str = CRITERIA[0]
@@ -39,6 +45,8 @@ class Scoring:
     prior: Prior = dataclasses.field(default_factory=Prior)
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
     groups: tuple[str, ...] | None = None
+    blocks: tuple[Block, ...] | None = None
+    semantics: SemanticMetric | None = None
 
     def __post_init__(self) -> None:
         for name, known in (("criterion", CRITERIA), ("method", METHODS)):
@@ -50,6 +58,26 @@ class Scoring:
         if self.groups is not None:
             must_be("select", "groups", self.groups, (tuple, list), 'e.g. ("means", "sh")')
             object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
+        if self.blocks is not None:
+            object.__setattr__(self, "blocks", checked_blocks("select", self.blocks))
+        if self.semantics is not None:
+            must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
+
+    def blocks_of(self, gaussians: Gaussians) -> tuple[Block, ...]:
+        """The blocks that are scored of a scene, `gaussians` at some time of it.
+
+        Raises:
+            ValueError: If one is wanted that the scene does not have.
+        """
+        there: tuple[Block, ...] = ("geometry",) if gaussians.features is None else BLOCK_NAMES
+        if self.blocks is None:
+            return there[:1] if self.method == "fisherrf" else there
+        if "semantic" in self.blocks and "semantic" not in there:
+            raise ValueError(
+                "select: blocks must be of what the scene has, got semantic for Gaussians without features; fit "
+                "them to a data set with teacher maps, or use geometry"
+            )
+        return self.blocks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +115,8 @@ class Selection:
         evaluations: How often a candidate was scored.
         computed: Views whose information was computed, not taken from the cache.
         notes: What a reader of the result should know, one sentence each.
+        blocks: Of which blocks of the image the information is; empty for policies without.
+        semantics: What is coupled, if anything is: the metric's estimate, gamma and width.
         seconds: Wall time.
     """
 
@@ -98,6 +128,8 @@ class Selection:
     evaluations: int = 0
     computed: int = 0
     notes: list[str] = dataclasses.field(default_factory=list)
+    blocks: list[str] = dataclasses.field(default_factory=list)
+    semantics: dict | None = None
     seconds: float = 0.0
 
 

@@ -1,0 +1,257 @@
+"""What the feature image says about the geometry, against dense float64 Jacobians; moments along rays; bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import dense_jacobian as dense
+import numpy as np
+import pytest
+import torch
+from dense_jacobian import error
+from scenes_random import gaussians
+from test_select import ring
+
+from drgs import fisher, reference
+from drgs.fisher import SemanticMetric
+from drgs.information.moments import moments_map
+from drgs.oracle import sh_colors
+from drgs.select import POLICIES, Cache, select
+from drgs.settings import RenderSettings
+
+Preset = RenderSettings.preset
+COUPLED = ("means", "rotations", "log_scales", "logit_opacities")
+# Rounding of float32 hits against float64, relative to the largest entry of a group; measured: 4e-7.
+BOUND = 1e-5
+ZERO = (0.0, 0.0, 0.0)
+
+
+def metric(D: int, draw: int = 0, **fields) -> SemanticMetric:
+    """Of a random decoder from D to D + 3 channels, gamma 0.7, exact unless said otherwise."""
+    W = torch.randn(D + 3, D, generator=torch.Generator().manual_seed(draw), dtype=torch.float64)
+    return SemanticMetric(W.T @ W, **{"weight": 0.7, "estimate": "exact", **fields})
+
+
+def truth(g, out, m: SemanticMetric) -> tuple[dict, torch.Tensor]:
+    """Diagonal and blocks of J^T J of y = [RGB; sqrt(gamma) W F], from the oracle's dense Jacobian."""
+    J, F = dense.jacobian(g, out), dense.feature_jacobian(g, out)
+    P, D = len(J["means"]) // 3, m.width
+    rows = torch.cat([F["means"], F["rotations"], F["log_scales"], F["logit_opacities"][..., None]], -1)
+    rows = rows.reshape(P, D, len(g), 10)
+    coupled = m.weight * torch.einsum("pcni,cd,pdnj->nij", rows, m.matrix, rows)
+    colors = dense.stacked(J)
+    blocks = torch.einsum("pni,pnj->nij", colors, colors)
+    blocks[:, :10, :10] += coupled
+    diagonal = dense.squares(J)
+    for name, place in zip(COUPLED, (slice(0, 3), slice(3, 6), slice(6, 9), 9), strict=True):
+        diagonal[name] = diagonal[name] + coupled.diagonal(dim1=1, dim2=2)[:, place]
+    return diagonal, blocks
+
+
+@pytest.mark.parametrize(
+    ("response", "order", "D"),
+    [
+        *itertools.product(("peak",), ("ray", "center"), (1, 3)),
+        *itertools.product(("integral",), ("ray",), (1, 3)),
+        *itertools.product(("ewa",), ("center",), (1, 3)),
+        ("peak", "center", 128),  # in eight traversals
+        *(pytest.param(*kind, marks=pytest.mark.slow) for kind in (("integral", "ray", 128), ("peak", "ray", 512))),
+    ],
+)
+def test_coupled_diagonal_and_blocks(response, order, D):
+    """Squares of what geometry does to colors and decoded features, as every form of the information has them.
+
+    Diagonal, blocks and columns are the dense Jacobian's; weighted by anything, the sum of the map is the diagonal's.
+    """
+    settings = Preset("exact", response=response, order=order, dilation=0.3 if response == "ewa" else 0.0)
+    g, cam, out = dense.scene(np.random.default_rng(3), settings, K=4, D=D, n=6, size=(8, 6))
+    m = metric(D)
+    diagonal, blocks = truth(g, out, m)
+    found = fisher.diagonal(g, cam, settings, semantics=m)
+    assert set(found) == {*COUPLED, "sh", "features"}
+    for name, x in diagonal.items():
+        assert error(found[name], x) <= BOUND, name
+    w2 = fisher.coverage(g, cam, settings)
+    assert error(found["features"], 0.7 * m.matrix.diagonal().mean() * w2) <= BOUND
+    scale = blocks.diagonal(dim1=1, dim2=2).amax(0).sqrt()
+    error_of_blocks = (fisher.blocks(g, cam, settings, semantics=m) - blocks) / (scale[:, None] * scale)
+    assert float(error_of_blocks.abs().max()) <= BOUND
+    weights = {name: torch.rand(x.shape, dtype=torch.float64) for name, x in found.items()}
+    total = float(fisher.variance_map(g, cam, weights, settings, semantics=m).double().sum())
+    assert total == pytest.approx(sum(float((weights[n] * x).sum()) for n, x in found.items()), rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A scene with three feature channels, a camera, and what they tell in the metric of a decoder."""
+    settings = Preset("exact")
+    g, cam, _ = dense.scene(np.random.default_rng(3), settings, K=4, D=3, n=6, size=(8, 6))
+    g = g.detach()
+    m = metric(3)
+    return g, cam, settings, m, fisher.diagonal(g, cam, settings, semantics=m)
+
+
+def test_columns_and_probes(seen):
+    """Forward mode says the same; 64 random images the same on average, within 4 of their standard deviations."""
+    g, cam, settings, m, found = seen
+    columns = fisher.diagonal(g, cam, settings, "columns", semantics=m)
+    probes = fisher.diagonal(g, cam, settings, "probes", probes=64, semantics=m)
+    for name, x in found.items():
+        assert error(columns[name], x) <= BOUND, name
+        ratios = (probes[name] / x)[x > 1e-6 * x.max()]
+        assert abs(float(ratios.mean()) - 1) < 4 * (2 / 64) ** 0.5, name
+
+
+def test_collapsed_channels_are_unbiased(seen):
+    """The mean over 100 draws of one channel is the exact sum, within 4 standard errors of the measured spread."""
+    g, cam, settings, m, exact = seen
+    one = dataclasses.replace(m, estimate="collapsed", samples=1)
+    draws = []
+    for seed in range(100):
+        again = fisher.diagonal(g, cam, settings, semantics=dataclasses.replace(one, seed=seed), groups=COUPLED)
+        draws.append(torch.stack([again[name].sum() for name in COUPLED]))
+    draws = torch.stack(draws)
+    want = torch.stack([exact[name].sum() for name in COUPLED])
+    assert float(draws.std(0).min()) > 0
+    assert ((draws.mean(0) - want).abs() <= 4 * draws.std(0) / len(draws) ** 0.5).all()
+
+
+def test_blocks_of_the_image_add_up(seen):
+    """Colors and features are rows of their own: what they tell adds up; scaled by c, a decoder tells c^2 as much."""
+    g, cam, settings, m, both = seen
+    colors = fisher.diagonal(g, cam, settings, groups=[*COUPLED, "sh"])
+    features = fisher.diagonal(g, cam, settings, semantics=m, channel_weights=ZERO)
+    doubled = dataclasses.replace(m, matrix=4 * m.matrix)
+    again = fisher.diagonal(g, cam, settings, semantics=doubled, channel_weights=ZERO)
+    for name, x in both.items():
+        assert error(colors.get(name, 0) + features[name], x) <= BOUND, name
+        assert error(again[name], 4 * features[name]) <= BOUND, name
+    assert float(features["sh"].abs().max()) == 0
+
+
+def test_shuffled_features(seen):
+    """Features among other Gaussians: what is uncoupled stays to the bit, what is coupled changes by 10 % and more."""
+    g, cam, settings, m, before = seen
+    other = g.replace(features=g.features.roll(1, 0))
+    uncoupled = [fisher.diagonal(x, cam, settings) for x in (g, other)]
+    assert all(torch.equal(uncoupled[0][name], uncoupled[1][name]) for name in uncoupled[0])
+    after = fisher.diagonal(other, cam, settings, semantics=m)
+    assert torch.equal(before["features"], after["features"])
+    assert torch.equal(before["sh"], after["sh"])
+    for name in COUPLED:
+        assert error(after[name], before[name]) > 0.1, name
+
+
+@pytest.mark.parametrize("D", [3, 0])
+def test_moments(D):
+    """sum w f^2 - (sum w f)^2, w from a float64 render of one channel a Gaussian; colors where there are no features.
+
+    Rounding of float32 images, relative to the largest second moment (measured: 1e-7).
+    """
+    rng = np.random.default_rng(0)
+    settings, cam = Preset("exact", background=(0.3, 0.5, 0.7)), ring(rng, 1)[0]
+    g = gaussians(rng, 12, 4, scale=0.25, D=D).detach()
+    f = g.features.double() if D else sh_colors(g.sh.double(), g.means.double() - torch.from_numpy(cam.center))
+    w = reference.render(g.replace(features=torch.eye(12)), cam, settings).features
+    second = torch.einsum("hwn,nc->hwc", w, f.square())
+    want = (second - torch.einsum("hwn,nc->hwc", w, f).square()).sum(-1)
+    assert float((moments_map(g, cam, settings) - want).abs().max()) <= 1e-6 * float(second.sum(-1).max())
+
+
+@pytest.fixture(scope="module")
+def world():
+    """12 Gaussians with three feature channels, two known views and four candidates."""
+    rng = np.random.default_rng(0)
+    cameras = ring(rng, 6)
+    return gaussians(rng, 12, 4, scale=0.25, D=3).detach(), cameras[:2], cameras[2:]
+
+
+def test_moments_rank_candidates(world):
+    """The score is the mean of the map; known views do not matter; two picks are the two best, and a note says so."""
+    g, train, candidates = world
+    found = select(g, candidates, train, 2, "moments")
+    maps = [moments_map(g, camera, Preset("exact")) for camera in candidates]
+    assert found.scores == pytest.approx([float(x.double().mean()) for x in maps], rel=1e-12)
+    order = sorted(range(4), key=lambda i: -found.scores[i])
+    assert [pick.index for pick in found.picks] == order[:2]
+    assert found.picks[1].margin == found.scores[order[1]] - found.scores[order[2]]
+    assert "do not take each other into account" in found.notes[0]
+    assert select(g, candidates, [], 1, "moments").scores == found.scores
+
+
+def test_every_policy_takes_semantic_scenes(world):
+    """All of them pick; those that know colors or poses only pick as without features."""
+    g, train, candidates = world
+    for policy in POLICIES:
+        found = select(g, candidates, train, 2, policy)
+        assert len(found.picks) == 2
+        if policy not in ("fisher", "moments", "random"):
+            assert found.scores == select(g.replace(features=None), candidates, train, 2, policy).scores
+    for criterion in ("eig", "logdet", "trace_cov", "block_logdet"):
+        assert select(g, candidates, train, 1, criterion=criterion).blocks == ["geometry", "semantic"]
+
+
+def test_blocks_that_are_scored(world):
+    """Geometry alone is the score without features; both is the default; results name blocks and metric."""
+    g, train, candidates = world
+    m = metric(3, estimate="collapsed", samples=2, seed=7)
+    scores = {}
+    for blocks in (("geometry",), ("semantic",), ("semantic", "geometry")):
+        found = select(g, candidates, train, blocks=blocks, semantics=m)
+        scores[blocks] = found.scores
+        assert found.blocks == [name for name in ("geometry", "semantic") if name in blocks]
+        assert ("features" in found.parts[0], "sh" in found.parts[0]) == ("semantic" in blocks, "geometry" in blocks)
+        told = {"estimate": "collapsed", "samples": 2, "seed": 7, "gamma": 0.7, "width": 3}
+        assert found.semantics == (told if "semantic" in blocks else None)
+    assert scores["geometry",] == select(g.replace(features=None), candidates, train).scores
+    assert scores["semantic", "geometry"] == select(g, candidates, train, semantics=m).scores
+    latent = select(g, candidates, train).semantics
+    assert latent["width"] == 3
+    assert latent["gamma"] == 1
+
+
+def test_the_cache_knows_the_metric(world):
+    """Another metric is other information; an equal one, of another object, is the same."""
+    g, train, candidates = world
+    cache = Cache()
+    count = len(train) + len(candidates)
+    for m, computed in ((metric(3), count), (metric(3), 0), (metric(3, draw=1), count), (None, count)):
+        assert select(g, candidates, train, cache=cache, semantics=m).computed == computed
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda g, c: select(g.replace(features=None), c, c, blocks=("semantic",)), "semantic for Gaussians without"),
+        (lambda g, c: select(g, c, c, blocks=("color",)), "blocks must be among geometry, semantic, got 'color'"),
+        (lambda g, c: select(g, c, c, blocks=()), "blocks must be a tuple of one or more"),
+        (lambda g, c: select(g, c, c, semantics=metric(4)), "must be of the width of the features, 3, got 4"),
+        (lambda g, c: fisher.blocks(g, c, semantics=metric(4)), "fisher.blocks: semantics must be of the width"),
+        (lambda g, c: fisher.variance_map(g, c[0], {}, semantics=metric(4)), "fisher.variance_map: semantics must be"),
+        (lambda g, c: fisher.diagonal(g.replace(features=None), c, semantics=metric(3)), "a scene with features"),
+        (lambda g, c: fisher.diagonal(g, c, method="fisherrf", semantics=metric(3)), "it is about colors only"),
+        (lambda g, c: SemanticMetric(torch.ones(2, 3)), r"matrix must be \(D, D\)"),
+        (lambda g, c: SemanticMetric(torch.tensor([[1.0, 2.0], [0.0, 1.0]])), "must be symmetric"),
+        (lambda g, c: SemanticMetric(-torch.eye(2)), "positive semidefinite, got an eigenvalue of -1"),
+        (lambda g, c: SemanticMetric(torch.eye(2) / 0), "matrix must be finite"),
+        (lambda g, c: SemanticMetric(torch.eye(2), weight=0), "weight must be a finite number > 0"),
+        (lambda g, c: SemanticMetric(torch.eye(2), estimate="guess"), "estimate must be"),
+        (lambda g, c: SemanticMetric(torch.eye(2), samples=0), "samples must be a whole number >= 1"),
+    ],
+)
+def test_bad_input(world, call, message):
+    """One line that says what must hold."""
+    g, _, candidates = world
+    with pytest.raises(ValueError, match=message) as caught:
+        call(g, candidates)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_decoder_that_sees_nothing(seen):
+    """W = 0: features tell nothing, colors what they always do."""
+    g, cam, settings, _, _ = seen
+    blind = SemanticMetric(torch.zeros(3, 3))
+    found, colors = fisher.diagonal(g, cam, settings, semantics=blind), fisher.diagonal(g, cam, settings)
+    assert all(torch.equal(found[name], colors[name]) for name in COUPLED)
+    assert float(found["features"].abs().max()) == 0
