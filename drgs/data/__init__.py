@@ -11,6 +11,7 @@ from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
 from drgs.data.points import added_points, initial_points, scene_extent
+from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.views import Dataset, View
@@ -34,8 +35,8 @@ def load(
 
     Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json``; a COLMAP
         model in ``.``,
-    ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``. A JSON or npy file may be
-    named itself.
+    ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt`` (Replica, as
+    Semantic-NeRF renders it). A JSON or npy file may be named itself.
 
     Args:
         path: folder or file.
@@ -69,6 +70,8 @@ def load(
         loader = load_colmap
     elif (path / "poses_bounds.npy").is_file():
         loader = load_llff
+    elif (path / POSES).is_file():
+        loader = load_replica
     else:
         raise _nothing_found(path)
     held_out = {"test_every": test_every, "test_offset": test_offset}
@@ -88,11 +91,14 @@ def _nothing_found(path: Path) -> FileNotFoundError:
                 f"{path}: must hold camera poses, found {len(list_images(folder))} photos without; "
                 f"run `drgs sfm {folder} -o OUT` and load OUT"
             )
+    for sequence in sorted(path.glob(f"*/{POSES}"))[:1]:
+        return FileNotFoundError(f"{path}: must be one sequence of Replica, found several; name {sequence.parent}")
     looked = [
         "transforms.json",
         "transforms_{train,val,test}.json",
         *MODEL_FOLDERS,
         "poses_bounds.npy",
+        POSES,
         "images",
     ]
     return FileNotFoundError(f"{path}: must be a data set, found none (looked for {', '.join(looked)}); check the path")

@@ -20,11 +20,13 @@ from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["IMAGE_SUFFIXES", "image_size", "inverse_pose", "list_images", "read_image", "read_npy"]
+__all__ = ["IMAGE_SUFFIXES", "image_size", "inverse_pose", "list_images", "read_image", "read_npy", "repaired_pose"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
 _MAX_PIXELS = 2**31
+# Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
+_ROUNDING = 1e-2
 # What OpenCV, libpng, libjpeg and libtiff begin their lines with; OpenCV ends some with an empty one.
 _DECODER = re.compile(
     rb"^\[ *(WARN|ERROR|INFO)|^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$", re.IGNORECASE
@@ -213,3 +215,15 @@ def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
     return w2c
+
+
+def repaired_pose(pose: np.ndarray) -> np.ndarray:
+    """A pose (4,4) whose rotation was printed with a few digits, with the nearest rotation; others as they are."""
+    rotation = pose[:3, :3]
+    is_close = np.abs(rotation).max() < 2 and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROUNDING
+    if not (is_close and np.linalg.det(rotation) > 0):
+        return pose
+    u, _, vt = np.linalg.svd(rotation)
+    repaired = pose.copy()
+    repaired[:3, :3] = u @ vt
+    return repaired

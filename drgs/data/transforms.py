@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, repaired_pose
 from drgs.data.points import read_point_ply
 from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
 from drgs.guards.json_files import check_json, read_json
@@ -29,8 +29,6 @@ _LENSES = {
 }
 _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
-# Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
-_ROUNDING = 1e-2
 
 
 def find_transforms(path: Path) -> list[Path]:
@@ -258,12 +256,7 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
     pose = np.eye(4)
     pose[:3] = c2w[:3]
     pose = c2w_from_opengl(pose)
-    rotation = pose[:3, :3]
-    is_close = np.abs(rotation).max() < 2 and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROUNDING
-    if is_close and np.linalg.det(rotation) > 0:
-        u, _, vt = np.linalg.svd(rotation)
-        pose[:3, :3] = u @ vt
-    return inverse_pose(where, pose)
+    return inverse_pose(where, repaired_pose(pose))
 
 
 def _focal(where: str, values: dict, key: str, size: float) -> float:
