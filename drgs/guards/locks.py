@@ -10,13 +10,17 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["NAME", "acquire", "release"]
+__all__ = ["NAME", "InUse", "acquire", "release"]
 
 NAME = ".drgs.lock"
 """Name of the lock in the folder that is being written."""
 
 _MAX_BYTES = 4096
 _UNWRITTEN = 2.0  # seconds after which a lock without content is of a process that was killed while it wrote it
+
+
+class InUse(ValueError):
+    """Another process writes into the folder, or may."""
 
 
 def acquire(folder: Path, command: str) -> str | None:
@@ -28,7 +32,7 @@ def acquire(folder: Path, command: str) -> str | None:
     Returns:
         Whose lock was taken over because its process no longer runs, in words; else None.
     Raises:
-        ValueError: If another process writes there, or one of another machine may.
+        InUse: If another process writes there, or one of another machine may.
         OSError: If the folder cannot be written.
     """
     path, stale = folder / NAME, None
@@ -63,13 +67,13 @@ def _refuse_if_running(folder: Path, path: Path, owner: dict) -> None:
     this = _this_process()
     if not owner:
         if time.time() - path.stat().st_mtime < _UNWRITTEN:
-            raise ValueError(f"{folder}: must not be written by two commands at once, another one begins; wait for it")
+            raise InUse(f"{folder}: must not be written by two commands at once, another one begins; wait for it")
         return
     where = f"{folder}: must not be written by two commands at once, {_in_words(owner)} writes there"
     if (owner.get("host"), owner.get("space")) != (this["host"], this["space"]):
-        raise ValueError(f"{where}; choose another folder, or delete {path} if that process no longer runs")
+        raise InUse(f"{where}; choose another folder, or delete {path} if that process no longer runs")
     if owner.get("started") == _started(owner.get("pid")):
-        raise ValueError(f"{where}; wait for it, end it, or choose another folder")
+        raise InUse(f"{where}; wait for it, end it, or choose another folder")
 
 
 def _owner(path: Path) -> dict | None:

@@ -1,0 +1,229 @@
+"""The tables of a study as Markdown: means, paired differences with intervals, and the points of every unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.files import atomic_write
+from drgs.lab.study import Metric, Study
+from drgs.lab.study_statistics import Estimate, Unit, differences, estimate, unit_of, values_of
+
+__all__ = ["fill_between", "study_report"]
+
+StudyRows = Sequence[Mapping[str, Any]]
+
+_FEWEST = 6  # units: five that all agree do so by chance in one of 16 studies (sign test, both sides)
+_PROTOCOLS = {
+    "blind": "nothing of a view is read before it is picked",
+    "paper": "initial points of the whole data set, views that are never picked included (`pool_leak`)",
+}
+
+
+def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
+    """Everything that a page says about a study's numbers.
+
+    Args:
+        study: What was studied.
+        rows: Its rows (`drgs.lab.study.read_study`); others are left out.
+        level: Of the headings.
+    """
+    rows = [row for row in rows if row["study"] == study.name and row["policy"] in study.policies]
+    if not rows:
+        return "No cell is finished."
+    parts = [_size(rows)]
+    protocols = [name for name in _PROTOCOLS if any(row["protocol"] == name for row in rows)]
+    for protocol in protocols:
+        mine = [row for row in rows if row["protocol"] == protocol]
+        if len(protocols) > 1:
+            parts.append(f"{'#' * level} Protocol `{protocol}`: {_PROTOCOLS[protocol]}")
+        below = "#" * (level + (len(protocols) > 1))
+        for scene in dict.fromkeys(row["scene"] for row in mine):
+            parts += [f"{below} {scene}", _means(study, [row for row in mine if row["scene"] == scene])]
+        if study.reference in study.policies and len({row["policy"] for row in mine}) > 1:
+            others = [(label, study.reference) for label in study.policies if label != study.reference]
+            parts += [f"{below} Against `{study.reference}`", _explained(mine), _compared(study, mine, others)]
+            if verdicts := _verdicts(study, mine, others):
+                parts.append(verdicts)
+        if study.comparisons:
+            table = _compared(study, mine, study.comparisons, named=True)
+            if verdicts := _verdicts(study, mine, study.comparisons):
+                table += "\n\n" + verdicts
+            parts += [f"{below} Other pairs", table]
+        parts += [f"{below} Every unit", _points(study, mine)]
+    return "\n\n".join(parts)
+
+
+def fill_between(page: Path, name: str, text: str) -> None:
+    """Replace what stands between `<!-- NAME: begin -->` and `<!-- NAME: end -->` of a page.
+
+    Raises:
+        ValueError: If the page does not have both, in this order.
+    """
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, found, rest = page.read_text().partition(begin)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise ValueError(f"{page}: must have {begin} and {end}, in this order; add them")
+    with atomic_write(page) as file:
+        file.write(f"{before}{begin}\n\n{text}\n\n{end}{after}".encode())
+
+
+def _size(rows: StudyRows) -> str:
+    """How much there is, and what it ran on."""
+    commits = dict.fromkeys((row.get("commit") or "unknown")[:7] for row in rows)
+    units: dict[str, set] = {}
+    views: dict[str, set] = {}
+    for row in rows:
+        units.setdefault(row["scene"], set()).add(unit_of(row))
+        if row.get("views"):
+            views.setdefault(row["scene"], set()).add(row["views"])
+    each = [
+        f"{scene} {len(found)}" + (f" (each with {_range(views[scene])} test views)" if scene in views else "")
+        for scene, found in units.items()
+    ]
+    return (
+        f"{len(rows)} fits, on commits {', '.join(commits)}. Units (scene, split, initial views): {', '.join(each)}. "
+        "Fits of one unit that differ by the seed alone are averaged."
+    )
+
+
+def _range(numbers: set[int]) -> str:
+    return str(min(numbers)) if len(numbers) == 1 else f"{min(numbers)} to {max(numbers)}"
+
+
+def _labels(study: Study, rows: StudyRows) -> list[str]:
+    """The policies that have rows, in the study's order."""
+    return [label for label in study.policies if any(row["policy"] == label for row in rows)]
+
+
+def _table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    rule = "|" + "---|" * len(heads)
+    return "\n".join(["| " + " | ".join(heads) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)])
+
+
+def _means(study: Study, rows: StudyRows) -> str:
+    """Policies against metrics: means over the units."""
+    lines = []
+    for label in _labels(study, rows):
+        cells = []
+        for metric in study.metrics:
+            values = values_of(rows, metric.key, label)
+            cells.append(f"{np.mean(list(values.values())):.{metric.digits}f}" if values else "none")
+        seconds = np.mean([row["pick_seconds"] for row in rows if row["policy"] == label])
+        count = len({unit_of(row) for row in rows if row["policy"] == label})
+        lines.append([label, *cells, f"{seconds:.2f}", str(count)])
+    heads = ["policy", *(_title(metric) for metric in study.metrics), "seconds a pick", "units"]
+    return _table(heads, lines)
+
+
+def _title(metric: Metric) -> str:
+    return metric.title if metric.larger else f"{metric.title} (lower is better)"
+
+
+def _explained(rows: StudyRows) -> str:
+    """How to read the table of differences."""
+    scenes, units = len({row["scene"] for row in rows}), len({unit_of(row) for row in rows})
+    told = (
+        "**Gain** and **loss**: the interval leaves out 0."
+        if units >= _FEWEST
+        else f"No verdicts: {units} units cannot tell a difference from chance, even if all of them agree."
+    )
+    return (
+        "Differences within a unit: their mean (every scene counts alike), its 95 % interval from a bootstrap over "
+        f"scenes ({scenes} here) first and the units of each then, and in how many units the policy was better. {told} "
+        "Can be seen: a true difference of that size (2.8 standard errors; the median of the lines) would be told from "
+        "0 in four of five such studies, a smaller one less often. Where scenes differ as much as units do, an "
+        "interval over 3 scenes holds the true mean in 83 % of studies, not in 95 %."
+    )
+
+
+def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], named: bool = False) -> str:
+    """Pairs of policies against metrics; below them the size of a difference that can be seen."""
+    lines: list[list[str]] = []
+    sizes: dict[str, list[float]] = {metric.key: [] for metric in study.metrics}
+    for policy, reference in pairs:
+        found = _estimates(study, rows, policy, reference)
+        if not any(found.values()):
+            continue
+        cells = []
+        for metric in study.metrics:
+            one = found[metric.key]
+            cells.append(_difference(metric, one) if one else "none")
+            if one:
+                sizes[metric.key].append(one.seen)
+        lines.append([f"{policy} against {reference}" if named else policy, *cells])
+    if not lines:
+        return "No pair of policies has a unit in common yet."
+    last = [f"{np.median(sizes[m.key]):.{m.digits}f}" if sizes[m.key] else "none" for m in study.metrics]
+    return _table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
+
+
+def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Estimate | None]:
+    """Metric -> what the pair's differences say; None where they have no unit in common."""
+    found = {metric.key: differences(rows, metric.key, policy, reference) for metric in study.metrics}
+    return {key: estimate(values) if values else None for key, values in found.items()}
+
+
+def _difference(metric: Metric, found: Estimate) -> str:
+    """Mean, interval, verdict, and in how many units it is better."""
+    numbers = f"{found.mean:+.{metric.digits}f} [{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
+    better = found.positive if metric.larger else found.negative
+    word = _verdict(metric, found)
+    return f"{numbers}{f' **{word}**' if word else ''}, {better} of {found.units}"
+
+
+def _verdict(metric: Metric, found: Estimate) -> str:
+    """`gain`, `loss`, or nothing where the interval holds 0 or is of too few units."""
+    if found.units < _FEWEST or found.low <= 0 <= found.high:
+        return ""
+    return "gain" if (found.mean > 0) == metric.larger else "loss"
+
+
+def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -> str:
+    """Gains and losses in words; a pair without either is named as well."""
+    lines, verbs = [], {"gain": "gains in", "loss": "loses in"}
+    for policy, reference in pairs:
+        found = _estimates(study, rows, policy, reference)
+        words: dict[str, list[str]] = {word: [] for word in verbs}
+        for metric in study.metrics:
+            one = found[metric.key]
+            if one and (word := _verdict(metric, one)):
+                words[word].append(metric.title)
+        if not any(one and one.units >= _FEWEST for one in found.values()):
+            continue
+        told = [f"{verbs[word]} {', '.join(names)}" for word, names in words.items() if names]
+        lines.append(
+            f"- `{policy}` against `{reference}`: {' and '.join(told) or 'no difference that this study can see'}."
+        )
+    return "\n".join(lines)
+
+
+def _points(study: Study, rows: StudyRows) -> str:
+    """One table a metric: policies against units, nothing averaged but the fits of one unit."""
+    units = sorted({unit_of(row) for row in rows})
+    names = _unit_names(units)
+    key = [f"- {names[unit]}: every {unit[1][0]}th view from index {unit[1][1]} on held out, initial views "
+           f"{', '.join(unit[2])}" for unit in units]  # fmt: skip
+    parts = ["\n".join(key)]
+    for metric in study.metrics:
+        lines = []
+        for label in _labels(study, rows):
+            values = values_of(rows, metric.key, label)
+            lines.append([label, *(f"{values[u]:.{metric.digits}f}" if u in values else "" for u in units)])
+        title = f"<details><summary>{_title(metric)}</summary>"
+        parts.append(f"{title}\n\n{_table(['policy', *(names[u] for u in units)], lines)}\n\n</details>")
+    return "\n\n".join(parts)
+
+
+def _unit_names(units: Sequence[Unit]) -> dict[Unit, str]:
+    """Scene and a number, counted within the scene."""
+    names: dict[Unit, str] = {}
+    counts: dict[str, int] = {}
+    for unit in units:
+        counts[unit[0]] = counts.get(unit[0], 0) + 1
+        names[unit] = f"{unit[0]} {counts[unit[0]]}"
+    return names

@@ -1,0 +1,359 @@
+"""Cells of a study: what is run, skipped, resumed and recorded; and what the statistics say of the rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import multiprocessing
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_active import write_still
+
+from drgs import train
+from drgs.files import write_json
+from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.guards.locks import InUse
+from drgs.lab import study as engine
+from drgs.lab.study import Cell, Metric, Study, append_row, cell_of, distinct_seeds, read_study, run_cell, run_cells
+from drgs.lab.study_report import fill_between, study_report
+from drgs.lab.study_statistics import differences, estimate, unit_of
+
+METRICS = (
+    Metric("psnr", "PSNR", 2),
+    Metric("flip", "FLIP", 3, larger=False),
+    Metric("steps", "steps", 0, path=("step",)),
+)
+SPLIT = (4, 1)
+
+
+def small(folder: Path, **fields) -> Study:
+    """Two policies, ten steps; `fields` of the FitConfig."""
+    config = {"max_steps": 10, "max_gaussians": 60, "sh_degree": 1, "save_every": 3, **fields}
+    return Study(
+        name="tiny",
+        folder=lambda scene: folder,
+        policies={"farthest": {"policy": "farthest"}, "Random, 1": {"policy": "random"}},
+        fit=FitConfig(**config),
+        active=ActiveConfig(initial=2, add=2, every=3),
+        metrics=METRICS,
+        reference="Random, 1",
+    )
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    write_still(folder)
+    return folder
+
+
+@pytest.fixture
+def faked(monkeypatch):
+    """`fit` is replaced by one that writes what a run folder has at the end; the configs that it was given."""
+    seen = []
+
+    def fit(dataset, folder, config, *, active, resume, progress):
+        seen.append((config, active))
+        fakes(folder, config, active, *([view.name for view in part] for part in dataset.split()))
+
+    monkeypatch.setattr(engine, "fit", fit)
+    return seen
+
+
+def fakes(folder, config, active, train=("a", "b", "c"), test=("t",)):
+    """The files of a finished run."""
+    schema = {"schema": 1, "command": "fit"}
+    recorded = {"data": "x", "train": train[:2], "test": test, "fit": config.to_json(), "active": active.to_json()}
+    write_json(folder / "config.json", {**schema, **recorded})
+    write_json(folder / "env.json", {"schema": 1, "commit": "0123456789", "drgs": "9"})
+    picks = [{"index": 2, "name": train[2], "seconds": 0.5}]
+    start = [{"index": i, "name": name} for i, name in enumerate(train[:2])]
+    leak = config.init_points == "all"
+    write_json(folder / "selection.json", {**schema, "start": start, "picks": picks, "pool_leak": leak})
+    mean = {"psnr": 20.0 + config.seed, "flip": None}
+    counts = {"count": len(test), "gaussians": 3, "step": config.max_steps, "seconds": 1.5}
+    write_json(folder / "metrics.json", {"schema": 1, "split": "test", "mean": mean, **counts})
+
+
+def units(seeds=(0, 1)):
+    return [("still", SPLIT, "seed", protocol, seed) for seed in seeds for protocol in ("blind", "paper")]
+
+
+def test_units_are_outermost(still, faked, tmp_path):
+    """After any number of whole units every policy has been run on each of them; a second call runs nothing."""
+    study, rows = small(still), tmp_path / "rows.jsonl"
+    cells = study.cells(units())
+    assert len(cells) == len(set(cells)) == len({cell.name for cell in cells}) == 8
+    assert [cell.policy for cell in cells] == ["farthest", "Random, 1"] * 4
+    said = []
+    assert run_cells(study, cells[:4], tmp_path, rows, said.append) == ([], [])
+    assert [cell_of(row) for row in read_study(rows)] == [("tiny", cell) for cell in cells[:4]]
+    assert len(faked) == 4
+    assert run_cells(study, cells, tmp_path, rows, said.append) == ([], [])
+    assert len(faked) == 8
+    assert [cell_of(row)[1] for row in read_study(rows)] == cells
+
+
+def test_a_cell_says_what_its_fit_is_told(still, faked, tmp_path):
+    """Seed, split, start, policy and protocol arrive; rows say what came of them, with the commit and the version."""
+    study = small(still)
+    for cell in study.cells(units((5,)))[::2]:
+        row = run_cell(study, cell, tmp_path)
+        config, active = faked[-1]
+        assert (config.seed, config.test_every, config.test_offset) == (5, 4, 1)
+        assert (active.start, active.policy) == ("seed", "farthest")
+        assert config.init_points == {"blind": "views", "paper": "all"}[cell.protocol]
+        assert row["pool_leak"] is (cell.protocol == "paper")
+        assert row["initial"] == ["0", "2"]
+        assert (row["picks"], row["views"], row["gaussians"]) == (["3"], 2, 3)
+        assert row["metrics"] == {"psnr": 25.0, "flip": None, "steps": 10.0}
+        assert (row["seconds"], row["pick_seconds"], row["commit"], row["drgs"]) == (1.5, 0.5, "0123456789", "9")
+
+
+def test_a_folder_of_another_fit_is_refused(still, faked, tmp_path):
+    """A study whose numbers have changed under the same name does not take old runs for its own."""
+    study = small(still)
+    cell = study.cells(units())[0]
+    run_cell(study, cell, tmp_path)
+    run_cell(dataclasses.replace(study, fit=dataclasses.replace(study.fit, save_every=9)), cell, tmp_path)
+    other = dataclasses.replace(study, fit=dataclasses.replace(study.fit, max_steps=11))
+    with pytest.raises(ValueError, match="must be the run of this cell, max_steps was 10 and is 11; give the study"):
+        run_cell(other, cell, tmp_path)
+    other = dataclasses.replace(study, active=dataclasses.replace(study.active, every=4))
+    with pytest.raises(ValueError, match="must be the run of this cell, every was 3 and is 4"):
+        run_cell(other, cell, tmp_path)
+    assert len(faked) == 1
+    said = []
+    assert run_cells(other, [cell], tmp_path, tmp_path / "rows.jsonl", said.append) == ([], [cell])
+    assert "failed: " in said[-1]
+    assert "every was 3" in said[-1]
+
+
+def test_a_stated_split_is_refused(still, tmp_path):
+    """Files that say what is held out would win over the cell's split."""
+    study = small(still)
+    data = json.loads((still / "transforms.json").read_text())
+    data["test_filenames"] = [data["frames"][0]["file_path"]]
+    data["train_filenames"] = [frame["file_path"] for frame in data["frames"][1:]]
+    folder = tmp_path / "stated"
+    folder.mkdir()
+    for name in ("images", "masks", "depth"):
+        (folder / name).symlink_to(still / name)
+    (folder / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(ValueError, match="a study must hold out views itself, the files state a split"):
+        run_cell(dataclasses.replace(study, folder=lambda scene: folder), study.cells(units())[0], tmp_path)
+
+
+def test_seeds_are_of_different_initial_views(still):
+    """Those that are left out would have repeated a unit; the order of two initial views does not matter."""
+    study = small(still)
+    seeds = distinct_seeds(study, "still", SPLIT, 4)
+    assert seeds == sorted(seeds)
+    assert len(set(seeds)) == 4
+    views = study.dataset(study.cells(units())[0]).split()[0]
+    sets = []
+    for seed in range(seeds[-1] + 1):
+        plan = engine.ActiveViews(
+            dataclasses.replace(study.active, start="seed"), views, dataclasses.replace(study.fit, seed=seed)
+        )
+        sets.append(frozenset(plan.chosen))
+    assert [sets.index(chosen) for chosen in dict.fromkeys(sets)] == seeds
+    with pytest.raises(ValueError, match="must have 1000 sets of initial views"):
+        distinct_seeds(study, "still", SPLIT, 1000)
+
+
+# ---- files
+
+
+def row_of(scene="s", split=(8, 0), policy="p", seed=0, psnr=0.0, **fields):
+    cell = Cell(scene, split, "seed", policy, "blind", seed)
+    metrics = {"psnr": psnr, "flip": psnr, "steps": 1.0}
+    row = {"study": "tiny", **cell.to_json(), "initial": [f"v{seed}"], "metrics": metrics, "pick_seconds": 1.0}
+    return {**row, "commit": "abcdefghi", **fields}
+
+
+def test_rows_survive_a_kill_and_merge(tmp_path):
+    """Half a last line is dropped and written over; damaged lines before it are named; later files win."""
+    path, other = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    assert read_study(path) == []
+    append_row(path, row_of(seed=0))
+    with path.open("ab") as file:
+        file.write(b'{"study": "ti')
+    assert [row["seed"] for row in read_study(path)] == [0]
+    append_row(path, row_of(seed=1))
+    append_row(path, row_of(seed=1, psnr=9.0))
+    assert [(row["seed"], row["metrics"]["psnr"]) for row in read_study(path)] == [(0, 0.0), (1, 0.0)]
+    assert path.read_bytes().count(b"\n") == 2
+    append_row(other, row_of(seed=1, psnr=7.0))
+    assert [row["metrics"]["psnr"] for row in read_study(path, other)] == [0.0, 7.0]
+    path.write_bytes(b"{}\n" + path.read_bytes())
+    with pytest.raises(ValueError, match=r"a\.jsonl: line 1 must be a row of a study, is not \('scene'\)"):
+        read_study(path)
+
+
+def _append(path, numbers):
+    for number in numbers:
+        append_row(path, row_of(seed=number))
+
+
+def test_many_processes_write_one_file(tmp_path):
+    """No row is lost or doubled, though both write the middle ones."""
+    path = tmp_path / "rows.jsonl"
+    context = multiprocessing.get_context("fork")
+    both = [context.Process(target=_append, args=(path, range(start, start + 40))) for start in (0, 20)]
+    for process in both:
+        process.start()
+    for process in both:
+        process.join()
+    assert sorted(row["seed"] for row in read_study(path)) == list(range(60))
+
+
+def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
+    """Two processes at once: the second goes on with the next cell, and says which it left."""
+    study = small(still)
+    cells = study.cells(units((0,)))
+    folder = tmp_path / study.name / cells[0].name
+    folder.mkdir(parents=True)
+    code = f"import time; from pathlib import Path; from drgs.guards.locks import acquire; " \
+           f"acquire(Path({str(folder)!r}), 'fit'); print('held', flush=True); time.sleep(60)"  # fmt: skip
+    other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    try:
+        other.stdout.readline()
+        with pytest.raises(InUse, match="must not be written by two commands at once"):
+            run_cell(study, cells[0], tmp_path)
+        left = run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None)
+        assert left == ([cells[0]], [])
+    finally:
+        other.kill()
+        other.wait()
+    assert run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None) == ([], [])
+    assert len(faked) == len(cells)
+
+
+# ---- one real cell
+
+
+def test_a_killed_cell_goes_on(still, tmp_path, monkeypatch):
+    """A fit that is killed after a pick is resumed from its checkpoint and ends as one that was not."""
+    study = small(still, deterministic=True)
+    cell = study.cells(units((3,)))[1]
+    whole = run_cell(study, cell, tmp_path / "whole")
+
+    class Killed(BaseException):
+        """Nothing catches it."""
+
+    real, saved = train.save_state, []
+
+    def save(*arguments):
+        real(*arguments)
+        saved.append(1)
+        if len(saved) == 2:
+            raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(train, "save_state", save)
+        with pytest.raises(Killed):
+            run_cell(study, cell, tmp_path / "killed")
+    folder = tmp_path / "killed" / study.name / cell.name
+    assert not (folder / "metrics.json").exists()
+    assert (folder / "state.safetensors").exists()
+    row = run_cell(study, cell, tmp_path / "killed")
+    events = [json.loads(line)["event"] for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert "resume" in events
+    same = ("initial", "picks", "metrics", "gaussians", "pool_leak", "commit")
+    assert {key: row[key] for key in same} == {key: whole[key] for key in same}
+    assert len(row["picks"]) == 2
+    assert row["metrics"]["psnr"] > 5.0
+
+
+# ---- statistics
+
+
+def test_units_are_paired_and_repeats_averaged():
+    """Fits of one unit are averaged before they are subtracted; what has no partner is left out."""
+    rows = [
+        row_of(policy="p", seed=0, psnr=3.0),
+        row_of(policy="p", seed=9, psnr=5.0, initial=["v0"]),
+        row_of(policy="r", seed=0, psnr=1.0),
+        row_of(policy="p", seed=1, psnr=8.0),
+        row_of(policy="r", seed=2, psnr=8.0),
+        row_of(policy="p", seed=3, psnr=2.0, split=(8, 4)),
+        row_of(policy="r", seed=3, psnr=2.5, split=(8, 4)),
+    ]
+    found = differences(rows, "psnr", "p", "r")
+    assert found == {("s", (8, 0), ("v0",)): 3.0, ("s", (8, 4), ("v3",)): -0.5}
+    assert unit_of(row_of(initial=["b", "a"])) == unit_of(row_of(initial=["a", "b"]))
+
+
+@pytest.mark.parametrize("sizes", [(2, 1), (2, 2), (3,)])
+def test_intervals_are_those_of_all_resamples(rng, sizes):
+    """Mean, 95 % interval and standard error against every possible draw of scenes, then units.
+
+    10,000 draws know the mean of the resamples to 1 % of their spread and its square root to 1 %: 5 % is asked for. A
+    quantile of a few dozen values is one of them; it may be the next one where the draws fall on its edge.
+    """
+    values = {(f"s{s}", (8, 0), (str(k),)): float(rng.normal()) for s, n in enumerate(sizes) for k in range(n)}
+    scenes = [[value for unit, value in values.items() if unit[0] == f"s{s}"] for s in range(len(sizes))]
+    means, weights = [], []
+    for drawn in itertools.product(scenes, repeat=len(scenes)):
+        count = np.prod([len(scene) ** len(scene) for scene in drawn])
+        for resampled in itertools.product(*(itertools.product(scene, repeat=len(scene)) for scene in drawn)):
+            means.append(np.mean([np.mean(units) for units in resampled]))
+            weights.append(1 / count)
+    order = np.argsort(means)
+    means, weights = np.array(means)[order], np.array(weights)[order] / np.sum(weights)
+    mean = np.sum(means * weights)
+    spread = np.sqrt(np.sum((means - mean) ** 2 * weights))
+    found = estimate(values)
+    assert found.mean == pytest.approx(np.mean([np.mean(scene) for scene in scenes]))
+    assert mean == pytest.approx(found.mean)
+    assert found.seen == pytest.approx(2.802 * spread, rel=0.05)
+    below = np.cumsum(weights)
+    for quantile, got in ((0.025, found.low), (0.975, found.high)):
+        low, high = (means[np.searchsorted(below, q)] for q in (quantile - 0.006, min(quantile + 0.006, 1 - 1e-9)))
+        assert low - 1e-9 <= got <= high + 1e-9, "within four standard errors of the share below it"
+    assert (found.units, found.scenes) == (sum(sizes), len(sizes))
+    assert found.positive == sum(value > 0 for value in values.values())
+    assert found.positive + found.negative == found.units
+
+
+def told(rows):
+    study = dataclasses.replace(small(Path("x")), policies={"p": {}, "Random, 1": {}})
+    return study_report(study, rows)
+
+
+def test_the_report_says_gain_and_loss(tmp_path):
+    """Larger PSNR is a gain, the same of FLIP a loss; noise is neither; every point is there; few units: no verdict."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for seed in range(8):
+        base = float(rng.normal())
+        rows += [row_of(policy="p", seed=seed, psnr=base + 2 + 0.1 * float(rng.normal()))]
+        rows += [row_of(policy="Random, 1", seed=seed, psnr=base)]
+    text = told(rows)
+    assert "- `p` against `Random, 1`: gains in PSNR and loses in FLIP." in text
+    line = next(line for line in text.splitlines() if line.startswith("| p | +"))
+    assert "**gain**, 8 of 8" in line
+    assert "**loss**, 0 of 8" in line
+    for row in rows:
+        assert f" {row['metrics']['psnr']:.2f} " in text
+    assert "abcdefg" in text
+    for row in rows[::2]:
+        row["metrics"]["psnr"] = row["metrics"]["flip"] = float(rng.normal())
+    assert "- `p` against `Random, 1`: no difference that this study can see." in told(rows)
+    few = told(rows[:6])
+    assert "No verdicts: 3 units" in few
+    assert "**gain**" not in few
+    assert told([]) == "No cell is finished."
+
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- x: begin -->\nold\n<!-- x: end -->\nb\n")
+    fill_between(page, "x", "new")
+    assert page.read_text() == "a\n<!-- x: begin -->\n\nnew\n\n<!-- x: end -->\nb\n"
+    with pytest.raises(ValueError, match="must have <!-- y: begin --> and <!-- y: end -->"):
+        fill_between(page, "y", "new")
