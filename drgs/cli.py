@@ -36,6 +36,7 @@ from drgs.commands.options import (
     Select,
     Sfm,
     Stress,
+    Teach,
     Tradeoff,
 )
 from drgs.display.progress import Bar
@@ -57,6 +58,7 @@ _OPTIONS = {
     "tradeoff": Tradeoff,
     "stress": Stress,
     "sfm": Sfm,
+    "teach": Teach,
     "scene": Scene,
     "demo": Demo,
 }

@@ -40,6 +40,7 @@ __all__ = [
     "Select",
     "Sfm",
     "Stress",
+    "Teach",
     "Tradeoff",
 ]
 
@@ -328,6 +329,24 @@ class Sfm(Common):
     """Match all pairs, or neighbors by name (video); auto decides by their number."""
     seed: int = 0
     """Seed of all random sampling."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Teach(Common, Data):
+    """Add a teacher to a data set: feature maps of its photographs by a local CLIP model, and text embeddings."""
+
+    data: Positional[Path]
+    """A data set; the files are written into its folder, where drgs fit finds them. Nothing there is replaced."""
+    model: Path
+    """Folder of a CLIP model as transformers saves it; needs pip install 'drgs[teacher]'. Nothing is downloaded."""
+    classes: str | None = None
+    """Names with commas between, or a file of them (.txt, .json); default those that the data set names."""
+    size: str | None = None
+    """WIDTHxHEIGHT of a map in cells; default 80 along the longer side, of the photograph's shape."""
+    scales: str = "0.75,1,1.5"
+    """Of the photographs as the model sees them, averaged; 1: the short side is twice the model's image size."""
+    flip: bool = True
+    """Average with the mirrored photographs, too; --no-flip takes half the time."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import typing
 from collections.abc import Sequence
 from typing import Any
 
 from drgs.settings import RenderSettings
 
-__all__ = ["check_color", "parsed"]
+__all__ = ["check_color", "parsed", "parsed_size"]
 
 
 def parsed(texts: Sequence[str]) -> dict[str, Any]:
@@ -35,6 +36,14 @@ def check_color(option: str, color: tuple[float, ...]) -> None:
     if len(color) != 3 or not all(0 <= x <= 1 for x in color):
         got = " ".join(f"{x:g}" for x in color)
         raise ValueError(f"{option} must be R, G and B in [0, 1], got {got}; 255 is 1.0 here")
+
+
+def parsed_size(option: str, text: str) -> tuple[int, int]:
+    """(width, height) of a WIDTHxHEIGHT; ValueError if it is none."""
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
+    if not found:
+        raise ValueError(f"{option}: must be WIDTHxHEIGHT, got {text!r}; say e.g. 320x240")
+    return int(found[1]), int(found[2])
 
 
 def _parse(key: str, hint: Any, text: str) -> Any:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib
 import json
-import re
 from typing import TYPE_CHECKING
 
+from drgs.commands.overrides import parsed_size
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
@@ -46,7 +46,4 @@ def run(args: Scene) -> None:
 
 def _pair(option: str, text: str, *names: str) -> dict[str, int]:
     """Name -> number of a WIDTHxHEIGHT."""
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not found:
-        raise ValueError(f"{option}: must be WIDTHxHEIGHT, got {text!r}; say e.g. 320x240")
-    return {name: int(number) for name, number in zip(names, found.groups(), strict=True)}
+    return dict(zip(names, parsed_size(option, text), strict=True))

@@ -1,0 +1,203 @@
+"""`drgs teach`: what a local CLIP model says about each photograph of a data set, as files that `drgs fit` finds.
+
+Everything is written into the data set's own folder, beside its photographs, where the loader and Feature 3DGS look:
+`rgb_feature_langseg/NAME_fmap_CxHxW.pt` for each photograph, `text_embeddings.npy` and, where the data set names no
+classes yet, `classes.json`. Nothing that is there is replaced but what this command wrote: a teacher's maps or
+embeddings of somebody else are refused. An interrupted command goes on where it stopped; with another model or other
+options all maps of this command are made anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs import data
+from drgs.commands.overrides import parsed_size
+from drgs.data.class_names import CLASS_FILES, read_class_names
+from drgs.data.semantics import TEACHER_FOLDERS
+from drgs.display.progress import Bar
+from drgs.features.encoders import TEMPLATES, ClipEncoder
+from drgs.files import SCHEMA, atomic_write, write_json
+from drgs.guards.json_files import read_json
+from drgs.guards.outputs import Claim, claim
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Teach
+    from drgs.data import View
+
+__all__ = ["run"]
+
+_FOLDER = TEACHER_FOLDERS[0]
+_RECORD, _EMBEDDINGS, _CLASSES = f"{_FOLDER}/teach.json", "text_embeddings.npy", CLASS_FILES[0]
+_LONG = 80  # cells of a map's longer side
+_LARGEST = 4096  # cells of a side
+
+
+def run(args: Teach) -> None:
+    """`drgs teach DATA`."""
+    size = None if args.size is None else parsed_size("--size", args.size)
+    if size is not None and not all(1 <= side <= _LARGEST for side in size):
+        raise ValueError(f"--size must be 1x1 to {_LARGEST}x{_LARGEST} cells, got {args.size}; correct it")
+    scales = _scales(args.scales)
+    if not args.data.exists():
+        raise FileNotFoundError(f"{args.data}: must be a data set, found no such file or folder; check the path")
+    folder = args.data if args.data.is_dir() else args.data.parent
+    output = claim(folder, "teach", inputs=[args.model])
+    output.sweep(_FOLDER)
+    _refuse_others(output)
+    names = _names(args, output)
+    with Bar("loading the model", show=not args.quiet):
+        on_cuda = args.variant != "llvm_ad_rgb" and torch.cuda.is_available()
+        encoder = ClipEncoder(args.model, "cuda" if on_cuda else "cpu")
+        digest = _digest(encoder)
+    dataset = data.load(args.data, points=False, strict=args.strict, semantics=False)
+    files = _files(dataset.views)
+    record = {
+        "schema": SCHEMA,
+        "command": "teach",
+        "method": "MaskCLIP: CLIP with the value path of its last attention alone",
+        "model": {"folder": str(args.model), "weights": encoder.weights.name, "sha256": digest},
+        "channels": encoder.channels,
+        "size": size or f"longer side {_LONG}",
+        "scales": scales,
+        "flip": args.flip,
+        "classes": names,
+        "templates": TEMPLATES,
+    }
+    texts = encoder.texts(names) if names else None  # before anything is written: there may be no tokenizer
+    _start(output, record)
+    if texts is not None:
+        _write_texts(output, texts, names)
+    with Bar("maps that are there", show=not args.quiet):  # each of them is hashed
+        left = [(name, view) for name, view in files.items() if not output.is_made(output.path / name)]
+    with Bar("teach", len(files), not args.quiet, done=len(files) - len(left)) as bar:
+        for name, view in left:
+            made = encoder.dense(_photograph(view), size or _size(view), scales, args.flip)
+            with atomic_write(output.path / name) as file:
+                torch.save(made.half(), file)
+            bar.advance()
+    if not args.quiet:
+        print(_summary(folder, len(files), len(left), encoder.channels, names))
+        print(f"next: drgs fit {args.data} -o RUN")
+
+
+def _scales(text: str) -> list[float]:
+    """The numbers of --scales."""
+    try:
+        scales = [float(part) for part in text.split(",")]
+    except ValueError:
+        scales = []
+    if not scales or not all(0.1 <= scale <= 8 for scale in scales):
+        raise ValueError(f"--scales must be numbers from 0.1 to 8 with commas between, got {text!r}; correct it")
+    return scales
+
+
+def _refuse_others(output: Claim) -> None:
+    """Raise ValueError where a teacher's files are there that this command did not write."""
+    folder = output.path / _FOLDER
+    if not folder.is_dir() or folder.is_symlink():
+        output.check([_FOLDER])
+    paths = [*sorted(folder.rglob("*")), output.path / _EMBEDDINGS]
+    other = next((path for path in paths if path.is_file() and not output.is_made(path, ("teach",))), None)
+    if other is not None:
+        raise ValueError(
+            f"{other}: must not be replaced, `drgs teach` did not make it; the data set has a teacher, move its files "
+            "away"
+        )
+
+
+def _names(args: Teach, output: Claim) -> list[str]:
+    """The classes that texts are made of: those of --classes, else those that the data set names, if any."""
+    held = next((output.path / name for name in CLASS_FILES if (output.path / name).is_file()), None)
+    if held is not None and output.is_made(held, ("teach",)):
+        held = None if args.classes is not None else held
+    known = [] if held is None else list(read_class_names(held)[0].values())
+    if args.classes is None:
+        return known
+    path = Path(args.classes)
+    if path.is_file() or path.suffix in (".txt", ".json"):
+        names = list(read_class_names(path)[0].values())
+    else:
+        names = [name.strip() for name in args.classes.split(",") if name.strip()]
+    if not names:
+        raise ValueError(f"--classes must name a class or more, got {args.classes!r}; say e.g. chair,table,lamp")
+    if held is not None and names != known:
+        raise ValueError(f"--classes must be the {len(known)} classes of {held} in its order, are not; leave it out")
+    return names
+
+
+def _digest(encoder: ClipEncoder) -> str:
+    """SHA-256 of the model's configuration and weights."""
+    total = hashlib.sha256()
+    for path in (encoder.folder / "config.json", encoder.weights):
+        with path.open("rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    return total.hexdigest()
+
+
+def _files(views: list[View]) -> dict[str, View]:
+    """The file of each view's map, below the data set's folder, as the loader matches them."""
+    files: dict[str, View] = {}
+    for view in views:
+        if view.image_path is None:
+            continue
+        below = PurePosixPath(_FOLDER) / PurePosixPath(view.name).parent
+        name = str(below / f"{view.image_path.stem}_fmap_CxHxW.pt")
+        if name in files:
+            raise ValueError(
+                f"{view.image_path}: must have a name of its own, {files[name].image_path} has the same but for its "
+                "ending; put them into subfolders"
+            )
+        files[name] = view
+    if not files:
+        raise ValueError("teach: the data set must have photographs, has none; name another")
+    return files
+
+
+def _start(output: Claim, record: dict) -> None:
+    """Write what is about to be made; what was made otherwise before is deleted first."""
+    path = output.path / _RECORD
+    held = read_json(path) if path.is_file() else {}
+    wanted = json.loads(json.dumps(record))
+    maps = {key: value for key, value in wanted.items() if key not in ("classes", "templates")}
+    if any(held.get(key) != value for key, value in maps.items()):
+        if (output.path / _FOLDER).is_dir():
+            output.remove(output.path / _FOLDER)
+        output.remove(output.path / _EMBEDDINGS)
+    if held != wanted:
+        write_json(path, record)
+
+
+def _write_texts(output: Claim, texts: torch.Tensor, names: list[str]) -> None:
+    """text_embeddings.npy, and classes.json where there is no file of classes but ours."""
+    held = next((output.path / name for name in CLASS_FILES if (output.path / name).is_file()), None)
+    if held is None or output.is_made(held, ("teach",)):
+        classes = [{"id": number, "name": name} for number, name in enumerate(names, 1)]
+        write_json(output.path / _CLASSES, {"schema": SCHEMA, "command": "teach", "unlabelled": 0, "classes": classes})
+    with atomic_write(output.path / _EMBEDDINGS) as file:
+        np.save(file, texts.numpy())
+
+
+def _photograph(view: View) -> np.ndarray:
+    """The photograph as it lies on disk, (H, W, 3) in [0, 1]: the loader straightens maps as it does photographs."""
+    return dataclasses.replace(view, camera=view.camera.undistorted()).image()
+
+
+def _size(view: View) -> tuple[int, int]:
+    """(w, h) of a view's map: its photograph's shape."""
+    width, height = view.camera.width, view.camera.height
+    factor = _LONG / max(width, height)
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def _summary(folder: Path, count: int, made: int, channels: int, names: list[str]) -> str:
+    before = f", {count - made} of them made before" if made < count else ""
+    texts = f"; text embeddings of {len(names)} classes" if names else "; no classes: name some with --classes"
+    return f"maps of {count} photographs, {channels} channels{before}: {folder / _FOLDER}{texts}"
