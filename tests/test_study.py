@@ -36,7 +36,7 @@ def small(folder: Path, **fields) -> Study:
     config = {"max_steps": 10, "max_gaussians": 60, "sh_degree": 1, "save_every": 3, **fields}
     return Study(
         name="tiny",
-        folder=lambda scene: folder,
+        folder=lambda scene, split: folder,
         policies={"farthest": {"policy": "farthest"}, "Random, 1": {"policy": "random"}},
         fit=FitConfig(**config),
         active=ActiveConfig(initial=2, add=2, every=3),
@@ -135,7 +135,7 @@ def test_a_folder_of_another_fit_is_refused(still, faked, tmp_path):
 
 
 def test_a_stated_split_is_refused(still, tmp_path):
-    """Files that say what is held out would win over the cell's split."""
+    """Files that say what is held out win over the cell's split: taken if they say the same."""
     study = small(still)
     data = json.loads((still / "transforms.json").read_text())
     data["test_filenames"] = [data["frames"][0]["file_path"]]
@@ -145,8 +145,11 @@ def test_a_stated_split_is_refused(still, tmp_path):
     for name in ("images", "masks", "depth"):
         (folder / name).symlink_to(still / name)
     (folder / "transforms.json").write_text(json.dumps(data))
-    with pytest.raises(ValueError, match="a study must hold out views itself, the files state a split"):
-        run_cell(dataclasses.replace(study, folder=lambda scene: folder), study.cells(units())[0], tmp_path)
+    stated = dataclasses.replace(study, folder=lambda scene, split: folder)
+    with pytest.raises(ValueError, match="must hold out every 4th view from index 1 on, as the cell does, its files"):
+        run_cell(stated, study.cells(units())[0], tmp_path)
+    same = Cell("still", (9, 0), "seed", "farthest", "blind", 0)
+    assert [view.name for view in stated.dataset(same).split()[1]] == ["0"]
 
 
 def test_seeds_are_of_different_initial_views(still):

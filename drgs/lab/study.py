@@ -106,7 +106,7 @@ class Study:
 
     Attributes:
         name: Of the study and its scale; in every row, and the folder of its runs.
-        folder: Scene -> folder of the data set, made where it is not there yet.
+        folder: Scene and split -> folder of the data set, made where it is not there yet.
         policies: Label -> fields of `ActiveConfig`.
         fit: What every fit does; seed, split and initial points are the cell's.
         active: How views are chosen; start and policy are the cell's.
@@ -116,7 +116,7 @@ class Study:
     """
 
     name: str
-    folder: Callable[[str], Path]
+    folder: Callable[[str, tuple[int, int]], Path]
     policies: Mapping[str, Mapping[str, Any]]
     fit: FitConfig
     active: ActiveConfig
@@ -146,19 +146,25 @@ class Study:
         """The views of a cell, none of them opened.
 
         Raises:
-            ValueError: If the data set has a split of its own: the cell's would not be used.
+            ValueError: If the data set states another split than the cell's: it would win.
         """
         every, offset = cell.split
         dataset = data.load(
-            self.folder(cell.scene),
+            self.folder(cell.scene, cell.split),
             test_every=every,
             test_offset=offset,
             background=self.fit.settings.background,
             lazy=True,
             points=cell.protocol == "paper",
         )
-        if any(view.split for view in dataset.views):
-            raise ValueError(f"{dataset.path}: a study must hold out views itself, the files state a split; remove it")
+        names = sorted(view.name for view in (*dataset.views, *dataset.absent))
+        held_out = {view.name for view in dataset.split()[1]}
+        there = {view.name for view in dataset.views}
+        if held_out != there & set(names[offset::every]):
+            raise ValueError(
+                f"{dataset.path}: must hold out every {every}th view from index {offset} on, as the cell does, its "
+                "files state other test views; remove what they state"
+            )
         return dataset
 
 

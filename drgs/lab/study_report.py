@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.files import atomic_write
 from drgs.lab.study import Metric, Study
-from drgs.lab.study_statistics import Estimate, Unit, differences, estimate, unit_of, values_of
+from drgs.lab.study_statistics import Effect, Unit, differences, estimate, unit_of, values_of
 
 __all__ = ["fill_between", "study_report"]
 
@@ -162,13 +162,13 @@ def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], n
     return _table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
 
 
-def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Estimate | None]:
+def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Effect | None]:
     """Metric -> what the pair's differences say; None where they have no unit in common."""
     found = {metric.key: differences(rows, metric.key, policy, reference) for metric in study.metrics}
     return {key: estimate(values) if values else None for key, values in found.items()}
 
 
-def _difference(metric: Metric, found: Estimate) -> str:
+def _difference(metric: Metric, found: Effect) -> str:
     """Mean, interval, verdict, and in how many units it is better."""
     numbers = f"{found.mean:+.{metric.digits}f} [{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
     better = found.positive if metric.larger else found.negative
@@ -176,7 +176,7 @@ def _difference(metric: Metric, found: Estimate) -> str:
     return f"{numbers}{f' **{word}**' if word else ''}, {better} of {found.units}"
 
 
-def _verdict(metric: Metric, found: Estimate) -> str:
+def _verdict(metric: Metric, found: Effect) -> str:
     """`gain`, `loss`, or nothing where the interval holds 0 or is of too few units."""
     if found.units < _FEWEST or found.low <= 0 <= found.high:
         return ""

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Estimate", "differences", "estimate", "unit_of", "values_of"]
+__all__ = ["Effect", "differences", "estimate", "unit_of", "values_of"]
 
 Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 
@@ -28,7 +28,7 @@ _SEEN = 1.960 + 0.842  # standard errors that 80 % of studies would tell from 0 
 
 
 @dataclasses.dataclass(frozen=True)
-class Estimate:
+class Effect:
     """A mean difference.
 
     Attributes:
@@ -71,7 +71,7 @@ def differences(rows: Sequence[Mapping[str, Any]], metric: str, policy: str, ref
     return {unit: value - theirs[unit] for unit, value in ours.items() if unit in theirs}
 
 
-def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Estimate:
+def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Effect:
     """Mean over scenes of the means over their units, and how certain it is.
 
     Args:
@@ -89,7 +89,7 @@ def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Estimate:
     drawn = rng.integers(count, size=(draws, count))
     resampled = np.take_along_axis(means, drawn[None], axis=0)[0].mean(1)
     low, high = np.quantile(resampled, _QUANTILES)
-    return Estimate(
+    return Effect(
         mean=float(np.mean([np.mean(x) for x in scenes.values()])),
         low=float(low),
         high=float(high),
