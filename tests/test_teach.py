@@ -18,7 +18,7 @@ transformers = pytest.importorskip("transformers", reason="needs the extra teach
 from drgs import data  # noqa: E402 (after the reason to skip)
 from drgs.cli import main  # noqa: E402
 from drgs.commands import options  # noqa: E402
-from drgs.features.encoders import NORM, SCALES, TEMPLATES, ClipEncoder  # noqa: E402
+from drgs.features.encoders import MAP_NORM, SCALES, TEMPLATES, ClipEncoder  # noqa: E402
 
 CHANNELS, PATCH = 12, 8
 
@@ -103,8 +103,8 @@ def test_maps_average_scales_and_mirrors(model):
     plain = encoder.dense(image, (6, 4), [1.0], flip=False)
     normalized = (torch.from_numpy(image) - torch.from_numpy(encoder._mean)) / torch.from_numpy(encoder._std)
     patches = encoder.patches(normalized.permute(2, 0, 1)[None])
-    torch.testing.assert_close(plain, NORM * torch.nn.functional.normalize(patches, dim=0), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(plain.norm(dim=0), torch.full((4, 6), NORM), rtol=1e-5, atol=0)
+    torch.testing.assert_close(plain, MAP_NORM * torch.nn.functional.normalize(patches, dim=0), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(plain.norm(dim=0), torch.full((4, 6), MAP_NORM), rtol=1e-5, atol=0)
     both = encoder.dense(image, (6, 4), [1.0])
     torch.testing.assert_close(encoder.dense(image[:, ::-1], (6, 4), [1.0]), both.flip(2), rtol=1e-4, atol=1e-4)
     assert float((both - plain).abs().max()) > 0.01

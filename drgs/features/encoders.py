@@ -29,11 +29,11 @@ import torch
 
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["NORM", "SCALES", "TEMPLATES", "ClipEncoder"]
+__all__ = ["MAP_NORM", "SCALES", "TEMPLATES", "ClipEncoder"]
 
 SCALES = (0.75, 1.0, 1.5)
 TEMPLATES = ("a photo of a {}.", "a photo of the {}.", "a {} in a scene.", "{}")
-NORM = 4.0
+MAP_NORM = 4.0
 _SHORT = 2  # short side of the photograph at scale 1, in image sizes of the model
 _LONGEST = 4096  # pixels that the transformer may see along a side: its attention grows with their fourth power
 _MEAN, _STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # CLIP's own
@@ -127,7 +127,7 @@ class ClipEncoder:
                 found = torch.stack([_unit(found), _unit(mirrored)]).mean(0)
             resized = torch.nn.functional.interpolate(_unit(found)[None], (height, width), mode="bilinear")[0]
             total += resized.cpu()
-        return NORM / len(scales) * total
+        return MAP_NORM / len(scales) * total
 
     @torch.no_grad()  # a teacher is not trained
     def patches(self, pixels: torch.Tensor) -> torch.Tensor:
