@@ -22,7 +22,16 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = ["Y_00", "DeformableScene", "Gaussians", "Scene", "ellipsoids_shape", "semi_axes", "sh_degree_of"]
+__all__ = [
+    "Y_00",
+    "DeformableScene",
+    "Gaussians",
+    "Scene",
+    "colors_only",
+    "ellipsoids_shape",
+    "semi_axes",
+    "sh_degree_of",
+]
 
 Y_00 = 0.28209479177387814  # the spherical harmonic of degree 0, sqrt(1 / (4 pi))
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
@@ -244,6 +253,12 @@ class Gaussians:
                 raise ValueError(
                     f"{where}: quats must not be 0, got {self.quats[i].tolist()} at index {i}; use (1, 0, 0, 0)"
                 )
+
+
+def colors_only(scene: Scene, time: float | None) -> Scene:
+    """What is seen of a scene at a time without its features, which then cost nothing: itself if it has none."""
+    seen = scene.at(time) if isinstance(scene, Scene) else scene  # `render` says what is wrong with anything else
+    return scene if getattr(seen, "features", None) is None else seen.replace(features=None)
 
 
 def _tensor(name: str, x: ArrayLike) -> torch.Tensor:

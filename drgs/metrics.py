@@ -14,6 +14,7 @@ import torch
 
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, write_json
 from drgs.fitting.losses import psnr_of
 from drgs.integrator import render
@@ -23,10 +24,12 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.files import Run
     from drgs.fitting.frames import Frame
+    from drgs.fitting.segments import Segmentation
 
 __all__ = [
     "METRICS",
     "DEFINITIONS",
+    "VIEW_PICTURES",
     "Lpips",
     "evaluate",
     "flip",
@@ -44,6 +47,8 @@ DEFINITIONS = {
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
 }
 METRICS = tuple(DEFINITIONS)
+VIEW_PICTURES = ("png", "semantics.png")
+"""Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
 _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
@@ -158,6 +163,7 @@ def evaluate(
     *,
     lpips: Lpips | None = None,
     pictures: Path | None = None,
+    segmentation: Segmentation | str | None = None,
 ) -> dict:
     """All metrics of the given views.
 
@@ -166,24 +172,41 @@ def evaluate(
         frames: Photographs to compare with; may be empty.
         settings: As in `drgs.render`. Pixels outside a mask are black in both images.
         lpips: None reports LPIPS as None with a reason.
-        pictures: Folder for one PNG a view: photograph, render, and error times 4, side by side.
+        pictures: Folder for one PNG a view: photograph, render, and error times 4, side by side; and, with a
+            segmentation, NAME.semantics.png: labels, reference, features, and labels over the photograph.
+        segmentation: As `drgs.fitting.segments.segmentation_of` makes it; in words: why there is none.
     Returns:
-        JSON-serializable: `views` (a list of name, size and metrics), `mean`, `variants`, `reasons` of what is None.
+        JSON-serializable: `views` (a list of name, size and metrics), `mean`, `variants`, `reasons` of what is None; of
+        a run with features `segmentation` (`Segmentation.result`), whose views have `pixel_accuracy` and `miou`, too.
     """
     with Bar("measuring views", len(frames)) as bar:
-        return _evaluated(g, frames, settings, lpips, pictures, bar)
+        result = _evaluated(g, frames, settings, lpips, pictures, segmentation, bar)
+    if isinstance(segmentation, str):
+        result["segmentation"], result["reasons"]["segmentation"] = None, segmentation
+    elif segmentation is not None:
+        result["segmentation"] = segmentation.result()
+    return result
 
 
 def _evaluated(
-    g: Scene, frames: list[Frame], settings: RenderSettings, lpips: Lpips | None, pictures: Path | None, bar: Bar
+    g: Scene,
+    frames: list[Frame],
+    settings: RenderSettings,
+    lpips: Lpips | None,
+    pictures: Path | None,
+    segmentation: Segmentation | str | None,
+    bar: Bar,
 ) -> dict:
     """`evaluate`, under a bar that it has begun."""
     views, reasons = [], {}
     if lpips is None:
         reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
+    measured = None if isinstance(segmentation, str) else segmentation
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
+        seen = g if measured else colors_only(g, frame.camera.time)
         with torch.no_grad():  # pictures of whatever an optimizer may hold
-            image = render(g, frame.camera, settings).rgb.cpu().clamp(0, 1)
+            out = render(seen, frame.camera, settings)
+        image = out.rgb.cpu().clamp(0, 1)
         target = frame.target()
         shown = image if frame.mask is None else image * frame.mask[..., None]
         height, width = target.shape[:2]
@@ -199,6 +222,10 @@ def _evaluated(
             row["lpips"] = lpips(shown, target)
         elif lpips is not None:
             reasons["lpips"] = f"view {frame.name} is smaller than {_LPIPS_MIN_SIDE} pixels"
+        if measured and out.features is not None:
+            row |= measured.add(frame, out.features)
+            if pictures is not None:
+                measured.write(pictures / f"{file_name}.semantics.png", frame, out.features)
         views.append(row)
         if pictures is not None:
             error = (4 * (shown - target).abs()).clamp(0, 1)
@@ -242,7 +269,8 @@ def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, spl
             found = []
             for frame in frames:
                 with torch.no_grad():  # as above
-                    image = render(g, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1)
+                    seen = colors_only(g, frame.camera.time)
+                    image = render(seen, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1)
                 found.append(psnr(image, frame.image(), frame.mask))
                 bar.advance()
             values[name] = float(np.mean(found))

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from drgs import metrics, runtime
 from drgs.data.views import check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
 from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig, FitConfig
@@ -158,7 +159,7 @@ def _fit(
             "pool": [view.name for view in train],
             "pool_leak": plan.pool_leak,
         }
-    _check_pictures(out_dir, config.max_steps, held_out)
+    _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught and dataset.semantics:
         taught.write_embeddings(run.path, dataset.semantics.classes)
@@ -169,7 +170,10 @@ def _fit(
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
-    result = metrics.evaluate(scene, held_out, config.settings, pictures=run.renders / "test")
+    segmentation = _segmentation(trainer, taught, run, held_out)
+    result = metrics.evaluate(
+        scene, held_out, config.settings, pictures=run.renders / "test", segmentation=segmentation
+    )
     written = metrics.write_metrics(
         run,
         "test",
@@ -221,11 +225,22 @@ def _start(
     return Trainer(config, frames, model, extent, parts or parts_of(config, extent, channels)), source
 
 
-def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame]) -> None:
+def _segmentation(trainer: Trainer, taught: SemanticRecord | None, run: Run, frames: list[Frame]) -> Any:
+    """What `metrics.evaluate` takes to measure the labels of a fit; None without features."""
+    if taught is None:
+        return None
+    from drgs.fitting.segments import segmentation_of
+
+    decoder: Any = next(network.module for network in trainer.parts.networks if network.name == "decoder")
+    return segmentation_of(trainer.gaussians(), decoder, taught.read_classes(run.path), taught, frames)
+
+
+def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame], semantics: bool) -> None:
     """Refuse, before the first step, a folder where pictures that drgs did not draw are in the way."""
     every = _preview_every(max_steps)
     names = [_preview_name(step) for step in range(every, max_steps + 1, every)]
-    names += [f"test/{name}.png" for name in file_names([frame.name for frame in held_out])]
+    kinds = metrics.VIEW_PICTURES if semantics else metrics.VIEW_PICTURES[:1]
+    names += [f"test/{name}.{kind}" for name in file_names([frame.name for frame in held_out]) for kind in kinds]
     with claim(out_dir, "fit", [f"renders/{name}" for name in names]):
         pass
 
@@ -353,7 +368,8 @@ class _Loop:
             if is_interrupted():
                 return
             with torch.no_grad():  # a picture
-                image = render(trainer.scene(), frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
+                seen = colors_only(trainer.scene(), frame.camera.time)
+                image = render(seen, frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
             values.append(metrics.psnr(image, frame.image(), frame.mask))
             if i == 0:
                 pair = torch.cat([frame.image(), image], dim=1)

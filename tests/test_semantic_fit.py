@@ -1,6 +1,7 @@
 """Features and a decoder that are fitted to a teacher's maps beside the colors, and the run folder that keeps them."""
 
 import dataclasses
+import json
 import sys
 
 import numpy as np
@@ -9,6 +10,10 @@ import torch
 from test_train import FAST, SIZE, config, dataset, masked, scene  # noqa: F401 (a fixture)
 
 import drgs
+from drgs import metrics
+from drgs.commands.eval import run as run_eval
+from drgs.commands.options import Eval
+from drgs.data.checks import read_image
 from drgs.data.semantics import Semantics
 from drgs.display.pictures import write_png
 from drgs.features.segmentation import Classes, classify
@@ -20,6 +25,8 @@ from drgs.fitting.frames import load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import load_run
 from drgs.fitting.rows import GaussianRows
+from drgs.fitting.segments import segmentation_of
+from drgs.fitting.semantic_record import SemanticRecord
 from drgs.fitting.threads import one_thread
 from drgs.fitting.trainer import Trainer
 from drgs.train import fit
@@ -273,7 +280,6 @@ def test_another_teacher_is_not_resumed(run, taught, change, message):
 
 def test_a_damaged_record_is_refused(run, tmp_path):
     """Embeddings of other classes, missing ones, and a decoder that does not go with config.json: one line each."""
-    import json
     import shutil
 
     def copied(change):
@@ -326,3 +332,66 @@ def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkey
     assert len(plan.views) == 9
     assert opened == set(done.metrics["fitted"])
     assert load_run(done.run).decoder is not None
+
+
+def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, capsys):
+    """metrics.json names the reference and has the run's figures beside the teacher's own; `drgs eval` repeats them,
+    prints them, and puts labels, reference, features and an overlay beside the picture of the colors.
+    """
+    found = run.metrics["segmentation"]
+    assert (found["reference"], found["folder"]) == ("labels", "semantic_class")
+    assert found["classes"] == ["ground", "middle", "sky"]
+    assert (found["run"]["images"], len(found["run"]["iou"])) == (2, CLASSES)
+    assert found["teacher"]["pixel_accuracy"] > 0.9  # a perfect teacher, but for edges that 16x16 cells blur
+    assert found["run"]["pixel_accuracy"] < found["teacher"]["pixel_accuracy"]  # after 6 steps
+    assert all(0 <= view["pixel_accuracy"] <= 1 for view in run.metrics["views"])
+    monkeypatch.setattr("drgs.data.load", lambda path, **_: taught)
+    capsys.readouterr()
+    run_eval(Eval(run=run.run.path))
+    again = json.loads((run.run.path / "metrics.json").read_text())["segmentation"]
+    assert again["run"]["pixel_accuracy"] == pytest.approx(found["run"]["pixel_accuracy"], abs=1e-2)
+    said = capsys.readouterr().out
+    assert "Segmentation of 2 test views, reference: the data set's labels (semantic_class)" in said
+    assert f"{again['teacher']['miou']:.4f}" in said
+    height, width, _ = read_image(run.run.renders / "test" / "8.semantics.png").shape
+    assert height >= SIZE
+    assert width > 4 * SIZE
+
+
+def test_without_labels_the_teacher_is_the_reference(taught):
+    """Then the output says `teacher`, and has no second row of its own figures, which would be 1."""
+    trainer = semantic_trainer(taught)
+    g, decoder = trainer.gaussians(), decoder_of(trainer)
+    classes, known = Classes(("a", "b", "c"), embeddings()), SemanticRecord.of(taught, trainer.config, taught.views)
+    frames = [dataclasses.replace(frame, labels=None) for frame in load_frames(taught.split()[1], 10**6)]
+    segmentation = segmentation_of(g, decoder, classes, known, frames)
+    result = metrics.evaluate(g, frames, FAST, segmentation=segmentation)["segmentation"]
+    assert (result["reference"], result["folder"]) == ("teacher", "rgb_feature_langseg")
+    assert (result["teacher"], result["run"]["images"]) == (None, 2)
+    names = Classes(("a", "b", "c"))
+    told = metrics.evaluate(g, frames, FAST, segmentation=segmentation_of(g, decoder, names, known, frames))
+    assert told["segmentation"] is None
+    assert "text_embeddings.npy" in told["reasons"]["segmentation"]
+    assert "segmentation" not in metrics.evaluate(g.replace(features=None), frames, FAST)
+
+
+def test_a_reference_is_nothing_outside_a_mask(taught):
+    """Pixels that a mask leaves out count for no label."""
+    trainer = semantic_trainer(taught)
+    (frame, *_) = load_frames(taught.split()[1], 10**6)
+    left = torch.zeros(SIZE, SIZE)
+    left[:, : SIZE // 2] = 1
+    g, known = trainer.gaussians(), SemanticRecord.of(taught, trainer.config, taught.views)
+    frames = [dataclasses.replace(frame, mask=left)]
+    segmentation = segmentation_of(g, decoder_of(trainer), Classes(("a", "b", "c"), embeddings()), known, frames)
+    result = metrics.evaluate(g, frames, FAST, segmentation=segmentation)["segmentation"]
+    assert result["run"]["pixels"] == int((frame.labels()[:, : SIZE // 2] > 0).sum())
+
+
+def test_other_classes_are_not_measured(run, taught, monkeypatch):
+    """A data set whose numbers mean other classes than when the run was fitted is refused in one line."""
+    (run.run.path.parent / "other.txt").write_text("a\nb\nc\n")
+    other = dataclasses.replace(taught.semantics, class_file=run.run.path.parent / "other.txt")
+    monkeypatch.setattr("drgs.data.load", lambda path, **_: dataclasses.replace(taught, semantics=other))
+    with pytest.raises(ValueError, match="must have the classes that the run was fitted with"):
+        run_eval(Eval(run=run.run.path))

@@ -11,10 +11,13 @@ from drgs.files import Run
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.resume import claim_run
-from drgs.metrics import METRICS, Lpips, evaluate, through_viewers, write_metrics
+from drgs.metrics import METRICS, VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
 
 if TYPE_CHECKING:
     from drgs.commands.options import Eval
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.records import LoadedRun
+    from drgs.fitting.segments import Segmentation
 
 __all__ = ["print_table", "run", "viewers_line"]
 
@@ -26,7 +29,8 @@ def run(args: Eval) -> None:
     run = Run(args.run)
     recorded = fit_record(run)
     output = claim_run(run, "eval")
-    g = load_run(run).gaussians
+    loaded = load_run(run)
+    g = loaded.gaussians
     config = recorded.config
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
     # Of an active run, images may be missing that were never picked.
@@ -38,6 +42,7 @@ def run(args: Eval) -> None:
         lazy=recorded.is_active,
         points=False,
         strict=args.strict,
+        semantics=recorded.semantics is not None,
     )
     train, test = dataset.split()
     if recorded.is_active:  # the rest of the training split was never seen
@@ -48,8 +53,12 @@ def run(args: Eval) -> None:
         raise ValueError(f"eval: split {args.split} must hold a view, holds none ({dataset.split_rule()}); use --split")
     frames = load_frames(views, config.max_pixels, config.mask)
     names = file_names([frame.name for frame in frames])
-    output.check(f"renders/{args.split}/{name}.png" for name in names)
-    result = evaluate(g, frames, config.settings, lpips=lpips, pictures=run.renders / args.split)
+    kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
+    output.check(f"renders/{args.split}/{name}.{kind}" for name in names for kind in kinds)
+    segmentation = _segmentation(loaded, dataset, frames)
+    result = evaluate(
+        g, frames, config.settings, lpips=lpips, pictures=run.renders / args.split, segmentation=segmentation
+    )
     viewers = through_viewers(g, frames, config.settings, args.split)
     written = write_metrics(
         run, args.split, frames, result, split_rule=dataset.split_rule(), gaussians=len(g), viewers=viewers
@@ -58,8 +67,28 @@ def run(args: Eval) -> None:
         print_table(written)
 
 
+def _segmentation(loaded: LoadedRun, dataset: data.Dataset, frames: list[Frame]) -> Segmentation | str | None:
+    """What of the run's labels is measured.
+
+    Raises:
+        ValueError: If numbers in the data set's labels mean other classes than they did when the run was fitted.
+    """
+    record, known = loaded.record.semantics, dataset.semantics
+    if record is None:
+        return None
+    from drgs.fitting.segments import segmentation_of
+
+    now = known.classes if known is not None and (known.class_file or known.embedding_file) else None
+    if now is not None and record.classes is not None and now.names != record.classes:
+        raise ValueError(
+            f"{dataset.path}: must have the classes that the run was fitted with ({', '.join(record.classes[:5])}, "
+            f"...), has {', '.join(now.names[:5])}, ...; restore its class names"
+        )
+    return segmentation_of(loaded.gaussians, loaded.decoder, loaded.classes, record, frames)
+
+
 def print_table(metrics: dict) -> None:
-    """The metrics of `write_metrics` as a table on stdout, reasons of missing ones below, and what viewers show."""
+    """The metrics of `write_metrics` as tables on stdout, reasons of missing ones below, and what viewers show."""
     digits = {"psnr": ".2f"}
     names = [name for name in METRICS if metrics["mean"][name] is not None]
     rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
@@ -68,10 +97,31 @@ def print_table(metrics: dict) -> None:
         ("view", *names),
         [(row["name"], *(f"{row[name]:{digits.get(name, '.4f')}}" for name in names)) for row in rows],
     )
+    if found := metrics.get("segmentation"):
+        _print_segmentation(metrics, found)
     for name, reason in metrics["reasons"].items():
         print(f"{name}: none ({reason})")
     if metrics["viewers"]:
         print(viewers_line(metrics["viewers"]))
+
+
+def _print_segmentation(metrics: dict, found: dict) -> None:
+    """How well labels agree with their reference; the teacher's own beside it where that is the data set's."""
+    names = {"labels": "the data set's labels", "teacher": "the teacher's labels, not the truth"}
+    shown = {
+        "pixel_accuracy": "pixel\naccuracy",
+        "class_accuracy": "class\naccuracy",
+        "miou": "mIoU",
+        "miou_top7": "top-7\nmIoU",
+    }
+    rows = [(name, found[name]) for name in ("run", "teacher") if found[name] is not None]
+    if rows:
+        tables.show(
+            f"Segmentation of {metrics['count']} {metrics['split']} views, reference: {names[found['reference']]} "
+            f"({found['folder']})",
+            ("", *shown.values()),
+            [(name, *(f"{values[key]:.4f}" for key in shown)) for name, values in rows],
+        )
 
 
 def viewers_line(viewers: dict) -> str:

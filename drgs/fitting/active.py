@@ -22,6 +22,7 @@ import torch
 from drgs.data.guided import Matches
 from drgs.data.sizes import at_most, resized_alike
 from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.frames import Frame, load_frames
 
@@ -112,7 +113,8 @@ class ActiveViews:
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
         with torch.no_grad():  # the Gaussians are fitted elsewhere
-            alpha = render(scene, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
+            plain = colors_only(scene, frame.camera.time)
+            alpha = render(plain, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
         is_open = alpha < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED

@@ -1,0 +1,169 @@
+"""What a run says of each pixel of a view, against labels: those of the data set, else those that its teacher gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from drgs.display.pictures import to_bytes, write_png
+from drgs.features.pictures import FeatureColors, label_picture, overlay, with_legend
+from drgs.features.segmentation import SCORE_DEFINITIONS, classify, scores
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+    from drgs.features.decoder import Decoder
+    from drgs.features.segmentation import Classes
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.semantic_record import SemanticRecord
+
+__all__ = ["Segmentation", "feature_colors", "segmentation_of", "teacher_labels"]
+
+_KEPT = 0.5  # of a mask, from which on a pixel counts
+_SAMPLES = 20_000  # Gaussians that the colors of features are made from
+
+
+class Segmentation:
+    """The labels of a run's views and of their reference, one view after the other.
+
+    Attributes:
+        reference: `labels` of the data set, or `teacher`.
+        folder: Where that lies in the data set.
+    """
+
+    def __init__(self, gaussians: Gaussians, decoder: Decoder, classes: Classes, reference: str, folder: str) -> None:
+        self.reference, self.folder = reference, folder
+        self._gaussians, self._decoder, self._classes = gaussians, decoder, classes
+        self._colors: FeatureColors | None = None
+        self._run: list[tuple[np.ndarray, np.ndarray]] = []
+        self._teacher: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def add(self, frame: Frame, features: torch.Tensor) -> dict[str, float | None]:
+        """Take a view.
+
+        Args:
+            frame: The photograph, with labels or a teacher's map; where it has no reference, it does not count.
+            features: (H, W, D), rendered.
+        Returns:
+            Of this view alone, as `SCORE_DEFINITIONS` says: `pixel_accuracy` and `miou`, None without reference.
+        """
+        found = self.labels(features)
+        reference = self._reference(frame)
+        if reference is None or not reference.any():
+            return {"pixel_accuracy": None, "miou": None}
+        pair = found.astype(np.int16), reference.astype(np.int16)
+        self._run.append(pair)
+        if self.reference == "labels" and frame.teacher is not None:
+            self._teacher.append((self._of_teacher(frame).astype(np.int16), pair[1]))
+        one = scores([pair], len(self._classes))
+        return {name: one[name] for name in ("pixel_accuracy", "miou")}
+
+    def labels(self, features: torch.Tensor) -> np.ndarray:
+        """(H, W) int64 labels of rendered features (H, W, D)."""
+        return classify(features, self._classes, self._decoder).numpy()
+
+    def result(self) -> dict[str, Any]:
+        """All views together.
+
+        Returns:
+            JSON-serializable: `reference`, `folder`, `classes` (names), `run` and, on the same views where all have
+            maps, `teacher` (`drgs.features.segmentation.scores`; None where there is nothing to compare), `variants`.
+        """
+        count = len(self._classes)
+        whole = len(self._teacher) == len(self._run) > 0
+        return {
+            "reference": self.reference,
+            "folder": self.folder,
+            "classes": list(self._classes.names),
+            "run": scores(self._run, count) if self._run else None,
+            "teacher": scores(self._teacher, count) if whole else None,
+            "variants": dict(SCORE_DEFINITIONS),
+        }
+
+    def write(self, path: Path, frame: Frame, features: torch.Tensor) -> None:
+        """A picture of a view: labels of the run, of the reference, the features, and labels over the photograph."""
+        self._colors = self._colors or feature_colors(self._gaussians, self._decoder)
+        found, reference = self.labels(features), self._reference(frame)
+        count = len(self._classes)
+        shown = np.zeros_like(found) if reference is None else reference
+        photo = to_bytes(frame.image().numpy())
+        panels = [
+            label_picture(found, count),
+            label_picture(shown, count),
+            self._colors.picture(features, self._decoder),
+            overlay(photo, found, count),
+        ]
+        seen = np.union1d(np.unique(found), np.unique(shown))
+        write_png(path, with_legend(np.concatenate(panels, axis=1), self._classes.names, seen))
+
+    def _reference(self, frame: Frame) -> np.ndarray | None:
+        """(H, W) labels to compare with, 0 outside the mask; None where the view has none."""
+        if self.reference == "labels":
+            labels = None if frame.labels is None else frame.labels()
+        else:
+            labels = None if frame.teacher is None else self._of_teacher(frame)
+        if labels is None or frame.mask is None:
+            return labels
+        return np.where(frame.mask.numpy() < _KEPT, 0, labels)
+
+    def _of_teacher(self, frame: Frame) -> np.ndarray:
+        assert frame.teacher is not None  # the caller has looked
+        return teacher_labels(frame.teacher(), self._classes, frame.camera.width, frame.camera.height)
+
+
+def segmentation_of(
+    gaussians: Gaussians,
+    decoder: Decoder | None,
+    classes: Classes | None,
+    record: SemanticRecord | None,
+    frames: list[Frame],
+) -> Segmentation | str | None:
+    """What to measure of frames: against the data set's labels if any of them has some, else against the teacher's.
+
+    Args:
+        gaussians: With features; those of a scene that moves are at rest.
+        decoder, classes, record: Of the run.
+        frames: That will be measured.
+    Returns:
+        None where a run has no features; in words why it cannot be measured.
+    """
+    if decoder is None or record is None or gaussians.features is None:
+        return None
+    if classes is None or classes.embeddings is None:
+        return "the run has no text embeddings of its classes: add text_embeddings.npy and classes.json to the data set"
+    if any(frame.labels is not None for frame in frames):
+        return Segmentation(gaussians, decoder, classes, "labels", record.labels)
+    if any(frame.teacher is not None for frame in frames):
+        return Segmentation(gaussians, decoder, classes, "teacher", record.teacher)
+    return "no view has labels or a map of the teacher"
+
+
+def teacher_labels(values: torch.Tensor, classes: Classes, width: int, height: int) -> np.ndarray:
+    """What a teacher's map says of each pixel.
+
+    The class of the largest cosine after the features have been interpolated bilinearly, cells covering areas; as the
+    length of a feature has no say, K scores are interpolated instead of C channels.
+
+    Args:
+        values: (C, h, w).
+        classes: With embeddings.
+        width, height: Of the view.
+    Returns:
+        (H, W) int64, 1..K.
+    """
+    channels, h, w = values.shape
+    score = classes.vectors(channels) @ values.float().reshape(channels, h * w)
+    planes = score.reshape(1, -1, h, w)
+    return torch.nn.functional.interpolate(planes, (height, width), mode="bilinear").argmax(1)[0].numpy() + 1
+
+
+def feature_colors(gaussians: Gaussians, decoder: Decoder) -> FeatureColors:
+    """Colors of the features of all views alike: of the Gaussians themselves, those that can be seen above all."""
+    assert gaussians.features is not None
+    with torch.no_grad():  # for pictures
+        opaque = (gaussians.opacities > _KEPT).nonzero()[:, 0]
+        kept = opaque if len(opaque) > 3 else torch.arange(len(gaussians))
+        kept = kept[:: -(-len(kept) // _SAMPLES)]
+        return FeatureColors.of([decoder(gaussians.features[kept].float())])
