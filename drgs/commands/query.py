@@ -41,7 +41,7 @@ def run(args: Query) -> None:
     args.settings()  # refuses what cannot be, before anything is read
     if bool(args.classes) == (args.text_embedding is not None):
         got = "both" if args.classes else "neither"
-        raise ValueError(f"query: one of --class and --text-embedding must be given, got {got}; say what to look for")
+        raise ValueError(f"one of --class and --text-embedding must be given, got {got}; say what to look for")
     ply = "rest.ply" if args.remove else "selected.ply"
     inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
     output = claim(args.output, "query", ["query.json", ply], inputs)
@@ -135,13 +135,12 @@ def _refuse_nothing(total: int, selected: int, largest: float, query: TextQuery,
     """Raise ValueError where the PLY would hold no Gaussian."""
     if selected == 0:
         raise ValueError(
-            f"query: a Gaussian must be selected, none of {total} is ({query.rule}; the largest {query.score_name} is "
-            f"{largest:.3g}); lower --threshold or look for something else"
+            f"a Gaussian must be selected, none of {total} is ({query.rule}; the largest {query.score_name} is "
+            f"{largest:.3g}); {'give a' if query.threshold is None else 'lower'} --threshold or look for something else"
         )
     if remove and selected == total:
         raise ValueError(
-            f"query: a Gaussian must be left, all {total} are selected ({query.rule}); raise --threshold or leave "
-            "--remove out"
+            f"a Gaussian must be left, all {total} are selected ({query.rule}); raise --threshold or leave --remove out"
         )
 
 

@@ -157,7 +157,7 @@ def _files(views: list[View]) -> dict[str, View]:
             )
         files[name] = view
     if not files:
-        raise ValueError("teach: the data set must have photographs, has none; name another")
+        raise ValueError("the data set must have photographs, has none; name another")
     return files
 
 
