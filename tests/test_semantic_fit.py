@@ -10,12 +10,14 @@ import torch
 from test_train import FAST, SIZE, config, dataset, masked, scene  # noqa: F401 (a fixture)
 
 import drgs
-from drgs import metrics
+from drgs import cli, metrics
+from drgs.commands import render as render_command
 from drgs.commands.eval import run as run_eval
 from drgs.commands.options import Eval
 from drgs.data.checks import read_image
 from drgs.data.semantics import Semantics
 from drgs.display.pictures import write_png
+from drgs.features.pictures import label_colors
 from drgs.features.segmentation import Classes, classify
 from drgs.files import Run
 from drgs.fitting import trainer as trainer_module
@@ -395,3 +397,52 @@ def test_other_classes_are_not_measured(run, taught, monkeypatch):
     monkeypatch.setattr("drgs.data.load", lambda path, **_: dataclasses.replace(taught, semantics=other))
     with pytest.raises(ValueError, match="must have the classes that the run was fitted with"):
         run_eval(Eval(run=run.run.path))
+
+
+def test_render_writes_what_is_asked_for(run, taught, tmp_path, monkeypatch):
+    """--features, --labels and --overlay write a picture a view and a video beside the colors, whose pixels are those
+    without them; labels have the colors of their classes, and without these options no feature is rendered.
+    """
+    monkeypatch.setattr("drgs.commands.viewpoints.data.load", lambda path, **_: taught)
+    seen = []
+
+    def spy(gaussians, *rest, **options):
+        seen.append(gaussians.features is not None)
+        return render(gaussians, *rest, **options)
+
+    render = render_command.render
+    monkeypatch.setattr(render_command, "render", spy)
+    folder = tmp_path / "all"
+    common = f"render {run.run.path} --frames 2 --width {SIZE} --height {SIZE} --preset fast --quiet"
+    assert (
+        cli.main([*common.split(), "-o", str(folder), "--features", "--labels", "--overlay", "--format", "png,webm"])
+        == 0
+    )
+    assert cli.main([*common.split(), "-o", str(tmp_path / "plain")]) == 0
+    assert seen == [True, True, False, False]
+    names = sorted(path.name for path in (tmp_path / "plain").glob("*.png"))
+    assert len(names) == 2
+    for name in names:
+        assert read_image(folder / name).tobytes() == read_image(tmp_path / "plain" / name).tobytes()
+        for kind in ("features", "labels", "overlay"):
+            assert read_image(folder / name.replace(".png", f".{kind}.png")).shape == (SIZE, SIZE, 3)
+        colors = np.unique(read_image(folder / name.replace(".png", ".labels.png")).reshape(-1, 3), axis=0)
+        assert {*map(tuple, colors)} <= {*map(tuple, label_colors(CLASSES)[1:])}
+    videos = {path.name for path in folder.glob("*.webm")}
+    assert videos == {f"turntable{kind}.webm" for kind in ("", ".features", ".labels", ".overlay")}
+
+
+def test_render_says_what_a_scene_lacks(run, tmp_path, capsys):
+    """A scene without features has none to be drawn, and a PLY has no classes: one line, exit code 2, no file."""
+    drgs.save_ply(scene(), tmp_path / "plain.ply")
+    drgs.save_ply(load_run(run.run).gaussians, tmp_path / "features.ply")
+    for name, option, text in (
+        ("plain", "--labels", "have Gaussians with semantic features"),
+        ("features", "--overlay", "text embeddings of classes"),
+    ):
+        out = tmp_path / f"out_{name}"
+        assert cli.main(["render", str(tmp_path / f"{name}.ply"), "-o", str(out), option]) == 2
+        said = capsys.readouterr().err
+        assert text in said
+        assert len(said.strip().splitlines()) == 1
+        assert not list(out.glob("*.png"))

@@ -77,6 +77,12 @@ class Render(Settings, Around, Data):
     """Frames a second of the video."""
     depth: bool = False
     """Write color-mapped depth too; exr files hold it anyway."""
+    features: bool = False
+    """Write pictures of the semantic features too, three principal components as colors."""
+    labels: bool = False
+    """Write pictures of the classes too, of a run that has been fitted with some."""
+    overlay: bool = False
+    """Write pictures of the classes over the colors too."""
     split: Split = "all"
     """Which views of a data set."""
     limit: int | None = None

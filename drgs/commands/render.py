@@ -10,7 +10,8 @@ import dataclasses
 import logging
 import statistics
 import time
-from collections.abc import Callable, Iterable
+import types
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from drgs import runtime
 from drgs.commands.forecast import forecast
 from drgs.commands.given import Given
 from drgs.commands.orbits import Wish
+from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.viewpoints import MAX_SIDE, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
@@ -32,6 +34,7 @@ from drgs.integrator import render
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Render
+    from drgs.commands.painters import Painter
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
@@ -50,19 +53,25 @@ def run(args: Render) -> None:
     formats = _formats(args.format)
     _check_numbers(args)
     movie = "turntable.webm" if args.cameras == "orbit" else "video.webm"
-    fixed = ["render.json", "cameras.json", *([movie] * ("webm" in formats))]
+    kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
+    movies = [movie, *(_movie_of(movie, kind) for kind in kinds)] if "webm" in formats else []
+    fixed = ["render.json", "cameras.json", *movies]
     output = claim(args.output, "render", fixed, inputs=[args.scene, args.cameras])
     given = Given.of(args)
     gaussians, settings = given.gaussians, given.settings(args.preset)
+    paint = painters(kinds, given, args.scene)
+    if not paint and gaussians.features is not None:
+        gaussians = gaussians.replace(features=None)
     size = args.width, args.height
     cameras, source = drawn_views(args, args.cameras, given, args.frames, size, returns=True)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
-    _check_memory(cameras, settings, formats)
-    kinds = [*(kind for kind in formats if kind != "webm"), *(["depth.png"] * args.depth)]
-    output.check(f"{name}.{kind}" for name in pictures.file_names([x.name for x in cameras]) for kind in kinds)
+    _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
+    ends = [*(kind for kind in formats if kind != "webm"), *(["depth.png"] * args.depth)]
+    ends += [f"{kind}.png" for kind in kinds]
+    output.check(f"{name}.{end}" for name in pictures.file_names([x.name for x in cameras]) for end in ends)
     if not args.quiet:
         _say_how_long(args, gaussians, cameras, settings)
     with Bar("render", len(cameras), not args.quiet) as bar:
@@ -75,6 +84,7 @@ def run(args: Render) -> None:
             depth=args.depth,
             fps=args.fps,
             video=movie,
+            paint=paint,
             advance=bar.advance,
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
@@ -96,6 +106,7 @@ def render_views(
     depth: bool = False,
     fps: float = 24.0,
     video: str = "video.webm",
+    paint: Mapping[str, Painter] = types.MappingProxyType({}),
     advance: Callable[[], None] | None = None,
 ) -> dict:
     """Render cameras to files, each of which appears once it is complete.
@@ -108,6 +119,7 @@ def render_views(
         depth: A color-mapped `NAME.depth.png` for each view, too.
         fps: Of the video.
         video: Its file name.
+        paint: Kind -> what draws it, a `NAME.KIND.png` for each view, and `VIDEO.KIND.webm` beside the video.
         advance: Called after each view.
     Returns:
         JSON-serializable: settings, backend, seconds (first, median of the others, total), rays and
@@ -116,8 +128,9 @@ def render_views(
     """
     outputs = ("depth",) if depth or "exr" in formats else ()
     views, seen = [], False
-    movie = pictures.Video(out_dir / video, fps) if "webm" in formats else None
-    with movie or contextlib.nullcontext():
+    wanted = {"": video, **{kind: _movie_of(video, kind) for kind in paint}} if "webm" in formats else {}
+    with contextlib.ExitStack() as stack:
+        movies = {kind: stack.enter_context(pictures.Video(out_dir / name, fps)) for kind, name in wanted.items()}
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
             began = time.perf_counter()
             with torch.no_grad():  # a picture
@@ -136,8 +149,14 @@ def render_views(
             if depth:
                 pictures.write_png(out_dir / f"{name}.depth.png", pictures.depth_picture(distance, alpha))
                 files.append(f"{name}.depth.png")
-            if movie is not None:
-                movie.write(rgb)
+            for kind, painter in paint.items():
+                painted = painter(out)
+                pictures.write_png(out_dir / f"{name}.{kind}.png", painted)
+                files.append(f"{name}.{kind}.png")
+                if kind in movies:
+                    movies[kind].write(painted)
+            if movies:
+                movies[""].write(rgb)
             seen = seen or bool(alpha.any())
             made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
             views.append({"camera": described(camera), "files": files, "seconds": seconds, **made})
@@ -158,7 +177,7 @@ def render_views(
         "threads": runtime.backend().threads,
         "seconds": {"first": times[0], "median": statistics.median(times[1:] or times), "total": sum(times)},
         **total,
-        "video": video if movie is not None else None,
+        "video": video if wanted else None,
         "views": views,
     }
 
@@ -190,6 +209,11 @@ def _check_numbers(args: Render) -> None:
     Wish.of(args)
 
 
+def _movie_of(video: str, kind: str) -> str:
+    """File name of the video of a kind of picture."""
+    return f"{Path(video).stem}.{kind}.webm"
+
+
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
     """The camera at the size asked for; one side alone keeps the shape."""
     if width is None and height is None:
@@ -201,13 +225,13 @@ def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
     return camera.resized(width, height)
 
 
-def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tuple[str, ...]) -> None:
+def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tuple[str, ...], features: int) -> None:
     """Refuse a view that is too large to be rendered and written, before the first one is."""
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     pixels = largest.width * largest.height
     pictures_need = max(memory.PICTURES[name] for name in formats)
     where, what = f"view {largest.name!r}", f"its {largest.width}x{largest.height} pixels"
-    needed = memory.frame_bytes(pixels, settings)
+    needed = memory.frame_bytes(pixels, settings, features)
     if runtime.backend().name == "cuda":
         memory.require(where, needed, what, "lower --width or --height", cuda=True)
         needed = 0

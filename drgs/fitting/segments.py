@@ -159,11 +159,17 @@ def teacher_labels(values: torch.Tensor, classes: Classes, width: int, height: i
     return torch.nn.functional.interpolate(planes, (height, width), mode="bilinear").argmax(1)[0].numpy() + 1
 
 
-def feature_colors(gaussians: Gaussians, decoder: Decoder) -> FeatureColors:
-    """Colors of the features of all views alike: of the Gaussians themselves, those that can be seen above all."""
+def feature_colors(gaussians: Gaussians, decoder: Decoder | None) -> FeatureColors:
+    """Colors of the features of all views alike: of the Gaussians themselves, those that can be seen above all.
+
+    Args:
+        gaussians: With features.
+        decoder: Of them; None where they are shown as they are.
+    """
     assert gaussians.features is not None
     with torch.no_grad():  # for pictures
         opaque = (gaussians.opacities > _KEPT).nonzero()[:, 0]
         kept = opaque if len(opaque) > 3 else torch.arange(len(gaussians))
         kept = kept[:: -(-len(kept) // _SAMPLES)]
-        return FeatureColors.of([decoder(gaussians.features[kept].float())])
+        sample = gaussians.features[kept].float()
+        return FeatureColors.of([sample if decoder is None else decoder(sample)])

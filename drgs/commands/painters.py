@@ -1,0 +1,69 @@
+"""Pictures of what Gaussians mean, of one rendered view: their features, their labels, and labels over the colors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.commands.given import Given
+
+if TYPE_CHECKING:
+    import torch
+
+    from drgs.integrator import Output
+
+__all__ = ["PAINTINGS", "Painter", "painters"]
+
+PAINTINGS = ("features", "labels", "overlay")
+
+Painter = Callable[["Output"], np.ndarray]
+"""From what `drgs.render` gives, features included, to (H, W, 3) uint8."""
+
+
+def painters(kinds: Iterable[str], given: Given, scene: Path) -> dict[str, Painter]:
+    """What draws each kind of picture.
+
+    Args:
+        kinds: Of `PAINTINGS`.
+        given: The Gaussians, with the decoder and the classes of their run.
+        scene: Where they are from, for messages.
+    Raises:
+        ValueError: If they have no features, or there is no decoder or no class to call them by.
+    """
+    kinds = tuple(kinds)
+    if not kinds:
+        return {}
+    features, decoder, classes = given.gaussians.features, given.decoder, given.classes
+    if features is None:
+        raise ValueError(
+            f"{scene}: --{kinds[0]} must have Gaussians with semantic features, these have none; fit a data set with a "
+            "teacher's maps, or leave the option out"
+        )
+    from drgs.features.pictures import label_picture, overlay
+    from drgs.features.segmentation import classify
+    from drgs.fitting.segments import feature_colors
+
+    made: dict[str, Painter] = {}
+    if "features" in kinds:
+        colors = feature_colors(given.gaussians, decoder)
+        made["features"] = lambda out: colors.picture(_shown(out), decoder)
+    if {"labels", "overlay"} & {*kinds}:
+        if classes is None or classes.embeddings is None or (given.run is not None and decoder is None):
+            raise ValueError(
+                f"{scene}: --{next(kind for kind in kinds if kind != 'features')} must have a run with a decoder and "
+                "text embeddings of classes, has not; fit a data set that has text_embeddings.npy"
+            )
+        known, count = classes, len(classes)
+        made["labels"] = lambda out: label_picture(classify(_shown(out), known, decoder).numpy(), count)
+        made["overlay"] = lambda out: overlay(
+            out.rgb.cpu().clamp(0, 1).numpy(), classify(_shown(out), known, decoder).numpy(), count
+        )
+    return {kind: made[kind] for kind in kinds}
+
+
+def _shown(out: Output) -> torch.Tensor:
+    assert out.features is not None  # the Gaussians have some
+    return out.features
