@@ -41,6 +41,7 @@ LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
 _EMBEDDINGS = "text_embeddings.npy"
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _IMAGE_FOLDERS = ("images", "rgb")
+_NEAR = 3  # folders above an image among which one may be named so
 _NUMBERED = re.compile(r"rgb_(\d+)")
 _NUMBERS = 1 << 16  # what a pixel of a label image can say
 _SHOWN = 5
@@ -279,7 +280,8 @@ def _bases(dataset: Dataset) -> list[Path]:
     bases = [path if path.is_dir() else path.parent]
     image = next((view.image_path for view in dataset.views if view.image_path), None)
     if image is not None:
-        bases += [folder.parent for folder in image.parents if folder.name in _IMAGE_FOLDERS][:1]
+        near = list(image.parents)[:_NEAR]
+        bases += [folder.parent for folder in near if folder.name in _IMAGE_FOLDERS][:1]
     return list(dict.fromkeys(bases))
 
 
