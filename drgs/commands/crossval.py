@@ -33,7 +33,7 @@ def run(args: Crossval) -> int:
     else:
         check_file(args.export, "crossval", inputs, dumps.is_export)
     given = Given.of(args)
-    g, fields = given.gaussians, given.fields
+    g, fields = given.colors, given.fields
     cameras, source = seen_views(args, given)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:

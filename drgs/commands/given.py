@@ -83,6 +83,11 @@ class Given:
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
 
     @property
+    def colors(self) -> Gaussians:
+        """The Gaussians without their features, for what looks at colors alone."""
+        return self.gaussians.replace(features=None)
+
+    @property
     def background(self) -> tuple[float, float, float]:
         """What is behind everything, whatever the preset."""
         return tuple(self.fields.get("background", RenderSettings.background))

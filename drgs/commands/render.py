@@ -58,10 +58,8 @@ def run(args: Render) -> None:
     fixed = ["render.json", "cameras.json", *movies]
     output = claim(args.output, "render", fixed, inputs=[args.scene, args.cameras])
     given = Given.of(args)
-    gaussians, settings = given.gaussians, given.settings(args.preset)
     paint = painters(kinds, given, args.scene)
-    if not paint and gaussians.features is not None:
-        gaussians = gaussians.replace(features=None)
+    gaussians, settings = given.gaussians if paint else given.colors, given.settings(args.preset)
     size = args.width, args.height
     cameras, source = drawn_views(args, args.cameras, given, args.frames, size, returns=True)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]

@@ -65,7 +65,7 @@ def run(args: Tradeoff) -> None:
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     claim(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
     given = Given.of(args)
-    gaussians, fields = given.gaussians, given.fields
+    gaussians, fields = given.colors, given.fields
     if not len(gaussians):
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")
     cameras, source = seen_views(args, given)
