@@ -103,18 +103,49 @@ def test_columns_and_probes(seen):
         assert abs(float(ratios.mean()) - 1) < 4 * (2 / 64) ** 0.5, name
 
 
-def test_collapsed_channels_are_unbiased(seen):
-    """The mean over 100 draws of one channel is the exact sum, within 4 standard errors of the measured spread."""
+@pytest.mark.parametrize(("estimate", "samples"), [("collapsed", 1), ("principal", 2)])
+def test_estimates_are_unbiased(seen, estimate, samples):
+    """The mean over 60 draws of signs is the exact sum, within 4 standard errors of the measured spread."""
     g, cam, settings, m, exact = seen
-    one = dataclasses.replace(m, estimate="collapsed", samples=1)
     draws = []
-    for seed in range(100):
-        again = fisher.diagonal(g, cam, settings, semantics=dataclasses.replace(one, seed=seed), groups=COUPLED)
+    for seed in range(60):
+        drawn = dataclasses.replace(m, estimate=estimate, samples=samples, seed=seed)
+        again = fisher.diagonal(g, cam, settings, semantics=drawn, groups=COUPLED)
         draws.append(torch.stack([again[name].sum() for name in COUPLED]))
     draws = torch.stack(draws)
     want = torch.stack([exact[name].sum() for name in COUPLED])
     assert float(draws.std(0).min()) > 0
     assert ((draws.mean(0) - want).abs() <= 4 * draws.std(0) / len(draws) ** 0.5).all()
+
+
+def test_channels():
+    """Scalar channels: distances of features in the metric exactly, or from what K - 1 of them have exactly upwards.
+
+    With as many channels as the decoder sees directions every estimate is exact. 1e-5: float32 channels.
+    """
+    f, m = torch.randn(40, 6, generator=torch.Generator().manual_seed(1)), metric(6)
+    f[:, 2:] *= 0.1
+    lengths = m.squares(f) / m.weight
+    for estimate, K in itertools.product(("exact", "principal", "collapsed"), (3, 6, 9)):
+        y = dataclasses.replace(m, estimate=estimate, samples=K).channels(f).double()
+        assert y.shape == (40, 6 if estimate == "exact" else min(K, 6))
+        if y.shape[1] == 6:
+            torch.testing.assert_close(y.square().sum(1), lengths, rtol=1e-5, atol=0)
+    strongest = dataclasses.replace(m, estimate="principal", samples=3).channels(f).double()[:, :2].square().sum(1)
+    assert (strongest <= lengths * (1 + 1e-5)).all()
+    white = f.double() @ m._factor
+    two = torch.linalg.svdvals(white)[:2].square().sum()
+    assert float(strongest.sum()) == pytest.approx(float(two), rel=1e-5)
+
+
+def test_colors_only_make_no_metric(world, monkeypatch):
+    """Scenes without features, and blocks without semantics, call no code of features."""
+    g, train, candidates = world
+    monkeypatch.setattr(SemanticMetric, "__post_init__", lambda self: pytest.fail("a metric was made"))
+    monkeypatch.setattr(SemanticMetric, "channels", lambda self, features: pytest.fail("channels were made"))
+    for criterion in ("eig", "block_logdet"):
+        select(g.replace(features=None), candidates, train, criterion=criterion)
+        select(g, candidates, train, criterion=criterion, blocks=("geometry",))
 
 
 def test_blocks_of_the_image_add_up(seen):

@@ -6,7 +6,17 @@ import typing
 from collections.abc import Sequence
 from typing import Literal
 
-__all__ = ["BLOCK_NAMES", "METHODS", "Block", "Criterion", "Estimate", "Method", "Policy", "checked_blocks"]
+__all__ = [
+    "BLOCK_NAMES",
+    "ESTIMATES",
+    "METHODS",
+    "Block",
+    "Criterion",
+    "Estimate",
+    "Method",
+    "Policy",
+    "checked_blocks",
+]
 
 Criterion = Literal["eig", "logdet", "trace_cov", "block_logdet"]
 """The names in `drgs.gain.CRITERIA`, where the functions are; the first is the default everywhere."""
@@ -41,5 +51,7 @@ def checked_blocks(where: str, names: Sequence[str]) -> tuple[Block, ...]:
     return tuple(name for name in BLOCK_NAMES if name in names)
 
 
-Estimate = Literal["collapsed", "exact"]
+Estimate = Literal["principal", "collapsed", "exact"]
 """How `drgs.fisher.SemanticMetric` sums over the channels of decoded features; the first is the default everywhere."""
+
+ESTIMATES: tuple[Estimate, ...] = typing.get_args(Estimate)

@@ -11,6 +11,12 @@ beside the colors: (f - B)^T M (f - B) = sum_k (y_k - B(y)_k)^2 with y = P^T f, 
 
     exact      P P^T = M: one channel for each direction that the decoder sees
     collapsed  P = L S / sqrt(K), M = L L^T, S random signs (rank, K): the sum's expected value is right
+    principal  P = L [Q_1 ... Q_{K-1}, S]: the directions in which the Gaussians' decoded features differ most from 0,
+               each exactly, and what is left of them collapsed into one channel: the expected value is right as well,
+               and only what is left is random (as Hutch++ [1] does for traces)
+
+Reference:
+    [1] Meyer, Musco, Musco, Woodruff: Hutch++: Optimal Stochastic Trace Estimation, SOSA 2021.
 """
 
 from __future__ import annotations
@@ -22,7 +28,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 
 from drgs.guards.arguments import must_be
-from drgs.information.choices import Estimate
+from drgs.information.choices import ESTIMATES, Estimate
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -48,8 +54,8 @@ class SemanticMetric:
     Attributes:
         matrix: (D, D) float64, symmetric and positive semidefinite: W^T W of the decoder.
         weight: gamma, the inverse noise variance of a decoded channel, where that of a color is 1.
-        estimate: `exact` or `collapsed` (the module's text).
-        samples: Channels of `collapsed`.
+        estimate: `exact`, `principal` or `collapsed` (the module's text).
+        samples: K, channels of `principal` and `collapsed`; `exact` is taken where it needs no more.
         seed: Of its signs: the same for all views that are compared.
     Raises:
         ValueError: If a value is out of range, or the matrix is no metric.
@@ -57,8 +63,8 @@ class SemanticMetric:
 
     matrix: torch.Tensor
     weight: float = 1.0
-    estimate: Estimate = "collapsed"
-    samples: int = 4
+    estimate: Estimate = "principal"
+    samples: int = 8
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -75,8 +81,9 @@ class SemanticMetric:
         object.__setattr__(self, "matrix", 0.5 * (M + M.T))
         if not (isinstance(self.weight, int | float) and 0 < self.weight < float("inf")):
             raise ValueError(f"SemanticMetric: weight must be a finite number > 0, got {self.weight!r}; try 1")
-        if self.estimate not in ("exact", "collapsed"):
-            raise ValueError(f"SemanticMetric: estimate must be exact or collapsed, got {self.estimate!r}; choose one")
+        if self.estimate not in ESTIMATES:
+            known = ", ".join(ESTIMATES)
+            raise ValueError(f"SemanticMetric: estimate must be one of {known}, got {self.estimate!r}; choose one")
         if not (isinstance(self.samples, int) and self.samples >= 1):
             raise ValueError(f"SemanticMetric: samples must be a whole number >= 1, got {self.samples!r}; try 4")
         if not (isinstance(self.seed, int) and 0 <= self.seed < 1 << 63):
@@ -111,18 +118,21 @@ class SemanticMetric:
         seen = values > _RANK * self.width * top
         return vectors[:, seen] * values[seen].sqrt()
 
-    def directions(self) -> torch.Tensor:
-        """(D, K) P: a feature's channels are P^T f."""
-        L = self._factor
-        if self.estimate == "exact" or self.samples >= L.shape[1]:
-            return L
-        generator = torch.Generator().manual_seed(self.seed)
-        signs = torch.randint(0, 2, (self.samples, L.shape[1]), generator=generator).double() * 2 - 1
-        return L @ signs.T / self.samples**0.5
-
     def channels(self, features: torch.Tensor) -> torch.Tensor:
         """(N, K) float32 scalars of (N, D) features, whose squared differences add up to that of the features."""
-        return (features.detach().double().cpu() @ self.directions()).float().to(features.device)
+        L, K = self._factor, self.samples
+        white = features.detach().double().cpu() @ L
+        rank = L.shape[1]
+        if self.estimate == "exact" or rank <= K:
+            return white.float().to(features.device)
+        generator = torch.Generator().manual_seed(self.seed)
+        if self.estimate == "collapsed":
+            signs = torch.randint(0, 2, (rank, K), generator=generator).double() * 2 - 1
+            return (white @ signs / K**0.5).float().to(features.device)
+        _, vectors = torch.linalg.eigh(white.T @ white)  # ascending
+        white = white @ vectors.flip(1)
+        signs = torch.randint(0, 2, (rank - K + 1, 1), generator=generator).double() * 2 - 1
+        return torch.cat([white[:, : K - 1], white[:, K - 1 :] @ signs], 1).float().to(features.device)
 
     def squares(self, features: torch.Tensor) -> torch.Tensor:
         """(...) gamma f^T M f of (..., D) features, exactly."""
@@ -146,7 +156,7 @@ class SemanticMetric:
 
     def to_json(self) -> dict:
         """What a report says of it; not the matrix."""
-        sampled = {"samples": self.samples, "seed": self.seed} if self.estimate == "collapsed" else {}
+        sampled = {"samples": self.samples, "seed": self.seed} if self.estimate != "exact" else {}
         return {"estimate": self.estimate, **sampled, "gamma": self.weight, "width": self.width}
 
     def _value(self) -> tuple:
