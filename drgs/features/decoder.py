@@ -110,7 +110,7 @@ class Decoder(torch.nn.Module):
                 f"Decoder: features must have {self.width} channels, got shape {tuple(features.shape)}; "
                 "use the decoder that was fitted with them"
             )
-        # A 1x1 convolution is this product; for channels that lie side by side it is the faster form on a CPU.
+        # A 1x1 convolution is this product, for channels that come last.
         return torch.nn.functional.linear(features, self.matrix, self.bias)
 
     def metric(self) -> torch.Tensor:
