@@ -390,3 +390,20 @@ def test_the_features_room_stays_closed(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.real_data
+def test_labels_of_real_captures(data_dir):
+    """Statue: a mask of 9 % of the pixels. Street: 11 of 12 lines are classes, and its photographs have a lens."""
+    statue = load(data_dir / "statue")
+    assert statue.semantics.classes.names == ("1",)
+    share = np.mean([(view.labels() == 1).mean() for view in statue.views])
+    assert share == pytest.approx(0.0866, abs=1e-4)
+    street = load(data_dir / "street" / "sparse_dev" / "0")
+    assert len(street.semantics.classes) == 11
+    assert "Unlabelled" not in street.semantics.classes.names
+    view = street.views[0]
+    assert view.camera.is_distorted
+    labels = view.labels()
+    assert labels.shape == (360, 480)
+    assert (labels > 0).mean() > 0.9

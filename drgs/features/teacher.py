@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
+import warnings
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -91,7 +92,9 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
         )
     _check_archive(path)
     try:
-        value = torch.load(path, map_location="cpu", mmap=True, weights_only=True)
+        with warnings.catch_warnings():  # of pickle protocols that no one uses; what they say comes to nothing
+            warnings.simplefilter("ignore")
+            value = torch.load(path, map_location="cpu", mmap=True, weights_only=True)
     except pickle.UnpicklingError:
         raise ValueError(
             f"{path}: must hold one plain tensor, got other Python objects, which are never unpickled; "
@@ -116,7 +119,7 @@ def _check_archive(path: Path) -> None:
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         raise ValueError(f"{path}: must be a whole file, got one without its index; copy it again") from None
     if packed:
-        raise ValueError(f"{path}: must hold its tensor as it is, {packed[0]} is compressed; save it with torch.save")
+        raise ValueError(f"{path}: must hold its tensor as it is, {packed[0]!r} is compressed; save it with torch.save")
 
 
 def check_finite(values: torch.Tensor, path: str | os.PathLike) -> None:
