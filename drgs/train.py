@@ -231,7 +231,7 @@ def _segmentation(trainer: Trainer, taught: SemanticRecord | None, run: Run, fra
         return None
     from drgs.fitting.segments import segmentation_of
 
-    decoder: Any = next(network.module for network in trainer.parts.networks if network.name == "decoder")
+    decoder: Any = trainer.network("decoder")
     return segmentation_of(trainer.gaussians(), decoder, taught.read_classes(run.path), taught, frames)
 
 
@@ -349,11 +349,13 @@ class _Loop:
         if done % _LOG_EVERY == 0 or done == self.trainer.config.max_steps:
             psnr = [x.psnr for x in self._recent if x.psnr is not None]
             loss = [x.loss for x in self._recent if math.isfinite(x.loss)]
+            features = [value for x in self._recent if math.isfinite(value := x.terms.get("features", math.nan))]
             self.run_folder.log(
                 "train",
                 step=done,
                 loss=float(np.mean(loss)) if loss else None,
                 psnr=float(np.mean(psnr)) if psnr else None,
+                **({"features": float(np.mean(features))} if features else {}),
                 gaussians=len(self.trainer.rows),
                 seconds=self.seconds,
             )

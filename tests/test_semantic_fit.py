@@ -236,6 +236,7 @@ def test_a_run_keeps_its_decoder_and_classes(run, taught):
     assert torch.equal(loaded.decoder.matrix, loaded.networks["decoder"]["conv.weight"][:, :, 0, 0])
     assert loaded.classes.names == taught.semantics.classes.names
     assert torch.equal(loaded.classes.embeddings, embeddings())
+    assert all(event["features"] > 0 for event in run.run.events() if event["event"] == "train")
 
 
 def test_a_resumed_fit_has_the_same_bits(run, taught, tmp_path, monkeypatch):
