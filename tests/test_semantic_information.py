@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 
 import dense_jacobian as dense
 import numpy as np
@@ -13,7 +14,9 @@ from dense_jacobian import error
 from scenes_random import gaussians
 from test_select import ring
 
-from drgs import fisher, reference
+from drgs import cli, fisher, reference
+from drgs.data.camera_lists import save_cameras_json
+from drgs.files import load_state, save_ply
 from drgs.fisher import SemanticMetric
 from drgs.information.moments import moments_map
 from drgs.oracle import sh_colors
@@ -286,3 +289,64 @@ def test_a_decoder_that_sees_nothing(seen):
     found, colors = fisher.diagonal(g, cam, settings, semantics=blind), fisher.diagonal(g, cam, settings)
     assert all(torch.equal(found[name], colors[name]) for name in COUPLED)
     assert float(found["features"].abs().max()) == 0
+
+
+@pytest.fixture(scope="module")
+def folder(world, tmp_path_factory):
+    """`scene.ply` with features, `plain.ply` without, `cameras.json`."""
+    g, train, candidates = world
+    path = tmp_path_factory.mktemp("semantic")
+    save_ply(g, path / "scene.ply")
+    save_ply(g.replace(features=None), path / "plain.ply")
+    save_cameras_json(path / "train.json", train)
+    save_cameras_json(path / "cameras.json", candidates)
+    return path
+
+
+def test_maps_of_blocks(folder, monkeypatch, capsys):
+    """`drgs fisher`: the maps of both blocks add up to the scores, each has a file of its own, tables name both.
+
+    1e-4: sums of float32 maps against float64 sums over parameters (measured: 1e-7).
+    """
+    monkeypatch.chdir(folder)
+    line = "fisher scene.ply --train train.json --cameras cameras.json --limit 1 -o out"
+    assert cli.main(line.split()) == 0
+    report, text = json.loads((folder / "out/fisher.json").read_text()), capsys.readouterr().out
+    assert report["blocks"] == ["geometry", "semantic"]
+    assert (report["semantics"]["estimate"], report["semantics"]["gamma"]) == ("principal", 1.0)
+    assert "geometry %" in text
+    assert "eig: semantic %" in text
+    (row,) = report["views"]
+    for kind, criterion in (("variance", "eig"), ("share", "logdet")):
+        parts = [row["blocks"][block][kind]["sum"] for block in report["blocks"]]
+        assert min(parts) > 0
+        assert sum(parts) == pytest.approx(row["gain"][criterion], rel=1e-4)
+        for name in ("", "geometry.", "semantic."):
+            assert f"{row['name']}.{name}{kind}.png" in row["files"]
+    tensors, header = load_state(folder / "out/information.safetensors")
+    assert header["blocks"] == report["blocks"]
+    for name, x in tensors.items():
+        assert sum(report["groups"][name]["blocks"].values()) == pytest.approx(float(x.sum()), rel=1e-9)
+    assert report["groups"]["sh"]["blocks"]["semantic"] == report["groups"]["features"]["blocks"]["geometry"] == 0
+
+
+def test_select_names_blocks(folder, monkeypatch, capsys):
+    """`drgs select`: blocks, estimate and gamma are in the report; a scene without features has no semantic block."""
+    monkeypatch.chdir(folder)
+    line = "select scene.ply --train train.json --candidates cameras.json"
+    for option, blocks in (("", ["geometry", "semantic"]), (" --blocks semantic", ["semantic"])):
+        assert cli.main((line + option + " -o picks.json").split()) == 0
+        report = json.loads((folder / "picks.json").read_text())
+        assert report["blocks"] == blocks
+        assert (report["semantics"]["estimate"], report["semantics"]["gamma"]) == ("principal", 1.0)
+    capsys.readouterr()
+    for bad, message in (
+        ("plain.ply --blocks geometry,semantic", "got semantic for Gaussians without features"),
+        ("scene.ply --blocks colors", "blocks must be among geometry, semantic, got 'colors'"),
+    ):
+        for command, other in (("select", "--candidates cameras.json -o no.json"), ("fisher", "-o no")):
+            assert cli.main(f"{command} {bad} --train train.json {other}".split()) == 2
+            error = capsys.readouterr().err
+            assert message in error
+            assert error.count("\n") == 1
+            assert not (folder / "no").exists()

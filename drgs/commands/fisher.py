@@ -5,6 +5,9 @@ known views and Hc that of the view itself:
 
     variance    sum_k J_pk^2 / (H_k + lambda): predictive variance of the pixel for unit noise; its sum is `eig`
     share       sum_k J_pk^2 / Hc_k log(1 + Hc_k / (H_k + lambda)): the pixel's share of the view's `logdet`
+
+The rows of J are the pixel's colors and, where the scene has features, its decoded features; where both count there is
+a map of each block beside that of both, whose sum it is a part of.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ from drgs.files import SCHEMA, save_state, write_json
 from drgs.fisher import Information
 from drgs.gain import Prior, check, information_gain, variances
 from drgs.guards.outputs import claim
+from drgs.information.semantics import SemanticMetric
+from drgs.select import Scoring
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -34,7 +39,10 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
-__all__ = ["map_weights", "run"]
+__all__ = ["KINDS", "Told", "added", "map_weights", "run"]
+
+KINDS = ("variance", "share")  # of maps
+_OTHERS = {"geometry": "features", "semantic": "sh"}  # block of the image -> group that it says nothing about
 
 
 def run(args: Fisher) -> None:
@@ -59,20 +67,24 @@ def run(args: Fisher) -> None:
         views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(views, args.limit)
     names = pictures.file_names([camera.name for camera in views])
-    output.check(f"{name}.{kind}.png" for name in names for kind in ("variance", "share"))
+    told = Told.of(given, args, settings)
+    output.check(f"{name}.{kind}.png" for name in names for kind in told.kinds)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
-        H: Information = {}
+        by_block: dict[str, Information] = {}
         for camera in known.cameras:
-            part = fisher.diagonal(given.gaussians, camera, settings, args.method)
-            check(f"fisher: view {camera.name}", part)
-            H = {name: x + H[name] if H else x for name, x in part.items()}
+            for block, part in told.said(camera).items():
+                check(f"fisher: view {camera.name}", part)
+                old = by_block.get(block, {})
+                by_block[block] = {name: x + old[name] if old else x for name, x in part.items()}
             bar.advance()
+        H = added(by_block)
         rows = []
         for camera, name in zip(views, names, strict=True):
-            rows.append(_view(args, given.gaussians, camera, settings, name, H, prior))
+            rows.append(_view(args, told, camera, name, H, prior))
             bar.advance()
-    groups = {name: GroupSummary.of(x) for name, x in H.items()}
+    groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
+    header |= {"blocks": list(by_block)}
     save_state(args.output / "information.safetensors", H, header)
     report = {
         "schema": SCHEMA,
@@ -81,6 +93,8 @@ def run(args: Fisher) -> None:
         "gaussians": len(given.gaussians),
         "method": args.method,
         "prior": {"value": args.prior, "relative": args.relative_prior},
+        "blocks": list(told.blocks),
+        "semantics": told.metric.to_json() if told.metric else None,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
@@ -94,20 +108,95 @@ def run(args: Fisher) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
+class Told:
+    """What of an image is asked about the scene.
+
+    Attributes:
+        gaussians, settings, method: As for `drgs.fisher.diagonal`.
+        blocks: The blocks of the image that count.
+        metric: In which features count, where `semantic` is among them.
+    """
+
+    gaussians: Gaussians
+    settings: RenderSettings
+    method: str
+    blocks: tuple[str, ...]
+    metric: SemanticMetric | None
+
+    @classmethod
+    def of(cls, given: Given, args: Fisher, settings: RenderSettings) -> Told:
+        """As the options say, of a run in the metric of its decoder."""
+        g, scoring = given.gaussians, Scoring(method=args.method, blocks=args.blocks)
+        blocks, metric = scoring.blocks_of(g, "fisher"), None
+        if "semantic" in blocks:
+            assert g.features is not None  # else there is no such block
+            metric = given.semantics() or SemanticMetric.of(None, g.features.shape[1])
+        return cls(g, settings, args.method, blocks, metric)
+
+    @property
+    def kinds(self) -> list[str]:
+        """Of maps, as in the names of their files."""
+        parts = ["", *(f"{block}." for block in self.blocks)] if len(self.blocks) > 1 else [""]
+        return [part + kind for part in parts for kind in KINDS]
+
+    def options(self, block: str) -> dict[str, Any]:
+        """Of `drgs.fisher.diagonal` and `drgs.fisher.variance_map`, for the rows of one block."""
+        return {"semantics": self.metric, "channel_weights": (0.0, 0.0, 0.0)} if block == "semantic" else {}
+
+    def own(self, block: str, information: Information) -> Information:
+        """Without what a block says nothing about."""
+        return {name: x for name, x in information.items() if name != _OTHERS[block]}
+
+    def said(self, camera: Camera) -> dict[str, Information]:
+        """What each block of a view says."""
+        found = {}
+        for block in self.blocks:
+            options = self.options(block)
+            found[block] = self.own(
+                block, fisher.diagonal(self.gaussians, camera, self.settings, self.method, **options)
+            )
+        return found
+
+    def maps(self, camera: Camera, weights: Information) -> dict[str, np.ndarray]:
+        """Block -> (H, W) map of its rows."""
+        return {
+            block: fisher.variance_map(
+                self.gaussians, camera, self.own(block, weights), self.settings, **self.options(block)
+            ).numpy()
+            for block in self.blocks
+        }
+
+
+def added(by_block: dict[str, Information]) -> Information:
+    """What all blocks together say."""
+    total: dict[str, torch.Tensor] = {}
+    for part in by_block.values():
+        for name, x in part.items():
+            total[name] = total[name] + x if name in total else x
+    return total
+
+
+@dataclasses.dataclass(frozen=True)
 class GroupSummary:
-    """What the known views say about a group of parameters: a summary of its information's entries."""
+    """What the known views say about a group of parameters: a summary of its information's entries.
+
+    Attributes:
+        sum: Of the entries; `blocks`: of those from each block of the image.
+    """
 
     shape: list[int]
     sum: float
     median_of_positive: float | None
     zero: int
+    blocks: dict[str, float]
 
     @classmethod
-    def of(cls, x: torch.Tensor) -> GroupSummary:
+    def of(cls, x: torch.Tensor, by_block: dict[str, Information], name: str) -> GroupSummary:
         """Of the information of a group."""
         positive = x[x > 0]
         median = float(positive.median()) if positive.numel() else None
-        return cls(list(x.shape), float(x.sum()), median, int((x == 0).sum()))
+        parts = {block: float(part[name].sum()) if name in part else 0.0 for block, part in by_block.items()}
+        return cls(list(x.shape), float(x.sum()), median, int((x == 0).sum()), parts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +206,11 @@ class MapSummary:
     sum: float
     mean: float
     max: float
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> MapSummary:
+        """Of a map."""
+        return cls(float(values.sum(dtype=np.float64)), float(values.mean()), float(values.max()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +229,8 @@ class MappedView:
         name, camera: The view's.
         files: Its maps.
         gain: What it would add to the known views, by criterion.
-        variance, share: Its maps.
+        variance, share: Its maps, of all blocks together.
+        blocks: Block of the image -> kind -> the map of that block alone.
         pose: With --pose, else None.
     """
 
@@ -145,13 +240,16 @@ class MappedView:
     gain: dict[str, float]
     variance: MapSummary
     share: MapSummary
+    blocks: dict[str, dict[str, MapSummary]]
     pose: PoseSummary | None
 
     def to_json(self) -> dict[str, Any]:
         """As fisher.json holds it."""
         fields = {name: getattr(self, name) for name in ("name", "camera", "files", "gain")}
         fields |= {"camera": described(self.camera)}
-        fields |= {name: dataclasses.asdict(getattr(self, name)) for name in ("variance", "share")}
+        fields |= {name: dataclasses.asdict(getattr(self, name)) for name in KINDS}
+        blocks = self.blocks.items()
+        fields |= {"blocks": {b: {kind: dataclasses.asdict(x) for kind, x in maps.items()} for b, maps in blocks}}
         return fields | ({} if self.pose is None else {"pose": dataclasses.asdict(self.pose)})
 
 
@@ -172,44 +270,59 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     return variance, share
 
 
-def _view(
-    args: Fisher, g: Gaussians, camera: Camera, settings: RenderSettings, name: str, H: Information, prior: Prior
-) -> MappedView:
+def _view(args: Fisher, told: Told, camera: Camera, name: str, H: Information, prior: Prior) -> MappedView:
     """Maps of one view, and what it says."""
-    Hc = fisher.diagonal(g, camera, settings, args.method)
-    # Maps are of the image's colors; features have an image of their own.
-    parts = map_weights(*({k: x for k, x in y.items() if k != "features"} for y in (H, Hc)), prior)
-    files, maps = [], []
-    for kind, weights in zip(("variance", "share"), parts, strict=True):
-        values = fisher.variance_map(g, camera, weights, settings).numpy()
-        files.append(f"{name}.{kind}.png")
-        pictures.write_png(args.output / files[-1], pictures.map_picture(values))
-        maps.append(MapSummary(float(values.sum(dtype=np.float64)), float(values.mean()), float(values.max())))
+    Hc = added(told.said(camera))
+    weights = dict(zip(KINDS, map_weights(H, Hc, prior), strict=True))
+    maps = {kind: told.maps(camera, x) for kind, x in weights.items()}
+    files, totals = [], {}
+    for kind, parts in maps.items():
+        totals[kind] = sum(parts.values())
+        shown = {"": totals[kind]} | ({f"{block}.": x for block, x in parts.items()} if len(parts) > 1 else {})
+        for prefix, values in shown.items():
+            files.append(f"{name}.{prefix}{kind}.png")
+            pictures.write_png(args.output / files[-1], pictures.map_picture(values))
     pose = None
     if args.pose:
-        found = fisher.pose_information(g, camera, settings)
+        found = fisher.pose_information(told.gaussians, camera, told.settings)
         pose = PoseSummary(found.tolist(), torch.linalg.eigvalsh(found).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
-    return MappedView(camera.name, camera, files, gain, *maps, pose)
+    blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in told.blocks}
+    return MappedView(camera.name, camera, files, gain, *(MapSummary.of(totals[kind]) for kind in KINDS), blocks, pose)
 
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
     """What was found, as tables on stdout."""
-    rows = []
+    rows, both = [], len(next(iter(groups.values())).blocks) > 1
     for name, row in groups.items():
         share = f"{row.zero / max(math.prod(row.shape), 1):.1%}"
         shape = "x".join(map(str, row.shape))
-        rows.append((name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share))
+        rows.append(
+            (name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share, *_parts(row.blocks, both))
+        )
     title = f"information of {len(known.cameras)} views ({known.source})"
-    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known"), rows)
+    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known", *_percent(both)), rows)
     rows = []
     for row in views:
         values = row.pose.eigenvalues if row.pose else []
         numbers = (row.gain["eig"], row.gain["logdet"], row.variance.mean, *values[:1], *values[-1:])
-        rows.append((row.name, *(f"{x:.3g}" for x in numbers)))
-    columns = ("view", "eig", "logdet", "mean variance", *(("pose: least", "most") if args.pose else ()))
+        parts = _parts({block: maps["variance"].sum for block, maps in row.blocks.items()}, both)
+        rows.append((row.name, *(f"{x:.3g}" for x in numbers), *parts))
+    poses = ("pose: least", "most") if args.pose else ()
+    columns = ("view", "eig", "logdet", "mean variance", *poses, *(f"eig: {x}" for x in _percent(both)))
     tables.show(f"views ({source})", columns, rows)
     if args.pose:
         print("pose: information about the least and the best known of its six directions; fisher.json has all six")
     files = sum(len(row.files) for row in views)
     print(f"information.safetensors, fisher.json and {files} maps: {args.output}")
+
+
+def _percent(both: bool) -> tuple[str, ...]:
+    """Columns of the blocks of the image, where there are two."""
+    return ("geometry %", "semantic %") if both else ()
+
+
+def _parts(blocks: dict[str, float], both: bool) -> tuple[str, ...]:
+    """What share of a sum each block has, for those columns."""
+    total = sum(blocks.values())
+    return tuple(f"{100 * x / total:.1f}" if total else "-" for x in blocks.values()) if both else ()

@@ -63,7 +63,7 @@ class Scoring:
         if self.semantics is not None:
             must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
 
-    def blocks_of(self, gaussians: Gaussians) -> tuple[Block, ...]:
+    def blocks_of(self, gaussians: Gaussians, where: str = "select") -> tuple[Block, ...]:
         """The blocks that are scored of a scene, `gaussians` at some time of it.
 
         Raises:
@@ -74,7 +74,7 @@ class Scoring:
             return there[:1] if self.method == "fisherrf" else there
         if "semantic" in self.blocks and "semantic" not in there:
             raise ValueError(
-                "select: blocks must be of what the scene has, got semantic for Gaussians without features; fit "
+                f"{where}: blocks must be of what the scene has, got semantic for Gaussians without features; fit "
                 "them to a data set with teacher maps, or use geometry"
             )
         return self.blocks
