@@ -337,6 +337,29 @@ def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkey
     assert load_run(done.run).decoder is not None
 
 
+def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path, monkeypatch):
+    """At every pick features count in the metric of the decoder at that step; selection.json says what was coupled."""
+    metrics_of, real = [], drgs.select.select
+
+    def watched(*rest, scoring, **options):
+        metrics_of.append(scoring.semantics.matrix)
+        return real(*rest, scoring=scoring, **options)
+
+    monkeypatch.setattr(drgs.select, "select", watched)
+    active = ActiveConfig(policy="fisher", add=2, every=2, info_pixels=100)
+    done = fit(taught, tmp_path / "run", config(**FIT), active=active, progress=False)
+    assert len(metrics_of) == 2
+    last = load_run(done.run).decoder.metric()
+    assert all(x.shape == last.shape for x in metrics_of)
+    assert not torch.equal(metrics_of[0], metrics_of[1])
+    report = json.loads((tmp_path / "run/selection.json").read_text())
+    for pick in report["picks"]:
+        assert pick["blocks"] == ["geometry", "semantic"]
+        told = pick["semantics"]
+        assert (told["estimate"], told["gamma"], told["width"]) == ("principal", 1.0, WIDTH)
+        assert "features" in pick["parts"]
+
+
 def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, capsys):
     """metrics.json names the reference and has the run's figures beside the teacher's own; `drgs eval` repeats them,
     prints them, and puts labels, reference, features and an overlay beside the picture of the colors.
