@@ -470,3 +470,23 @@ def test_render_says_what_a_scene_lacks(run, tmp_path, capsys):
         assert text in said
         assert len(said.strip().splitlines()) == 1
         assert not list(out.glob("*.png"))
+
+
+def test_a_run_is_asked_for_its_classes(run, taught, tmp_path, monkeypatch):
+    """`drgs query` uses the run's own decoder and classes: each Gaussian belongs to the one class of its label, and
+    what --remove writes are all others; masks have the size of the photographs.
+    """
+    monkeypatch.setattr("drgs.commands.viewpoints.data.load", lambda path, **_: taught)
+    loaded = load_run(run.run)
+    g = loaded.gaussians
+    labels = classify(g.features, loaded.classes, loaded.decoder)
+    assert len(labels.unique()) > 1
+    for k in labels.unique().tolist():
+        name, out = loaded.classes.names[k - 1], tmp_path / str(k)
+        for more, ply, wanted in (([], "selected", labels == k), (["--remove"], "rest", labels != k)):
+            options = ["--class", name, "-o", str(out), "--limit", "1", "--quiet", *more]
+            assert cli.main(["query", str(run.run.path), *options]) == 0
+            assert torch.equal(drgs.load_ply(out / f"{ply}.ply").means, g.take(wanted).means)
+        masks = list(out.glob("*.mask.png"))
+        assert len(masks) == 1
+        assert read_image(masks[0]).shape == (SIZE, SIZE, 3)
