@@ -7,6 +7,7 @@ import shutil
 import socket
 import string
 import sys
+from pathlib import PurePosixPath
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from drgs import data  # noqa: E402 (after the reason to skip)
 from drgs.cli import main  # noqa: E402
 from drgs.commands import options  # noqa: E402
 from drgs.features.encoders import MAP_NORM, SCALES, TEMPLATES, ClipEncoder  # noqa: E402
+from drgs.features.teacher import read_map  # noqa: E402
 
 CHANNELS, PATCH = 12, 8
 
@@ -158,6 +160,30 @@ def test_teach_writes_what_a_fit_finds(capture, model, monkeypatch, capsys):
         assert values.dtype == torch.float16
         want = encoder.dense(view.image(), (6, 4), [1.0])
         torch.testing.assert_close(values.float(), want, rtol=2e-3, atol=2e-3)  # half precision of numbers below 4
+
+
+def test_maps_are_of_photographs_as_they_are(capture, model, capsys):
+    """Of a lens, the file is the map of the bent photograph, which the loader straightens as it does the photograph;
+    photographs in subfolders have maps in subfolders; two that differ in their endings only are refused.
+    """
+    path = capture / "transforms.json"
+    poses = json.loads(path.read_text())
+    (capture / "images/left").mkdir()
+    shutil.move(capture / "images/view_0.png", capture / "images/left/view_0.png")
+    poses["frames"][0]["file_path"] = "images/left/view_0.png"
+    path.write_text(json.dumps(poses | {"k1": 0.3}))
+    assert teach(capture, model, "--quiet") == 0
+    view = next(view for view in data.load(capture).views if view.name.endswith("view_0"))
+    photograph = cv2.imread(str(view.image_path))[..., ::-1].astype(np.float32) / 255
+    want = ClipEncoder(model).dense(photograph, (6, 4), [1.0])
+    torch.testing.assert_close(read_map(view.teacher_path).float(), want, rtol=2e-3, atol=2e-3)  # half precision
+    assert float((view.teacher().float() - want).abs().max()) > 0.05
+    assert view.teacher_path.parent.name == PurePosixPath(view.name).parent.name
+    shutil.copy(capture / "images/view_1.png", capture / "images/view_1.jpg")
+    poses["frames"].append(poses["frames"][1] | {"file_path": "images/view_1.jpg"})
+    path.write_text(json.dumps(poses))
+    assert teach(capture, model) == 2
+    assert "must have a name of its own" in capsys.readouterr().err
 
 
 def test_teach_goes_on_where_it_stopped(capture, model, monkeypatch, capsys):
