@@ -80,6 +80,10 @@ class BvhTraversal:
         ordered = s.order != "entry"
         return [Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, ordered, self.center_key)]
 
+    def weighed(self, share: int, size: int) -> list[Part]:
+        """As `parts`: there are no lists that rays have in common."""
+        return self.parts(share)
+
     def _ray(self, i: UInt32) -> Ray:
         carried = [dr.gather(self.lib.Float, c, i) for c in self.carried]
         return Ray(carried=carried, basis=self.basis)

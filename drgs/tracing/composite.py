@@ -1,22 +1,26 @@
 """One view composited: records, features and rays in, flat images and their derivatives out.
 
-`Compositor` is plain: color, depth and coverage come out of a first traversal, feature channels out of further ones,
-`CHUNK` channels each; its adjoint replays them, its forward mode carries any number of tangents through one traversal
-each. `Composite` makes it one differentiable operation of Dr.Jit.
+`Compositor` is plain: color, depth and coverage come out of a first traversal, its adjoint replays it, its forward mode
+carries any number of tangents through one traversal. Feature channels are products with the weights that the first
+traversal writes down (weights.py) where rays walk along lists of tiles; elsewhere they come out of further traversals,
+`CHUNK` channels each. `Composite` makes it one differentiable operation of Dr.Jit.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import drjit as dr
+import torch
 
 from drgs.settings import RenderSettings
 from drgs.tracing.derivatives import Adjoint, Tangent
-from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
+from drgs.tracing.kernels import Channels, HitModel, Primal
 from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.walk import Part
+from drgs.tracing.weights import MATRIX, PIXELS, Weights, emit_weights, in_rows, without_graph
 
 __all__ = ["CHUNK", "Composite", "Compositor"]
 
@@ -40,7 +44,8 @@ class Compositor:
         certificate: After `forward`: rays, redone rays, entries listed.
         extra: After `forward`: outputs without a derivative.
         finals: After `forward`: per traversal, (part, final states) pairs.
-        beside: Feature channels that the first traversal composites beside the colors; set it before `forward`.
+        beside: Feature channels that the first traversal composites beside the colors, none or all; set it before
+            `forward`.
     """
 
     beside = 0
@@ -63,8 +68,15 @@ class Compositor:
 
     # -- forward -----------------------------------------------------------------------------------------------------
 
+    @without_graph
     def forward(
-        self, record: list[Float], sh: Float | None, features: Float | None, carried: list[Float], keep: bool
+        self,
+        record: list[Float],
+        sh: Float | None,
+        features: Float | None,
+        carried: list[Float],
+        keep: bool,
+        columns: int = 0,
     ) -> dict:
         """Flat images rgb, alpha, and where there are any depth and features.
 
@@ -74,10 +86,11 @@ class Compositor:
             features: Flat (N D) or None.
             carried: Per-ray floats: SH basis values, then o and d of world rays.
             keep: The adjoint may follow.
+            columns: So many tangents may follow.
         """
-        lib, view = self.lib, self.traversal
+        view = self.traversal
         self.entries, self.carried = len(record), carried
-        self.buffers = {"record": pack_records(lib, record)}
+        self.buffers = {"record": pack_records(self.lib, record)}
         if sh is not None:
             self.buffers["sh"] = sh
         if features is not None:
@@ -90,25 +103,10 @@ class Compositor:
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
         # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
         share = 4 if self.settings.order == "center" and not view.world and not self.basis else 1
-        self.color_parts = view.parts(share)
-        self.feature_parts = view.parts(1) if chunks and share != 1 else self.color_parts
-        out = self._images()
-        for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
-            if name in self.want:
-                out[name] = dr.zeros(kind, self.rays)
-        want = set(self.want) - {"visibility"} | ({"replay"} if keep else set())
-        visibility = dr.zeros(lib.Float, count_of(record)) if "visibility" in self.want else None
-        self.finals = []
-        for number, channels in enumerate(self.passes):
-            first = number == 0
-            emit = _add_to(visibility) if first and visibility is not None else None
-            kernel = Primal(self.model, channels, frozenset(want if first else want & {"replay"}), emit)
-            self.finals.append(self._primal(kernel, first))
-            for part, states in self.finals[-1]:
-                self._write(out, channels, part, states)
-        if visibility is not None:
-            self.extra["visibility"] = visibility
-        for name in ("median", "count"):
+        weighed = self.width > self.beside
+        self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
+        out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))
+        for name in ("visibility", "median", "count"):
             if name in out:
                 self.extra[name] = out.pop(name)
         dr.eval(out, self.extra)
@@ -121,7 +119,35 @@ class Compositor:
             features: Flat (N count), all of them composited.
         """
         channels = Channels({**self.buffers, "features": features}, count, 0, count, True)
-        return channels, self._primal(Primal(self.model, channels, frozenset({"replay"})), first=False)
+        states = [part.run(Primal(self.model, channels, frozenset({"replay"}))) for part in self.parts]
+        dr.eval(states)
+        return channels, list(zip(self.parts, states, strict=True))
+
+    def _composited(self, want: frozenset, count: int) -> dict:
+        """Flat images, `count` visibilities among them, from all passes."""
+        lib, out, self.finals = self.lib, self._images(), []
+        for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
+            if name in want:
+                out[name] = dr.zeros(kind, self.rays)
+        if "visibility" in want:
+            out["visibility"] = dr.zeros(lib.Float, count)
+        keep = "replay" in want and len(self.parts) == 1
+        image = self._no_rows(self.rays) if self._held else None
+        for channels in self.passes:
+            done = []
+            for part in self._parts(channels):  # gets longer where rays are redone
+                states, buffer = self._primal(part, channels, want, out.get("visibility"))
+                done.append((part, states))
+                if part.weights is not None and image is not None:
+                    part.weights.survey(buffer)
+                    part.weights.image(buffer, in_rows(self.buffers["features"], self.width), image)
+                    part.weights.kept = buffer if keep else None
+            if image is not None and channels.color:
+                out["features"] = lib.Float(image.view(-1))
+            for part, states in done:
+                self._write(out, channels, part, states)
+            self.finals.append(done)
+        return out
 
     def _channels(self, first: int = 0, channels: int = 0, color: bool = False) -> Channels:
         return Channels(self.buffers, self.width, first, channels, color)
@@ -137,29 +163,29 @@ class Compositor:
         return out
 
     def _parts(self, channels: Channels) -> list[Part]:
-        return self.color_parts if channels.color or not channels.channels else self.feature_parts
+        """Of a pass: features need none where their weights are held."""
+        return [x for x in self.parts if x.weights is None] if channels.channels and not channels.color else self.parts
 
-    def _primal(self, kernel: Primal, first: bool) -> list[tuple[Part, list[dict]]]:
-        """(part, final states) pairs; in exact order the first traversal decides which rays are redone."""
-        parts, done = self._parts(kernel.channels), []
-        for part in list(parts):
-            # Weights are scattered on the way, so rays that turn out wrong must be known beforehand.
-            check = part.ordered and first
-            if check and kernel.emit is not None:
-                probe = Primal(self.model, self._channels(), frozenset())
-                dr.eval(part.run(probe, check=True), part.failed)
-                parts += self._redo(part)
-                check = False
-            states = part.run(kernel, check=check)
-            dr.eval(states, part.failed if check else None)  # together: one kernel
-            if check:
-                parts += self._redo(part)
-            done.append((part, states))
-        for part in parts[len(done) :]:
-            states = part.run(kernel)
-            dr.eval(states)
-            done.append((part, states))
-        return done
+    def _primal(
+        self, part: Part, channels: Channels, want: frozenset, visibility: Float | None
+    ) -> tuple[list[dict], Float | None]:
+        """Final states of a part, and its weights if they are held; adds a part of rays that are to be redone."""
+        if not channels.color:
+            want, visibility = want & {"replay"}, None
+        # In exact order the first traversal decides which rays are redone.
+        check = part.ordered and channels.color
+        if check and visibility is not None:
+            # It is summed up on the way, so rays that turn out wrong must be known beforehand.
+            dr.eval(part.run(Primal(self.model, self._channels(), frozenset()), check=True), part.failed)
+            self.parts += self._redo(part)
+            check = False
+        buffer = part.weights.zeros() if part.weights is not None else None
+        kernel = Primal(self.model, channels, want - {"visibility"}, emit_weights(part, buffer, visibility))
+        states = part.run(kernel, check=check)
+        dr.eval(states, part.failed if check else None, buffer)  # together: one kernel
+        if check:
+            self.parts += self._redo(part)
+        return states, buffer
 
     def _redo(self, part: Part) -> list[Part]:
         """Take the rays that the certificate rejects out of `part`, into parts of their own."""
@@ -168,8 +194,19 @@ class Compositor:
         part.inside = [part.inside[0] & ~failed]
         dr.eval(part.inside)
         self.certificate["rays"] = self.rays
-        self.certificate["redone"] = dr.width(again)
+        self.certificate["redone"] = self.certificate.get("redone", 0) + dr.width(again)
+        if part.weights is not None and dr.width(again):
+            part.weights.skip(dr.gather(self.lib.UInt32, part.flat[0], again))
         return part.listed(again)
+
+    @property
+    def _held(self) -> bool:
+        """Whether weights are."""
+        return any(part.weights is not None for part in self.parts)
+
+    def _no_rows(self, count: int) -> torch.Tensor:
+        """Zeros of all channels."""
+        return in_rows(dr.zeros(self.lib.Float, count * self.width), self.width)
 
     def _write(self, out: dict, channels: Channels, part: Part, states: list[dict]) -> None:
         """Scatter the states of a part into the images."""
@@ -188,12 +225,14 @@ class Compositor:
 
     # -- reverse -----------------------------------------------------------------------------------------------------
 
+    @without_graph
     def adjoint(self, g: dict) -> dict:
         """Replay every traversal with the cotangents `g` of its images: gradients of `forward`'s arguments by name."""
         lib = self.lib
         grads = {name: dr.zeros(lib.Float, dr.width(x)) for name, x in self.buffers.items()}
         carried = [dr.zeros(lib.Float, self.rays) for _ in self.carried]
         dr.eval(g)
+        slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
             depth = "depth" in self.want and channels.color
             for part, finals in done:
@@ -203,14 +242,21 @@ class Compositor:
                 # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
                 mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
+                    scalar = None
+                    if part.weights is not None and slopes is not None:
+                        scalar = self._products(
+                            part, part.weights, in_rows(g["features"], self.width), slopes, cotangents
+                        )
                     if channels.channels and not self.couple:
                         self._feature_gradient(grads["features"], channels, part, cotangents, mode)
                         continue
-                    states = part.run(Adjoint(self.model, channels, grads, finals, cotangents, depth, mode))
+                    states = part.run(Adjoint(self.model, channels, grads, finals, cotangents, depth, mode, scalar))
                     for st, at, inside in zip(states, part.flat, part.inside, strict=True):
                         for total, x in zip(carried, st["carried"], strict=True):
                             dr.scatter_add(total, x, at, inside)
                     dr.eval(grads, carried)
+        if slopes is not None:
+            grads["features"] += lib.Float(slopes.view(-1))
         i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
         used = set(self.model.slots("depth" in self.want))
         record = grads.pop("record")
@@ -219,6 +265,26 @@ class Compositor:
             for k in range(self.entries)
         ]
         return grads | ({"carried": carried} if carried else {})
+
+    def _products(
+        self, part: Part, weights: Weights, g: torch.Tensor, slopes: torch.Tensor, cotangents: list[dict]
+    ) -> Callable[[int, list, Mask], Float] | None:
+        """Add the gradient of the features in a part to `slopes`; if coupled, the `scalar` of its `Adjoint`."""
+        lib, buffer = self.lib, weights.kept
+        if not bool(g.any()):
+            return None
+        if buffer is None:
+            buffer = weights.zeros()
+            dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), emit_weights(part, buffer))), buffer)
+        weights.gradient(buffer, g, slopes)
+        if not self.couple:
+            return None
+        scalars = weights.scalars(in_rows(self.buffers["features"], self.width), g)
+        totals = weights.totals(buffer, scalars)
+        tile = dr.arange(lib.UInt32, dr.width(part.columns[0])) // (PIXELS // len(part.columns))
+        for cotangent, column in zip(cotangents, part.columns, strict=True):
+            cotangent["rest"] = dr.gather(lib.Float64, totals, tile * PIXELS + column)
+        return lambda k, place, ok: dr.gather(lib.Float, scalars, part.held(k, place), ok)
 
     def _feature_gradient(
         self, grad: Float, channels: Channels, part: Part, cotangents: list[dict], mode: dr.ReduceMode
@@ -249,6 +315,7 @@ class Compositor:
 
     # -- tangents ----------------------------------------------------------------------------------------------------
 
+    @without_graph
     def tangents(self, buffers: list[dict], carried: list[list[Float]]) -> list[dict]:
         """Images of K tangents: dicts like the output of `forward`.
 
@@ -266,6 +333,8 @@ class Compositor:
                 b[name] = x + dr.zeros(lib.Float, dr.width(self.buffers[name]))
         dr.eval(records, rest, carried)
         results = [self._images() for _ in buffers]
+        images = [self._no_rows(self.rays) for _ in buffers] if self._held else []
+        features = [b["features"] for b in (self.buffers, *rest)] if self._held else []
         for channels in self.passes:
             depth = self.want & {"depth"} if channels.color else frozenset()
             if channels.channels and not self.couple:
@@ -277,11 +346,22 @@ class Compositor:
                     [[dr.gather(lib.Float, v, at, inside) for v in per_tangent] for per_tangent in carried]
                     for at, inside in zip(part.flat, part.inside, strict=True)
                 ]
-                states = part.run(Tangent(Primal(self.model, channels, depth), records, slots, rest, own))
-                dr.eval(states)
+                buffer, moved = None, []
+                if part.weights is not None:
+                    buffer = part.weights.zeros()
+                    moved = [part.weights.zeros() for _ in rest] if self.couple else []
+                primal = Primal(self.model, channels, depth, emit_weights(part, buffer))
+                states = part.run(Tangent(primal, records, slots, rest, own, [emit_weights(part, x) for x in moved]))
+                dr.eval(states, buffer, moved)
+                if part.weights is not None:
+                    f, *slopes = (in_rows(x, self.width) for x in features)
+                    part.weights.push(buffer, moved, f, slopes, images)
                 for at, inside, state in zip(part.flat, part.inside, states, strict=True):
                     for out, d in zip(results, state["d"], strict=True):
                         self._write_tangent(out, channels, at, inside, d)
+            if channels.color:
+                for out, image in zip(results, images, strict=False):
+                    out["features"] = lib.Float(image.view(-1))
         return results
 
     def _feature_tangent(self, out: dict, channels: Channels, features: Float) -> None:
@@ -303,11 +383,6 @@ class Compositor:
         first = 3 if channels.color else 0
         for k in range(channels.channels):
             dr.scatter(out["features"], d["sum"][first + k], at * self.width + channels.first + k, inside)
-
-
-def _add_to(total: Float) -> Emit:
-    """Sums up the weights of each Gaussian."""
-    return lambda index, k, place, w, ok: dr.scatter_add(total, w, index, ok)
 
 
 class Composite(dr.CustomOp):

@@ -24,7 +24,7 @@ from collections.abc import Callable
 import drjit as dr
 
 from drgs.tracing.harmonics import sh_color
-from drgs.tracing.kernels import Channels, HitModel, Primal, Ray
+from drgs.tracing.kernels import Channels, Emit, HitModel, Primal, Ray
 from drgs.tracing.protocols import Float, Mask, UInt32
 from drgs.tracing.records import load_packed, packed_size
 
@@ -69,6 +69,8 @@ class Adjoint:
         finals: Per shared ray, the final state of the Primal pass.
         cotangents: Per shared ray: `sum` (a float a channel), `alpha` (of sum w), `depth` (of sum w t*).
         depth: There is a depth cotangent.
+        scalar: What the features add to s: `scalar(shared ray, place, is hit)`; None without features here. The
+            cotangents then have `rest`, the sum of it over the ray's weights.
     """
 
     def __init__(
@@ -80,8 +82,9 @@ class Adjoint:
         cotangents: list,
         depth: bool,
         mode: dr.ReduceMode,
+        scalar: Callable[[int, list, Mask], Float] | None = None,
     ) -> None:
-        self.m, self.channels, self.grads, self.mode = model, channels, grads, mode
+        self.m, self.channels, self.grads, self.mode, self.scalar = model, channels, grads, mode, scalar
         self.finals, self.cotangents, self.slots = finals, cotangents, set(model.slots(depth))
 
     def init(self, k: int, alive: Mask, nowhere: list) -> dict:
@@ -95,6 +98,8 @@ class Adjoint:
         if self.channels.color:
             for c, background in zip(g["sum"][:3], self.m.background, strict=True):
                 rest = dr.fma(D(c * background), D(final["T"]), rest)
+        if self.scalar is not None:
+            rest += g["rest"]
         nothing = final["place"][0] == nowhere[0]
         return {
             "T": lib.Float(1),
@@ -119,7 +124,8 @@ class Adjoint:
             }
             dr.enable_grad(fixed)
             total, hits, carried = lib.Float(0), lib.Bool(False), []
-            for ray, st, g, final, place in zip(rays, states, self.cotangents, self.finals, places, strict=True):
+            shared = zip(rays, states, self.cotangents, self.finals, places, strict=True)
+            for number, (ray, st, g, final, place) in enumerate(shared):
                 ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])  # leaves, too
                 dr.enable_grad(ray.carried)
                 carried.append(ray.carried)
@@ -131,6 +137,8 @@ class Adjoint:
                 s = dr.fma(D(g["depth"]), D(depth0), D(g["alpha"]))
                 for v, c in zip(values, g["sum"], strict=True):
                     s = dr.fma(D(dr.detach(v)), D(c), s)  # a number, likewise
+                if self.scalar is not None:
+                    s += D(self.scalar(number, place, ok))
                 rest = st["rest"] - D(w) * s
                 left = 1 - a0
                 # Behind an a that rounds to 1 nothing was composited: there is no rest to share out.
@@ -170,12 +178,19 @@ class Tangent:
         slots: Entries of a record that they hold.
         tangents: K dicts of buffers laid out like those of `channels.buffers` besides the records.
         carried: Per shared ray and tangent, the tangent of what the ray carries.
+        emits: Per tangent, told of that of every weight like `Primal.emit`; None or empty without.
     """
 
     def __init__(
-        self, primal: Primal, records: Float, slots: list[int], tangents: list[dict], carried: list[list]
+        self,
+        primal: Primal,
+        records: Float,
+        slots: list[int],
+        tangents: list[dict],
+        carried: list[list],
+        emits: list[Emit | None] | None = None,
     ) -> None:
-        self.primal, self.m, self.channels = primal, primal.m, primal.channels
+        self.primal, self.m, self.channels, self.emits = primal, primal.m, primal.channels, emits
         self.records, self.slots, self.tangents, self.carried = records, slots, tangents, carried
 
     def init(self, k: int, alive: Mask, nowhere: list) -> dict:
@@ -197,7 +212,8 @@ class Tangent:
         speeds = self._load(index, rays[0], going)
         primal = [{k: v for k, v in st.items() if k != "d"} for st in states]
         out = self.primal.shade(index, rays, primal, places, active)
-        for ray, moving, st, new in zip(rays, self.carried, states, out, strict=True):
+        shared = zip(rays, self.carried, states, out, places, strict=True)
+        for number, (ray, moving, st, new, place) in enumerate(shared):
             live = active & (st["alive"] != 0)
             # The primal wrote what it decided: the weight is what T lost, and 0 where there was no hit.
             a0, depth0, ok = m.hit(loaded["record"], ray, live)
@@ -210,10 +226,12 @@ class Tangent:
             # One gradient of the hit serves all columns.
             slopes = [self._slopes(loaded["record"], ray, live, k) for k in range(2 if "depth" in new else 1)]
             new["d"] = []
-            for speed, moved, old in zip(speeds, moving, st["d"], strict=True):
+            for column, (speed, moved, old) in enumerate(zip(speeds, moving, st["d"], strict=True)):
                 da = dr.select(ok, _along(slopes[0], speed["record"], moved), 0)
                 dvalues = self._moved_values(loaded, speed, ray, moved)
                 dw = dr.fma(old["T"], dr.select(ok, a0, 0), T * da)
+                if self.emits and (emit := self.emits[column]) is not None:
+                    emit(index, number, place, dw, ok)
                 fresh = dict(old)
                 fresh["T"] = dr.select(ok, old["T"] * (1 - a0), old["T"]) - T * da
                 fresh["sum"] = [

@@ -50,6 +50,9 @@ class Traversal(Protocol):
     def parts(self, share: int) -> list[Part]:
         """All rays, `share` (1 or 4) a lane."""
 
+    def weighed(self, share: int, size: int) -> list[Part]:
+        """All rays, in parts whose weights are held, `size` bytes each; where there are no lists, as `parts`."""
+
 
 class Stream(Protocol):
     """Candidate Gaussians of every lane, one after the other; its state is part of that of Dr.Jit's loop."""

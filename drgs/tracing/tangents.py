@@ -105,7 +105,7 @@ def _pushed(call: Call, columns: list[dict]) -> tuple[dict, list[dict]]:
         dr.eval(buffers[-1], carried[-1])
     # What is composited is the same for all columns; its tangents are carried along, not recorded.
     with dr.suspend_grad():
-        primal = compositor.forward(*dr.detach(list(arguments)), keep=False)
+        primal = compositor.forward(*dr.detach(list(arguments)), keep=False, columns=len(columns))
         images = compositor.tangents(buffers, carried)
     dr.eval(images)
     return primal, images

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 import drjit as dr
+import torch
 
 from drgs import runtime
 from drgs.guards import memory
@@ -20,6 +21,7 @@ from drgs.tracing.projection import Projected
 from drgs.tracing.protocols import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.responses import RESPONSES
 from drgs.tracing.walk import ListStream, Part
+from drgs.tracing.weights import PIXELS, Weights, signed
 
 __all__ = ["TILE", "Lists", "TileTraversal", "build", "depth_order"]
 
@@ -55,16 +57,45 @@ class TileTraversal:
 
     def parts(self, share: int) -> list[Part]:
         """All pixels as one part."""
+        count = self.lists.columns * self.lists.rows
+        return [self._part(share, dr.arange(self.lib.UInt32, count * (TILE * TILE // share)) // (TILE * TILE // share))]
+
+    def weighed(self, share: int, size: int) -> list[Part]:
+        """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
+        lib, per_tile, made, begin, first = self.lib, TILE * TILE // share, [], 0, 0
+        lengths = signed(self.lists.end).long() - signed(self.lists.start).long()
+        ends, index = lengths.cumsum(0), signed(self.lists.index)
+        while begin < len(lengths):
+            end = int(torch.searchsorted(ends, first + size // (4 * PIXELS), right=True))
+            end = min(max(end, begin + 1), len(lengths))
+            last = int(ends[end - 1])
+            lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
+            part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin))
+            pixels = self._pixels(torch.arange(begin, end, device=lengths.device))
+            part.weights = Weights(lib, index[first:last], lengths[begin:end], first, pixels)
+            part.columns = [lane % per_tile + 16 * k for k in range(share)]
+            made.append(part)
+            begin, first = end, last
+        return made
+
+    def _pixels(self, tiles: torch.Tensor) -> torch.Tensor:
+        """(tiles, 64) row-major pixels in the order of lanes, -1 outside of the image."""
+        k = torch.arange(TILE * TILE, device=tiles.device)
+        x = (tiles % self.lists.columns)[:, None] * TILE + k // 16 % 2 * 4 + k % 4
+        y = (tiles // self.lists.columns)[:, None] * TILE + k // 32 * 4 + k % 16 // 4
+        return torch.where((x < self.width) & (y < self.height), y * self.width + x, -1)
+
+    def _part(self, share: int, tile: UInt32) -> Part:
+        """The pixels of tiles, one a lane, `share` a lane."""
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
-        lane = dr.arange(lib.UInt32, lists.columns * lists.rows * per_tile)
-        tile, inner = lane // per_tile, lane % per_tile
+        inner = dr.arange(lib.UInt32, dr.width(tile)) % per_tile
         block, k = inner // 16, inner % 16
         # 16 consecutive lanes, a packet, are 4x4 pixels.
         x = (tile % lists.columns) * TILE + (block % 2) * 4 + k % 4
         y = (tile // lists.columns) * TILE + (block // 2) * 4 + k // 4
-        blocks = [(0, 0), (4, 0), (0, 4), (4, 4)] if share == 4 else [(0, 0)]
-        pixels = [(x + a, y + b) for a, b in blocks]
+        corners = [(0, 0), (4, 0), (0, 4), (4, 4)] if share == 4 else [(0, 0)]
+        pixels = [(x + a, y + b) for a, b in corners]
         inside = [(px < self.width) & (py < self.height) for px, py in pixels]
         flat = [py * self.width + px for px, py in pixels]
         rays = [
@@ -77,7 +108,7 @@ class TileTraversal:
         start = dr.gather(lib.UInt32, lists.start, tile)
         end = dr.select(some, dr.gather(lib.UInt32, lists.end, tile), start)
         stream = ListStream(lib, lists.index, start, end, lists.ahead)
-        return [Part(lib, self.model, self.records, rays, flat, inside, stream, self.settings.order == "ray")]
+        return Part(lib, self.model, self.records, rays, flat, inside, stream, self.settings.order == "ray")
 
     def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""

@@ -20,6 +20,7 @@ import drjit as dr
 from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.protocols import Float, Kernel, Lib, Mask, Stream, UInt32
 from drgs.tracing.records import RECORD
+from drgs.tracing.weights import PIXELS, Weights
 
 __all__ = ["BUFFER", "EMPTY", "NOWHERE", "ListStream", "Part"]
 
@@ -74,6 +75,9 @@ class Part:
         flat: Per shared ray, the pixel (row-major index) it belongs to.
         inside: Per shared ray, whether there is such a pixel and this part decides it.
         failed: After a primal pass in exact order: lanes whose buffer was too short.
+        weights: Where the weights of these rays are held; None where they are not. A place in the order then ends
+            with that in the list.
+        columns: Per shared ray, its pixel of the tile.
     """
 
     def __init__(
@@ -92,6 +96,13 @@ class Part:
         self.rays, self.flat, self.inside = rays, flat, inside
         self.stream, self.ordered, self.center_key = stream, ordered, center_key
         self.failed = None
+        self.weights: Weights | None = None
+        self.columns: list[UInt32] = []
+
+    def held(self, k: int, place: list) -> UInt32:
+        """Where the weight of shared ray k at a place in its order is held."""
+        assert self.weights is not None
+        return (place[-1] - self.weights.first) * PIXELS + self.columns[k]
 
     def listed(self, again: UInt32) -> list[Part]:
         """Parts that walk some of the rays again, given by their lanes, along sorted lists of all their hits."""
@@ -184,31 +195,34 @@ class Part:
         """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
         lib, stream = self.lib, self.stream
         F, U = lib.Float, lib.UInt32
-        state = kernel.init(0, self.inside[0], [F(EMPTY), U(0)])
+        # What a hit is known by: the Gaussian, and where weights are held its place in the list.
+        known = 1 if self.weights is None else 2
+        state = kernel.init(0, self.inside[0], [F(EMPTY), *(U(0) for _ in range(known))])
         start = stream.begin()
-        keys, index = [F(EMPTY) for _ in range(BUFFER)], [U(0) for _ in range(BUFFER)]
+        keys, names = [F(EMPTY) for _ in range(BUFFER)], [[U(0) for _ in range(known)] for _ in range(BUFFER)]
 
         def exchange(
-            enter: Float, candidate: UInt32, keys: list[Float], index: list[UInt32], last: list, state: dict
+            enter: Float, name: list[UInt32], keys: list[Float], names: list[list[UInt32]], last: list, state: dict
         ) -> tuple:
             """Put a hit into the buffer and composite the one that leaves it."""
-            (key, at), keys, index = _push(enter, candidate, keys, index)
+            (key, at), keys, names = _push(enter, name, keys, names)
             out = key != EMPTY
-            (state,) = kernel.shade(at, self.rays, [state], [[key, at]], out)
-            return keys, index, [dr.select(out, key, last[0]), dr.select(out, at, last[1])], state
+            (state,) = kernel.shade(at[0], self.rays, [state], [[key, *at]], out)
+            return keys, names, [dr.select(out, key, last[0]), dr.select(out, at[0], last[1])], state
 
         def body(
-            s: Any, go: UInt32, keys: list[Float], index: list[UInt32], last: list, failed: UInt32, state: dict
+            s: Any, go: UInt32, keys: list[Float], names: list[list[UInt32]], last: list, failed: UInt32, state: dict
         ) -> tuple:
             """Meet the next candidate; `last` left the buffer last, `failed` is 1 where a hit came too late."""
+            place = stream.place(s)
             candidate, valid, bound, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, self.rays[0], valid)
             if check:
                 failed = dr.select(ok & _less(key, candidate, *last), 1, failed)
             enter = dr.select(ok & (state["alive"] != 0), key, EMPTY)
             # Most candidates miss most packets of lanes: the branch skips the rest for these.
-            keys, index, last, state = dr.if_stmt(
-                (enter, candidate, keys, index, last, state),
+            keys, names, last, state = dr.if_stmt(
+                (enter, [candidate, place][:known], keys, names, last, state),
                 enter != EMPTY,
                 exchange,
                 lambda _, __, *unchanged: unchanged,
@@ -216,30 +230,30 @@ class Part:
             going = state["alive"] != 0
             if check:
                 going |= bound <= last[0]
-            return s, dr.select(stream.more(s) & going, U(1), 0), keys, index, last, failed, state
+            return s, dr.select(stream.more(s) & going, U(1), 0), keys, names, last, failed, state
 
         go = dr.select(stream.more(start) & (state["alive"] != 0), U(1), 0)
-        loop = (start, go, keys, index, [F(EMPTY), U(0)], U(0), state)
-        _, _, keys, index, _, failed, state = dr.while_loop(loop, lambda s, go, *_: go != 0, body)
+        loop = (start, go, keys, names, [F(EMPTY), U(0)], U(0), state)
+        _, _, keys, names, _, failed, state = dr.while_loop(loop, lambda s, go, *_: go != 0, body)
         self.failed = failed != 0
-        return [self._drain(kernel, keys, index, state)]
+        return [self._drain(kernel, keys, names, state)]
 
-    def _drain(self, kernel: Kernel, keys: list[Float], index: list[UInt32], state: dict) -> dict:
+    def _drain(self, kernel: Kernel, keys: list[Float], names: list[list[UInt32]], state: dict) -> dict:
         """Composite what is left in the buffer."""
         lib = self.lib
 
-        def body(j: UInt32, keys: list[Float], index: list[UInt32], state: dict) -> tuple:
+        def body(j: UInt32, keys: list[Float], names: list[list[UInt32]], state: dict) -> tuple:
             (state,) = kernel.shade(
-                index[0], self.rays, [state], [[keys[0], index[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST)
+                names[0][0], self.rays, [state], [[keys[0], *names[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST)
             )
             keys = [*keys[1:], lib.Float(_LAST)]
-            index = [*index[1:], lib.UInt32(0)]
-            return j + 1, keys, index, state
+            names = [*names[1:], [lib.UInt32(0) for _ in names[0]]]
+            return j + 1, keys, names, state
 
-        def cond(j: UInt32, keys: list[Float], index: list[UInt32], state: dict) -> Mask:
+        def cond(j: UInt32, keys: list[Float], names: list[list[UInt32]], state: dict) -> Mask:
             return (j < BUFFER) & (state["alive"] != 0)
 
-        return dr.while_loop((lib.UInt32(0), keys, index, state), cond, body)[3]
+        return dr.while_loop((lib.UInt32(0), keys, names, state), cond, body)[3]
 
 
 def _less(key_a: Float, index_a: UInt32, key_b: Float, index_b: UInt32) -> Mask:
@@ -248,16 +262,23 @@ def _less(key_a: Float, index_a: UInt32, key_b: Float, index_b: UInt32) -> Mask:
 
 
 def _push(
-    key: Float, index: UInt32, keys: list[Float], indices: list[UInt32]
-) -> tuple[tuple[Float, UInt32], list[Float], list[UInt32]]:
-    """Insert into an ascending buffer and take its smallest out; pushing EMPTY changes nothing."""
-    keys, indices = list(keys), list(indices)
-    swap = _less(keys[0], indices[0], key, index)
-    out = dr.select(swap, keys[0], key), dr.select(swap, indices[0], index)
-    key, index = dr.select(swap, key, keys[0]), dr.select(swap, index, indices[0])
+    key: Float, name: list[UInt32], keys: list[Float], names: list[list[UInt32]]
+) -> tuple[tuple[Float, list[UInt32]], list[Float], list[list[UInt32]]]:
+    """Insert into a buffer that ascends by (key, Gaussian) and take its smallest out; pushing EMPTY changes nothing.
+
+    A name begins with the Gaussian.
+    """
+    keys, names = list(keys), list(names)
+    swap = _less(keys[0], names[0][0], key, name[0])
+    out = dr.select(swap, keys[0], key), _either(swap, names[0], name)
+    key, name = dr.select(swap, key, keys[0]), _either(swap, name, names[0])
     for j in range(1, len(keys)):
-        swap = _less(keys[j], indices[j], key, index)
-        keys[j - 1], indices[j - 1] = dr.select(swap, keys[j], key), dr.select(swap, indices[j], index)
-        key, index = dr.select(swap, key, keys[j]), dr.select(swap, index, indices[j])
-    keys[-1], indices[-1] = key, index
-    return out, keys, indices
+        swap = _less(keys[j], names[j][0], key, name[0])
+        keys[j - 1], names[j - 1] = dr.select(swap, keys[j], key), _either(swap, names[j], name)
+        key, name = dr.select(swap, key, keys[j]), _either(swap, name, names[j])
+    keys[-1], names[-1] = key, name
+    return out, keys, names
+
+
+def _either(first: Mask, a: list[UInt32], b: list[UInt32]) -> list[UInt32]:
+    return [dr.select(first, x, y) for x, y in zip(a, b, strict=True)]

@@ -1,0 +1,231 @@
+"""Feature images as products of matrices: the weights of a tile's list in its pixels, times the features of the list.
+
+What hits composite is linear in what they are colored with, so that D channels need no D sums along every ray. The
+traversal that composites the colors writes the weight w of every entry of a tile's list in every pixel of the tile; of
+these W (entries, 64)
+
+    F = W^T f          the feature image in the tile, f (entries, D) the features of the list
+    dL/df = W dL/dF    summed over the tiles that list a Gaussian
+    s = f (dL/dF)^T    (entries, 64): what the features add to the derivative of the loss by each weight
+
+are dense products, which a processor does at its full speed. The adjoint of the colors reads s, one number a hit,
+instead of D features and D cotangents. Weights are held for as many tiles at a time as `MATRIX` bytes have room for;
+products take those entries that any pixel of the tile composites, `_WORK` bytes of their features at a time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import torch
+
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Emit
+    from drgs.tracing.walk import Part
+
+__all__ = ["MATRIX", "PIXELS", "Weights", "emit_weights", "in_rows", "signed", "without_graph"]
+
+PIXELS = 64  # of a tile
+MATRIX = 128 << 20
+"""Bytes of the weights that are held at once; more where the list of a single tile has more."""
+_WORK = 4 << 20  # bytes of the features of the entries that one product takes
+_SLACK = 8  # tiles of one product: the most entries may be more than the fewest by 1/8, or by as many entries
+
+
+@dataclasses.dataclass
+class _Group:
+    """Tiles with about the same number of entries that count: a batch of equal matrices.
+
+    Attributes:
+        rows: (tiles, entries) rows in the buffer; those left over are the last row, which is 0.
+        index: Like `rows`, the Gaussians.
+        pixels: (tiles 64) row-major pixels, 0 where outside of the image.
+        inside: (tiles 64) bool: inside of the image.
+    """
+
+    rows: torch.Tensor
+    index: torch.Tensor
+    pixels: torch.Tensor
+    inside: torch.Tensor
+
+    def slices(self, width: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """(rows, Gaussians) of as many entries at a time as there is room for."""
+        tiles, entries = self.rows.shape
+        step = max(1, _WORK // (4 * width * tiles))
+        for k in range(0, entries, step):
+            yield self.rows[:, k : k + step].reshape(-1), self.index[:, k : k + step].reshape(-1)
+
+
+class Weights:
+    """The weights of some tiles: how they lie in a buffer, and products with them.
+
+    Args:
+        index: (entries,) int32, Gaussians of the tiles' lists, one list behind the other.
+        lengths: (T,) int64 of the lists.
+        first: Place of the first entry in the lists of the whole view.
+        pixels: (T, 64) int64: row-major pixel, -1 outside of the image.
+    Attributes:
+        kept: A buffer that the adjoint may use again, or None.
+    """
+
+    def __init__(self, lib: Lib, index: torch.Tensor, lengths: torch.Tensor, first: int, pixels: torch.Tensor) -> None:
+        self.lib, self.lengths, self.pixels, self.inside = lib, lengths, pixels.clamp_min(0), pixels >= 0
+        self.index = torch.cat([index, index.new_zeros(1)])  # of the row that is 0, too
+        self.rows, self.first = len(index), dr.opaque(lib.UInt32, first)
+        self.kept: Float | None = None
+        self._groups: list[_Group] | None = None
+        self._width = 0
+
+    def zeros(self) -> Float:
+        """A buffer."""
+        return dr.zeros(self.lib.Float, (self.rows + 1) * PIXELS)
+
+    def skip(self, pixels: UInt32) -> None:
+        """Leave out pixels of the image: what the buffer says of them is wrong."""
+        self.inside &= ~torch.isin(self.pixels, signed(pixels).long())
+        self._groups = None
+
+    def image(self, buffer: Float, features: torch.Tensor, out: torch.Tensor) -> None:
+        """Add W^T f to the pixels of `out` (pixels, D); `features` is (N, D)."""
+        flat, width = _matrix(buffer), features.shape[1]
+        for group in self._grouped(width):
+            tiles = len(group.rows)
+            total = features.new_zeros(tiles, PIXELS, width)
+            for rows, index in group.slices(width):
+                W, f = flat.index_select(0, rows), features.index_select(0, index)
+                torch.baddbmm(total, W.view(tiles, -1, PIXELS).mT, f.view(tiles, -1, width), out=total)
+            total = total.view(-1, width)
+            if bool(group.inside.all()):
+                out.index_add_(0, group.pixels, total)
+            else:
+                out.index_add_(0, group.pixels[group.inside], total[group.inside])
+
+    def push(self, buffer: Float, moved: list[Float], f: torch.Tensor, df: list[torch.Tensor], out: list) -> None:
+        """Add dW^T f + W^T df to the images `out` of tangents, the latter alone without buffers `moved` of dW."""
+        for change, image in zip(moved, out, strict=False):
+            self.image(change, f, image)
+        for slopes, image in zip(df, out, strict=True):
+            if bool(slopes.any()):
+                self.image(buffer, slopes, image)
+
+    def gradient(self, buffer: Float, cotangent: torch.Tensor, out: torch.Tensor) -> None:
+        """Add W dL/dF to the rows of `out` (N, D); `cotangent` dL/dF is (pixels, D)."""
+        flat, width = _matrix(buffer), cotangent.shape[1]
+        for group in self._grouped(width):
+            g = _gathered(cotangent, group)
+            for rows, index in group.slices(width):
+                W = flat.index_select(0, rows).view(len(g), -1, PIXELS)
+                out.index_add_(0, index, torch.bmm(W, g).view(-1, width))
+
+    def scalars(self, features: torch.Tensor, cotangent: torch.Tensor) -> Float:
+        """f (dL/dF)^T, laid out like the weights; 0 where these are."""
+        width = features.shape[1]
+        flat = features.new_zeros(self.rows + 1, PIXELS)
+        for group in self._grouped(width):
+            g = _gathered(cotangent, group).mT
+            for rows, index in group.slices(width):
+                f = features.index_select(0, index).view(len(g), -1, width)
+                flat.index_copy_(0, rows, torch.bmm(f, g).view(-1, PIXELS))
+        return self.lib.Float(flat.view(-1))
+
+    def totals(self, buffer: Float, scalars: Float) -> Float:
+        """(T 64) Float64: sum over the entries of w s, as precise as the adjoint takes it apart again."""
+        lib = self.lib
+        start = self.lengths.cumsum(0) - self.lengths
+        begin, count = (lib.UInt32(lib.Int32(x.to(torch.int32))) for x in (start, self.lengths))
+        lane = dr.arange(lib.UInt32, len(self.lengths) * PIXELS)
+        first, count = (dr.gather(lib.UInt32, x, lane // PIXELS) for x in (begin, count))
+        at = first * PIXELS + lane % PIXELS
+
+        def body(k: UInt32, total: Float) -> tuple[UInt32, Float]:
+            w, s = (lib.Float64(dr.gather(lib.Float, x, at + k * PIXELS)) for x in (buffer, scalars))
+            return k + 1, dr.fma(w, s, total)
+
+        state = (dr.zeros(lib.UInt32, dr.width(lane)), dr.zeros(lib.Float64, dr.width(lane)))
+        with dr.suspend_grad():  # part of a derivative
+            total = dr.while_loop(state, lambda k, total: k < count, body)[1]
+        dr.eval(total)
+        return total
+
+    def survey(self, buffer: Float) -> None:
+        """Find out which entries any pixel composites; products need it."""
+        self._touched = _matrix(buffer)[:-1].sum(1).nonzero()[:, 0]  # weights are >= 0
+        self._groups = None
+
+    def _grouped(self, width: int) -> list[_Group]:
+        """The tiles in groups, those with most entries first; tiles without any are in none."""
+        if self._groups is not None and self._width == width:
+            return self._groups
+        ends = self.lengths.cumsum(0)
+        ends = torch.searchsorted(self._touched, ends)
+        counts = torch.diff(ends, prepend=ends.new_zeros(1))
+        starts = ends - counts
+        counts, tiles = torch.sort(counts, descending=True, stable=True)
+        touched = torch.cat([self._touched, self._touched.new_full((1,), self.rows)])
+        ascending, filled, k = counts.flip(0), int((counts > 0).sum()), 0
+        self._groups, self._width = [], width
+        while k < filled:
+            most = int(counts[k])
+            fewest = max(most - max(most // _SLACK, _SLACK), 1)
+            similar = len(tiles) - int(torch.searchsorted(ascending, fewest)) - k
+            count = max(min(similar, _WORK // (4 * width * most)), 1)
+            own, j = tiles[k : k + count], torch.arange(most, device=tiles.device)
+            at = torch.where(j < counts[k : k + count, None], starts[own, None] + j, -1)  # -1: the row that is 0
+            rows = touched[at]
+            inside = self.inside[own].view(-1)
+            self._groups.append(_Group(rows, self.index[rows], self.pixels[own].view(-1), inside))
+            k += count
+        return self._groups
+
+
+def _gathered(cotangent: torch.Tensor, group: _Group) -> torch.Tensor:
+    """(tiles, 64, D): the cotangents of a group's pixels, 0 where they do not count."""
+    g = cotangent.index_select(0, group.pixels)
+    if not bool(group.inside.all()):
+        g[~group.inside] = 0
+    return g.view(len(group.rows), PIXELS, -1)
+
+
+def emit_weights(part: Part, buffer: Float | None, visibility: Float | None = None) -> Emit | None:
+    """Writes the weights of a part into a buffer, and sums up those of each Gaussian; None if nothing is to be done."""
+    if buffer is None and visibility is None:
+        return None
+
+    def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
+        if buffer is not None:
+            dr.scatter(buffer, w, part.held(k, place), ok)
+        if visibility is not None:
+            dr.scatter_add(visibility, w, index, ok)
+
+    return emit
+
+
+def without_graph(method: Callable) -> Callable:
+    """A method whose operations of torch are of numbers: no graph records them and no transform of torch sees them."""
+
+    @functools.wraps(method)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with torch.no_grad(), torch._C._DisableFuncTorch():
+            return method(*args, **kwargs)
+
+    return call
+
+
+def in_rows(flat: Float, width: int) -> torch.Tensor:
+    """A flat array in torch, `width` floats a row."""
+    return flat.torch().view(-1, width)
+
+
+def _matrix(buffer: Float) -> torch.Tensor:
+    return in_rows(buffer, PIXELS)
+
+
+def signed(x: UInt32) -> torch.Tensor:
+    """In torch, which knows few operations of unsigned integers."""
+    return x.torch().view(torch.int32)
