@@ -20,8 +20,9 @@ import drjit as dr
 from drgs import runtime
 from drgs.settings import RenderSettings
 from drgs.tracing.bvh import BvhTraversal
-from drgs.tracing.composite import Composite, Compositor
+from drgs.tracing.composite import Compositor
 from drgs.tracing.harmonics import sh_basis
+from drgs.tracing.operation import Composite
 from drgs.tracing.projection import project_world
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 

@@ -16,9 +16,10 @@ from drgs.guards import memory
 from drgs.guards.arguments import ArgumentError, kind_of
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
-from drgs.tracing.composite import Composite, Compositor
+from drgs.tracing.composite import Compositor
 from drgs.tracing.field import Field
 from drgs.tracing.harmonics import sh_basis
+from drgs.tracing.operation import Composite
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.tiles import TileTraversal
 

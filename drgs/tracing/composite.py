@@ -3,7 +3,7 @@
 `Compositor` is plain: color, depth and coverage come out of a first traversal, its adjoint replays it, its forward mode
 carries any number of tangents through one traversal. Feature channels are products with the weights that the first
 traversal writes down (weights.py) where rays walk along lists of tiles; elsewhere they come out of further traversals,
-`CHUNK` channels each. `Composite` makes it one differentiable operation of Dr.Jit.
+`CHUNK` channels each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.walk import Part
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, emit_weights, in_rows, without_graph
 
-__all__ = ["CHUNK", "Composite", "Compositor"]
+__all__ = ["CHUNK", "Compositor"]
 
 CHUNK = 32  # feature channels of one traversal
 
@@ -383,32 +383,3 @@ class Compositor:
         first = 3 if channels.color else 0
         for k in range(channels.channels):
             dr.scatter(out["features"], d["sum"][first + k], at * self.width + channels.first + k, inside)
-
-
-class Composite(dr.CustomOp):
-    """`dr.custom(Composite, compositor, record, sh, features, carried, keep)`: `Compositor.forward`, with AD."""
-
-    def eval(
-        self,
-        compositor: Compositor,
-        record: list[Float],
-        sh: Float | None,
-        features: Float | None,
-        carried: list[Float],
-        keep: bool,
-    ) -> dict:
-        """Dr.Jit's name for it."""
-        self.compositor = compositor
-        return compositor.forward(record, sh, features, carried, keep)
-
-    def backward(self) -> None:
-        """Dr.Jit reverse mode."""
-        for name, x in self.compositor.adjoint(self.grad_out()).items():
-            self.set_grad_in(name, x)
-
-    def forward(self) -> None:
-        """Dr.Jit forward mode: one tangent."""
-        c = self.compositor
-        tangent = {name: self.grad_in(name) for name in c.buffers}
-        carried = self.grad_in("carried") if c.carried else []
-        self.set_grad_out(c.tangents([tangent], [carried])[0])
