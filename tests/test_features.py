@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
-from scenes_random import FIELDS, camera, gaussians, gradients, relative, twist_basis
+from scenes_random import FIELDS, Oracle, camera, compare, gaussians, gradients, relative, twist_basis
 
 import drgs
 from drgs import reference
-from drgs.integrator import render, render_jvp
+from drgs.integrator import OUTPUTS, render, render_jvp
+from drgs.tracing import composite, walk, weights
 
 IMAGE, GRADIENT = 1e-5, 1e-4  # those of tests/test_integrator.py
 Preset = drgs.RenderSettings.preset
@@ -79,3 +81,104 @@ def test_uncoupled_through_torch(rng):
     torch.testing.assert_close(tangent, only, rtol=1e-6, atol=1e-6)  # linear in the features, in float32
     with pytest.raises(ValueError, match="couple_features must be a bool, got the int 0"):
         render(g, cam, couple_features=0)
+
+
+WIDTHS = {
+    1: {"preset": "exact", "extent": 4.0, "background": (0.2, 0.5, 0.9)},
+    3: {"preset": "exact", "order": "center", "response": "integral", "alpha_max": 0.9, "extent": 3.0},
+    128: {"preset": "fast", "transmittance_min": 0.2, "background": (0.2, 0.5, 0.9)},
+    512: {"preset": "inria", "near": 0.0, "max_hits": 4},
+}
+
+
+def settings_of(width):
+    """Of `WIDTHS`."""
+    fields = dict(WIDTHS[width])
+    return Preset(fields.pop("preset"), **fields)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_any_width(rng, width, monkeypatch):
+    """Images, all gradients and forward mode against the oracle; in exact order with rays that are redone."""
+    settings = settings_of(width)
+    monkeypatch.setattr(walk, "BUFFER", 2)  # too short for these rays
+    # Opaque Gaussians leave R_i / (1 - a_i) without digits unless the sums are float64, s included.
+    cam, g = camera(rng, (11, 9)), gaussians(rng, 24, 4, width, scale=0.3, opacity=6.0)
+    errors = compare(g, cam, settings, Oracle(g, cam, settings, rng))
+    assert errors.finite
+    assert (errors.out.certificate.get("redone", 0) > 10) == (settings.order == "ray")
+    for name, error in errors.image.items():
+        assert error <= IMAGE * (max(1, float(g.features.detach().abs().max())) if name == "features" else 1), name
+    for name, error in {**errors.gradient, **errors.forward}.items():
+        assert error <= GRADIENT, (name, error)
+    assert errors.duality <= GRADIENT
+
+
+def everything(g, cam, settings, **options):
+    """Image of features, gradients of a loss of all images by all groups, and tangents."""
+    rng = np.random.default_rng(3)
+    out = render(g, cam, settings, outputs="all", **options)
+    u = {n: torch.tensor(rng.normal(size=tuple(getattr(out, n).shape))) for n in FIELDS}
+    v = {name: torch.tensor(rng.normal(size=tuple(x.shape))) for name, x in g.parameters().items()}
+    pushed = render_jvp(g, cam, v, settings, **options)
+    return {
+        **{name: getattr(out, name).detach() for name in (*FIELDS, "visibility")},
+        **{f"gradient of {name}": x for name, x in gradients(g, cam, out, u).items()},
+        **{f"tangent of {name}": getattr(pushed, name) for name in FIELDS},
+    }
+
+
+@pytest.mark.parametrize("width", [128, 1])
+def test_blocks_of_weights(rng, width, monkeypatch):
+    """Weights that are held for a few tiles at a time give the same, and are never more than the bound."""
+    cam, g = camera(rng, (29, 21)), gaussians(rng, 40, 4, 24)
+    settings, sizes, zeros = settings_of(width), [], weights.Weights.zeros
+    monkeypatch.setattr(walk, "BUFFER", 2)
+
+    def noted(held):
+        sizes.append((len(held.lengths), zeros(held)))
+        return sizes[-1][1]
+
+    for couple in (True, False)[: 1 + (width == 128)]:  # each compiles kernels
+        whole = everything(g, cam, settings, couple_features=couple)
+        with monkeypatch.context() as small:
+            small.setattr(composite, "MATRIX", 12 << 10)
+            small.setattr(weights, "_WORK", 1 << 10)
+            small.setattr(weights.Weights, "zeros", noted)
+            parts = everything(g, cam, settings, couple_features=couple)
+        for name, x in whole.items():
+            # Sums in another order, in float32.
+            assert relative(parts[name].double(), x.double()) < 1e-5, name
+    assert len(sizes) > 20
+    # One row more than there are entries; a tile alone may need more than the bound.
+    assert all(tiles == 1 or 4 * (len(x) - weights.PIXELS) <= 12 << 10 for tiles, x in sizes)
+
+
+def test_without_features_nothing_is_held(rng, monkeypatch):
+    """A scene without features asks for no weights and no products; one without Gaussians has an image of zeros."""
+    cam, g = camera(rng, (9, 7)), gaussians(rng, 12, 4, 0)
+
+    def fails(*arguments):
+        raise AssertionError("weights are held")
+
+    for name in ("__init__", "zeros", "survey", "image", "gradient", "scalars", "totals", "push"):
+        monkeypatch.setattr(weights.Weights, name, fails)
+    render(g, cam, Preset("fast"), outputs=OUTPUTS).rgb.sum().backward()
+    render_jvp(g, cam, {"means": torch.ones(12, 3)}, Preset("fast"))
+    with pytest.raises(RuntimeError):  # Dr.Jit's, of the error above
+        render(g.replace(features=torch.ones(12, 3)), cam, Preset("fast"))
+    empty = gaussians(rng, 0, 1, 5)
+    assert render(empty, cam, Preset("fast")).features.shape == (7, 9, 5)
+    assert not render(empty, cam, Preset("fast")).features.any()
+
+
+def test_features_that_are_no_numbers(rng):
+    """NaN and infinite features are refused; a loss that leaves the features out has no gradient by them."""
+    cam, g = camera(rng, (9, 7)), gaussians(rng, 12, 1, 3)
+    for bad in (float("nan"), float("inf")):
+        features = g.features.detach().clone()
+        features[4, 1] = bad
+        with pytest.raises(ValueError, match="features must be finite"):
+            render(g.replace(features=features), cam, Preset("fast"))
+    render(g, cam, Preset("fast")).rgb.sum().backward()
+    assert not g.features.grad.any()
