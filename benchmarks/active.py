@@ -1,25 +1,29 @@
-"""From 2 to 12 views by every policy: held-out quality, paired over scenes and seeds.
+"""From 2 to 12 views by every policy, color alone: held-out quality, paired over scenes and seeds.
 
-    python benchmarks/active.py [--scale small] [--seeds 3] [--scenes ...] [--policies ...] [--shard 0/2] [--page]
+    python benchmarks/active.py [--scale small] [--seeds 3] [--start first] [--scenes ...] [--policies ...]
+    python benchmarks/active.py --page
 
-The paper's static loop (2 views, one more every 200 steps at `paper` scale). Rows of benchmarks/active.json and runs
-that are there are kept and killed ones resumed, so that shards may work side by side; `--again` drops the rows. Results
-go to docs/active-static.md and benchmarks/active.json, each row with the commit that it ran on.
+The paper's static loop (2 views, one more every 200 steps at `paper` scale) as cells of `drgs.lab.study`: rows of
+benchmarks/active.jsonl and runs that are there are kept, killed ones resumed, and several processes may work side by
+side. Every 8th view is held out. The rows that are there begin with the first view whatever the seed: three units, one
+a scene, with three seeds each. `--start seed` makes every seed a unit. The page, docs/active-static.md, is of one of
+both.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import sys
+import textwrap
 from pathlib import Path
 
-import numpy as np
 import studies
 from studies import ROOT, SCALES
 
-from drgs.train import ActiveConfig, FitConfig, fit
+from drgs.lab.study import Metric, Study, read_study, run_cells
+from drgs.lab.study_report import fill_between, study_report
+from drgs.train import ActiveConfig, FitConfig
 
-BEGIN, END = "<!-- active: begin -->", "<!-- active: end -->"
 POLICIES = {
     "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
     "fisher, eig": {"policy": "fisher", "criterion": "eig"},
@@ -35,150 +39,61 @@ POLICIES = {
     "uniform": {"policy": "uniform"},
     "random": {"policy": "random"},
 }
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", "flip": "FLIP"}
-REFERENCE = "random"
-RESULTS = ROOT / "benchmarks" / "active.json"
+METRICS = (Metric("psnr", "PSNR", 2), Metric("ssim", "SSIM"), Metric("flip", "FLIP", larger=False))
+RESULTS = ROOT / "benchmarks" / "active.jsonl"
+SPLIT = 8, 0
 
 
-def key_of(row: dict) -> tuple:
-    """What tells a run from the others."""
-    return row["scene"], row["policy"], row["seed"]
-
-
-def path_of(runs: Path, scale: str, name: str, label: str, seed: int) -> Path:
-    """Folder of a run."""
-    words = label.replace(",", "").replace(" ", "-")
-    return runs / "active" / f"{scale}-{name}-{words}-{seed}"
-
-
-def run(runs: Path, scale: str, name: str, label: str, seed: int) -> None:
-    """One fit, unless it is finished."""
-    folder = path_of(runs, scale, name, label, seed)
-    if (folder / "metrics.json").exists():
-        return
-    print(folder.name, flush=True)
+def study_of(scale: str, runs: Path) -> Study:
+    """The study at a scale."""
     size = dict(SCALES[scale])
     every = size.pop("every")
-    data = studies.dataset(name, runs, lazy=True, points=False)
-    active = ActiveConfig(initial=2, add=10, every=every, **POLICIES[label])
-    fit(data, folder, FitConfig(seed=seed, **size), active=active, resume=folder.exists(), progress=False)
+    return Study(
+        name=f"active-{scale}",
+        folder=lambda scene, split: studies.folder(scene, runs),
+        policies=POLICIES,
+        fit=FitConfig(**size),
+        active=ActiveConfig(initial=2, add=10, every=every),
+        metrics=METRICS,
+        reference="random",
+    )
 
 
-def row_of(folder: Path, name: str, label: str, seed: int) -> dict:
-    """What a finished run found."""
-    metrics = json.loads((folder / "metrics.json").read_text())
-    picks = json.loads((folder / "selection.json").read_text())["picks"]
-    return {
-        "scene": name,
-        "policy": label,
-        "seed": seed,
-        **{key: metrics["mean"][key] for key in METRICS},
-        "seconds": metrics["seconds"],
-        "pick seconds": float(np.mean([pick["seconds"] for pick in picks])),
-        "picks": [pick["index"] for pick in picks],
-        "commit": json.loads((folder / "env.json").read_text())["commit"][:7],
-    }
-
-
-def report(rows: list[dict], scale: str, made: str) -> str:
+def page_of(scale: str, start: str) -> str:
     """The part of docs/active-static.md."""
     size = SCALES[scale]
-    commits = dict.fromkeys(r["commit"] for r in rows)
-    scenes = list(dict.fromkeys(r["scene"] for r in rows))
-    labels = [label for label in POLICIES if any(r["policy"] == label for r in rows)]
-    seeds = 1 + max(r["seed"] for r in rows)
-    ran = [sum(r["scene"] == s and r["policy"] == label for r in rows) for s in scenes for label in labels]
-    number = f"{min(ran)} to {max(ran)} seeds" if min(ran) < max(ran) else f"{seeds} seeds"
-    lines = [
-        f"Made by {made} Rows ran on commits {', '.join(commits)} (benchmarks/active.json says which).",
-        "",
-        f"`--scale {scale}`: {size['max_gaussians']:,} Gaussians, at most {size['max_pixels']:,} pixels, "
-        f"{size['max_steps']:,} steps, 2 views and one more every {size['every']} steps until 12; {number}.",
-        "Every 8th view is held out. Nothing of a view is read before it is picked. Mean over the seeds, and every",
-        "seed's PSNR:",
-    ]
-    for name in scenes:
-        lines += [
-            "",
-            f"### {name}",
-            "",
-            "| policy | PSNR | each seed | SSIM | FLIP | seconds a pick |",
-            "|---|---|---|---|---|---|",
-        ]
-        for label in labels:
-            part = [r for r in rows if r["scene"] == name and r["policy"] == label]
-            if part:
-                mean = {k: np.mean([r[k] for r in part]) for k in (*METRICS, "pick seconds")}
-                each = " ".join(f"{r['psnr']:.2f}" for r in part)
-                lines.append(
-                    f"| {label} | {mean['psnr']:.2f} | {each} | {mean['ssim']:.3f} | {mean['flip']:.3f} "
-                    f"| {mean['pick seconds']:.2f} |"
-                )
-    lines += [
-        "",
-        "### Against picking at random",
-        "",
-        f"Differences to `{REFERENCE}` on the same scene and seed; mean over all scene and seed pairs with its 95 %",
-        "bootstrap interval, and in how many pairs the policy was better.",
-        "",
-        "| policy | PSNR, dB | SSIM | FLIP (lower is better) | better PSNR |",
-        "|---|---|---|---|---|",
-    ]
-    at = {key_of(r): r for r in rows}
-    for label in labels:
-        pairs = [
-            (at[s, label, k], at[s, REFERENCE, k])
-            for s in scenes
-            for k in range(seeds)
-            if (s, label, k) in at and (s, REFERENCE, k) in at
-        ]
-        if label == REFERENCE or not pairs:
-            continue
-        cells = []
-        for key in METRICS:
-            mean, low, high = studies.interval([a[key] - b[key] for a, b in pairs])
-            digits = 2 if key == "psnr" else 3
-            cells.append(f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]")
-        wins = sum(a["psnr"] > b["psnr"] for a, b in pairs)
-        lines.append(f"| {label} | " + " | ".join(cells) + f" | {wins} of {len(pairs)} |")
-    return "\n".join(lines)
+    rows = [row for row in read_study(RESULTS) if row["start"] == start]
+    seeds = len({row["seed"] for row in rows})
+    text = (
+        f"`python benchmarks/active.py --scale {scale} --start {start}`: {size['max_gaussians']:,} Gaussians, at most "
+        f"{size['max_pixels']:,} pixels, {size['max_steps']:,} steps, 2 views and one more every {size['every']} steps "
+        f"until 12; {seeds} seeds. Nothing of a view is read before it is picked."
+    )
+    return textwrap.fill(text, 120, break_on_hyphens=False) + "\n\n" + study_report(study_of(scale, Path()), rows)
 
 
-def main():
+def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--scale", choices=list(SCALES), default="small")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--start", choices=("first", "seed"), default="first", help="what the initial views begin with")
     parser.add_argument("--scenes", nargs="+", default=list(studies.SCENES))
     parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=list(POLICIES))
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
-    parser.add_argument("--again", action="store_true", help="run everything anew")
-    parser.add_argument("--shard", default="0/1", help="K/N: every N-th run from the K-th on, and no page if N > 1")
-    parser.add_argument("--page", action="store_true", help="the page of the runs that there are")
+    parser.add_argument("--shard", default="0/1", help="K/N: every N-th cell from the K-th on")
+    parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
     args = parser.parse_args()
+    if args.page:
+        fill_between(ROOT / "docs" / "active-static.md", "active", page_of(args.scale, args.start))
+        return 0
+    study = study_of(args.scale, args.runs)
+    units = [(scene, SPLIT, args.start, "blind", seed) for seed in range(args.seeds) for scene in args.scenes]
     shard, shards = map(int, args.shard.split("/"))
-    kept = studies.read_rows(RESULTS, {}) if not args.again else {}
-    known = {key_of(r): r for r in kept.get("rows", []) if kept["scale"] == args.scale}
-    # Seeds outermost: what there is at any time is a complete study of fewer seeds.
-    jobs = [(s, label, k) for k in range(args.seeds) for s in args.scenes for label in args.policies]
-    for name, label, seed in [] if args.page else jobs[shard::shards]:
-        if (name, label, seed) not in known:
-            run(args.runs, args.scale, name, label, seed)
-    if shards > 1 and not args.page:
-        return
-    for job in jobs:
-        folder = path_of(args.runs, args.scale, *job)
-        if job not in known and (folder / "metrics.json").exists():
-            known[job] = row_of(folder, *job)
-    order = [(s, label) for s in studies.SCENES for label in POLICIES]
-    rows = sorted(known.values(), key=lambda r: (order.index((r["scene"], r["policy"])), r["seed"]))
-    made = studies.stamp("active")
-    text = report(rows, args.scale, made)
-    print(text)
-    studies.write_rows(RESULTS, {"made": made, "scale": args.scale, "rows": rows})
-    page = ROOT / "docs" / "active-static.md"
-    before, _, rest = page.read_text().partition(BEGIN)
-    page.write_text(before + BEGIN + "\n\n" + text + "\n\n" + END + rest.partition(END)[2])
+    cells = [cell for cell in study.cells(units) if cell.policy in args.policies][shard::shards]
+    taken, failed = run_cells(study, cells, args.runs, RESULTS, say=lambda line: print(line, flush=True))
+    print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {studies.stamp('active')}")
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

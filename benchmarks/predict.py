@@ -22,9 +22,9 @@ from studies import ROOT
 import drgs
 from drgs import fisher
 from drgs.gain import Prior, variances
+from drgs.lab.study_report import fill_between
 from drgs.select import Cache, select
 
-BEGIN, END = "<!-- predict: begin -->", "<!-- predict: end -->"
 VIEWS, STEPS, MORE = 6, 1000, 200
 COVERED = ", alpha > 0.5"
 RELATIVE = {"policy": "fisher", "prior": Prior(1e-3, relative=True)}
@@ -197,9 +197,7 @@ def main():
     print(text)
     if tuple(args.scenes) == studies.SCENES:
         studies.write_rows(ROOT / "benchmarks" / "predict.json", {"made": made, "scenes": result})
-        page = ROOT / "docs" / "active-static.md"
-        before, _, rest = page.read_text().partition(BEGIN)
-        page.write_text(before + BEGIN + "\n\n" + text + "\n\n" + END + rest.partition(END)[2])
+        fill_between(ROOT / "docs" / "active-static.md", "predict", text)
 
 
 if __name__ == "__main__":

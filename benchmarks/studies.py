@@ -1,4 +1,6 @@
-"""What the studies share: scenes at `--scale small`, base models, statistics, and the line that says where and when.
+"""What the studies share: scenes at `--scale small`, base models, and the line that says where and when.
+
+Studies of fits are cells of `drgs.lab.study`, their statistics are in `drgs.lab.study_statistics`.
 
 `small` is 15,000 Gaussians, at most 12,000 pixels and a fifth of the paper's steps (a pick every 40 of 1,400);
 `paper` is 30,000 Gaussians, 130,000 pixels and its 7,000 steps.
@@ -17,8 +19,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-import numpy as np  # noqa: E402
-
 from drgs import runtime  # noqa: E402
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
@@ -33,7 +33,7 @@ __all__ = [
     "SCENES",
     "base",
     "dataset",
-    "interval",
+    "folder",
     "rank_correlation",
     "read_rows",
     "stamp",
@@ -48,13 +48,18 @@ SCALES = {
 }
 
 
-def dataset(name: str, runs: Path, **options):
-    """A scene's views; the still life is made where it is not there yet. `options` as of `drgs.data.load`."""
+def folder(name: str, runs: Path) -> Path:
+    """A scene's data set; the still life is made where it is not there yet."""
     if name != "still_life":
-        return load(DATA / name, **options)
+        return DATA / name
     from scenes import still_life
 
-    return load(still_life.generate(runs / "still_life", views=40, width=240, height=180), **options)
+    return still_life.generate(runs / "still_life", views=40, width=240, height=180)
+
+
+def dataset(name: str, runs: Path, **options):
+    """A scene's views; `options` as of `drgs.data.load`."""
+    return load(folder(name, runs), **options)
 
 
 def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") -> tuple:
@@ -107,14 +112,6 @@ def rank_correlation(a, b, kind: str = "spearman") -> float:
     from scipy import stats
 
     return float((stats.spearmanr if kind == "spearman" else stats.kendalltau)(a, b).statistic)
-
-
-def interval(values, draws: int = 10_000) -> tuple[float, float, float]:
-    """Mean and the 95 % bootstrap interval of the mean."""
-    values = np.asarray(values, float)
-    rng = np.random.default_rng(0)
-    means = values[rng.integers(0, len(values), (draws, len(values)))].mean(1)
-    return float(values.mean()), float(np.quantile(means, 0.025)), float(np.quantile(means, 0.975))
 
 
 def stamp(script: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import itertools
 import json
 import multiprocessing
@@ -360,3 +361,13 @@ def test_the_report_says_gain_and_loss(tmp_path):
     assert page.read_text() == "a\n<!-- x: begin -->\n\nnew\n\n<!-- x: end -->\nb\n"
     with pytest.raises(ValueError, match="must have <!-- y: begin --> and <!-- y: end -->"):
         fill_between(page, "y", "new")
+
+
+def test_a_page_comes_from_its_rows(monkeypatch):
+    """The tables of docs/active-static.md are what benchmarks/active.py makes of benchmarks/active.jsonl."""
+    root = Path(__file__).parents[1]
+    monkeypatch.syspath_prepend(root / "benchmarks")
+    active = importlib.import_module("active")
+    text = active.page_of("small", "first")
+    assert text in (root / "docs" / "active-static.md").read_text()
+    assert "72 fits" in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in study.policies]
     if not rows:
         return "No cell is finished."
-    parts = [_size(rows)]
+    parts = [_wrapped(_size(rows))]
     protocols = [name for name in _PROTOCOLS if any(row["protocol"] == name for row in rows)]
     for protocol in protocols:
         mine = [row for row in rows if row["protocol"] == protocol]
@@ -45,7 +46,11 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             parts += [f"{below} {scene}", _means(study, [row for row in mine if row["scene"] == scene])]
         if study.reference in study.policies and len({row["policy"] for row in mine}) > 1:
             others = [(label, study.reference) for label in study.policies if label != study.reference]
-            parts += [f"{below} Against `{study.reference}`", _explained(mine), _compared(study, mine, others)]
+            parts += [
+                f"{below} Against `{study.reference}`",
+                _wrapped(_explained(mine)),
+                _compared(study, mine, others),
+            ]
             if verdicts := _verdicts(study, mine, others):
                 parts.append(verdicts)
         if study.comparisons:
@@ -72,6 +77,10 @@ def fill_between(page: Path, name: str, text: str) -> None:
         file.write(f"{before}{begin}\n\n{text}\n\n{end}{after}".encode())
 
 
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
+
+
 def _size(rows: StudyRows) -> str:
     """How much there is, and what it ran on."""
     commits = dict.fromkeys((row.get("commit") or "unknown")[:7] for row in rows)
@@ -82,7 +91,7 @@ def _size(rows: StudyRows) -> str:
         if row.get("views"):
             views.setdefault(row["scene"], set()).add(row["views"])
     each = [
-        f"{scene} {len(found)}" + (f" (each with {_range(views[scene])} test views)" if scene in views else "")
+        f"{scene} {len(found)}" + (f" ({_range(views[scene])} test views)" if scene in views else "")
         for scene, found in units.items()
     ]
     return (
@@ -203,7 +212,7 @@ def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
 
 
 def _points(study: Study, rows: StudyRows) -> str:
-    """One table a metric: policies against units, nothing averaged but the fits of one unit."""
+    """One table a metric: policies against units, every fit's number; of one unit in the order of their seeds."""
     units = sorted({unit_of(row) for row in rows})
     names = _unit_names(units)
     key = [f"- {names[unit]}: every {unit[1][0]}th view from index {unit[1][1]} on held out, initial views "
@@ -212,8 +221,11 @@ def _points(study: Study, rows: StudyRows) -> str:
     for metric in study.metrics:
         lines = []
         for label in _labels(study, rows):
-            values = values_of(rows, metric.key, label)
-            lines.append([label, *(f"{values[u]:.{metric.digits}f}" if u in values else "" for u in units)])
+            found: dict[Unit, list[str]] = {unit: [] for unit in units}
+            for row in sorted((row for row in rows if row["policy"] == label), key=lambda row: row["seed"]):
+                value = row["metrics"].get(metric.key)
+                found[unit_of(row)].append("none" if value is None else f"{value:.{metric.digits}f}")
+            lines.append([label, *(" ".join(numbers) for numbers in found.values())])
         title = f"<details><summary>{_title(metric)}</summary>"
         parts.append(f"{title}\n\n{_table(['policy', *(names[u] for u in units)], lines)}\n\n</details>")
     return "\n\n".join(parts)

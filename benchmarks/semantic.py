@@ -1,0 +1,165 @@
+"""From 2 to 12 views of semantic scenes by every policy: color and segmentation of held-out views, paired by units.
+
+    python benchmarks/semantic.py [--scale small] [--seeds 3] [--shard K/N]     fits, rows as they come
+    python benchmarks/semantic.py --page [--merge ROWS.jsonl ...]               the tables of docs/semantic.md
+
+Scenes: two rooms (seeds 1 and 2; constants are fixed on others), 56 candidates and 28 test views along one way each,
+and the statue, 29 photographs with a teacher made from their labels, at two held-out offsets. Every seed draws other
+initial views. `blind` everywhere; on the first room the paper's protocol beside it. One thread a process; any number of
+processes may run side by side, with or without --shard: the lock of a run folder says who has a cell. Finished rows
+(benchmarks/semantic.jsonl) and runs are kept, killed ones resumed.
+
+TIME
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+
+import labelled
+import studies
+from studies import ROOT
+
+from drgs.lab.study import Metric, Study, append_row, distinct_seeds, read_study, run_cells
+from drgs.lab.study_report import fill_between, study_report
+from drgs.train import ActiveConfig, FitConfig
+from scenes import room
+
+POLICIES = {
+    "random": {"policy": "random"},
+    "uniform": {"policy": "uniform"},
+    "farthest": {"policy": "farthest"},
+    "moments": {"policy": "moments"},
+    "fisherrf": {"policy": "fisherrf"},
+    **{
+        f"{'+'.join(blocks)}, {criterion}": {"policy": "fisher", "criterion": criterion, "blocks": blocks}
+        for blocks in (("geometry",), ("geometry", "semantic"))
+        for criterion in ("eig", "block_logdet")
+    },
+}
+COMPARISONS = (
+    ("geometry+semantic, eig", "geometry, eig"),
+    ("geometry+semantic, block_logdet", "geometry, block_logdet"),
+    ("geometry+semantic, eig", "fisherrf"),
+    ("geometry+semantic, eig", "farthest"),
+    ("geometry+semantic, eig", "moments"),
+)
+
+
+def of_run(key: str, title: str) -> Metric:
+    """A number of the segmentation of all test views, against the data set's labels."""
+    return Metric(key, title, path=("segmentation", "run", key))
+
+
+METRICS = (
+    Metric("ssim", "SSIM"),
+    Metric("psnr", "PSNR", 2),
+    Metric("flip", "FLIP", larger=False),
+    of_run("pixel_accuracy", "pixel accuracy"),
+    of_run("class_accuracy", "class-mean accuracy"),
+    of_run("miou", "mIoU"),
+)
+RESULTS = ROOT / "benchmarks" / "semantic.jsonl"
+SPLITS = (("room-1", (3, 0)), ("statue", (3, 0)), ("room-2", (3, 0)), ("statue", (3, 1)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """Sizes: of the fit, of the rooms as they are traced, and of all teachers' maps."""
+
+    fit: FitConfig
+    every: int
+    room: tuple[int, int]
+    teacher: tuple[int, int]
+
+
+SCALES = {
+    "small": Scale(
+        FitConfig(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, feature_width=16),
+        every=40,
+        room=(160, 120),
+        teacher=(40, 30),
+    ),
+    "paper": Scale(FitConfig(max_steps=7000), every=200, room=(320, 240), teacher=(80, 60)),
+}
+
+
+def study_of(scale: str, runs: Path) -> Study:
+    """The study at a scale; data sets are made where they are not there yet."""
+    size = SCALES[scale]
+
+    def folder(scene: str, split: tuple[int, int]) -> Path:
+        name, _, number = scene.partition("-")
+        if name == "statue":
+            out = runs / f"{scale}-statue-{split[1]}"
+            return labelled.generate("statue", out, offset=split[1], teacher_size=size.teacher)
+        (width, height), (w, h) = size.room, size.teacher
+        return room.generate(
+            runs / f"{scale}-{scene}",
+            views=84,
+            width=width,
+            height=height,
+            seed=int(number),
+            teacher_width=w,
+            teacher_height=h,
+            test_every=split[0],
+        )
+
+    return Study(
+        name=f"semantic-{scale}",
+        folder=folder,
+        policies=POLICIES,
+        fit=size.fit,
+        active=ActiveConfig(initial=2, add=10, every=size.every),
+        metrics=METRICS,
+        reference="random",
+        comparisons=COMPARISONS,
+    )
+
+
+def units_of(study: Study, seeds: int) -> list:
+    """Seeds outermost, then scenes and splits; the first room once more by the paper's protocol."""
+    drawn = {(scene, split): distinct_seeds(study, scene, split, seeds) for scene, split in SPLITS}
+    units = []
+    for number in range(seeds):
+        for scene, split in SPLITS:
+            units.append((scene, split, "seed", "blind", drawn[scene, split][number]))
+        scene, split = SPLITS[0]
+        units.append((scene, split, "seed", "paper", drawn[scene, split][number]))
+    return units
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scale", choices=list(SCALES), default="small")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
+    parser.add_argument("--shard", default="0/1", help="K/N: every N-th cell from the K-th on")
+    parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
+    parser.add_argument("--merge", type=Path, nargs="+", default=[], help="rows of another checkout, to be added")
+    args = parser.parse_args()
+    for path in args.merge:
+        for row in read_study(path):
+            append_row(RESULTS, row)
+    study = study_of(args.scale, args.runs)
+    if args.page:
+        rows = [row for row in read_study(RESULTS) if row["study"] == study.name]
+        planned = args.seeds * (len(SPLITS) + 1) * len(POLICIES)
+        text = f"`python benchmarks/semantic.py --scale {args.scale}`: {len(rows)} of {planned} cells are finished.\n\n"
+        fill_between(ROOT / "docs" / "semantic.md", "semantic", text + study_report(study, rows))
+        return 0
+    shard, shards = map(int, args.shard.split("/"))
+    cells = study.cells(units_of(study, args.seeds))[shard::shards]
+    taken, failed = run_cells(study, cells, args.runs, RESULTS, say=lambda line: print(line, flush=True))
+    print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {studies.stamp('semantic')}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
