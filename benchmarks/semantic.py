@@ -81,7 +81,7 @@ class Scale:
 
 SCALES = {
     "small": Scale(
-        FitConfig(max_pixels=7_500, max_gaussians=6_000, max_steps=1400, feature_width=16),
+        FitConfig(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, feature_width=32),
         every=40,
         room=(160, 120),
         teacher=(40, 30),
