@@ -6,12 +6,14 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import drgs
 from drgs import cli
@@ -30,11 +32,12 @@ _SMALLER = {
     "crossval": ["--limit", "1", "--max-pixels", "192", "--no-ladder"],
     "tradeoff": ["--limit", "1", "--max-pixels", "192", "--repeats", "1"],
     "stress": ["--match", "1 Gaussian"],
+    "query": ["--limit", "1", "--threshold", "0"],  # six steps have taught nothing
     "demo": ["--quick"],
 }
-# Structure from motion needs real texture, the demo half a minute, a room ten seconds: tests/test_sfm.py, test_demo.py,
-# test_room.py.
-_ELSEWHERE = ("sfm", "demo", "scene")
+# Structure from motion needs real texture, the demo half a minute, a room ten seconds, a teacher a model:
+# tests/test_sfm.py, test_demo.py, test_room.py, test_teach.py.
+_ELSEWHERE = ("sfm", "demo", "scene", "teach")
 
 
 def _blocks(language: str) -> list[str]:
@@ -48,7 +51,8 @@ def _commands() -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with `scene`, nine posed pictures of a few Gaussians, and `point_cloud.ply`."""
+    """A folder with `scene`, nine posed pictures of a few Gaussians, `data/room`, the same with a teacher's maps, and
+    `point_cloud.ply`."""
     import cv2
 
     rng, folder = np.random.default_rng(3), tmp_path_factory.mktemp("readme")
@@ -80,6 +84,15 @@ def folder(tmp_path_factory):
     lens = {"w": 32, "h": 24, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     transforms = {"camera_model": "OPENCV", **lens, "depth_unit_scale_factor": 1e-3, "frames": frames}
     (folder / "scene/transforms.json").write_text(json.dumps(transforms))
+    room = folder / "data/room"  # in place of the made one: the same views, with maps of chairs left and walls right
+    shutil.copytree(folder / "scene", room)
+    (room / "rgb_feature_langseg").mkdir()
+    maps = torch.zeros(2, 6, 8, dtype=torch.half)
+    maps[0, :, :4] = maps[1, :, 4:] = 1
+    for i in range(9):
+        torch.save(maps, room / f"rgb_feature_langseg/{i}_fmap_CxHxW.pt")
+    np.save(room / "text_embeddings.npy", np.eye(2, dtype=np.float32))
+    (room / "classes.txt").write_text("chair\nwall\n")
     return folder
 
 
