@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["SemanticMetric"]
 
 _RANK = 1e-12  # of the largest eigenvalue: below, float64 rounding of W^T W
+_SAMPLE = 4096  # Gaussians that say in which directions features differ: any directions are right, these are good
 
 
 class _Decodes(Protocol):
@@ -118,21 +119,23 @@ class SemanticMetric:
         seen = values > _RANK * self.width * top
         return vectors[:, seen] * values[seen].sqrt()
 
-    def channels(self, features: torch.Tensor) -> torch.Tensor:
-        """(N, K) float32 scalars of (N, D) features, whose squared differences add up to that of the features."""
+    def directions(self, features: torch.Tensor) -> torch.Tensor:
+        """(D, K) P: the channels of (N, D) features are P^T f. No more than the directions that the decoder sees."""
         L, K = self._factor, self.samples
-        white = features.detach().double().cpu() @ L
         rank = L.shape[1]
         if self.estimate == "exact" or rank <= K:
-            return white.float().to(features.device)
+            return L
         generator = torch.Generator().manual_seed(self.seed)
+        draw = lambda *shape: torch.randint(0, 2, shape, generator=generator).double() * 2 - 1  # noqa: E731
         if self.estimate == "collapsed":
-            signs = torch.randint(0, 2, (rank, K), generator=generator).double() * 2 - 1
-            return (white @ signs / K**0.5).float().to(features.device)
-        _, vectors = torch.linalg.eigh(white.T @ white)  # ascending
-        white = white @ vectors.flip(1)
-        signs = torch.randint(0, 2, (rank - K + 1, 1), generator=generator).double() * 2 - 1
-        return torch.cat([white[:, : K - 1], white[:, K - 1 :] @ signs], 1).float().to(features.device)
+            return L @ draw(rank, K) / K**0.5
+        some = features[:: max(1, len(features) // _SAMPLE)].detach().double().cpu() @ L
+        Q = torch.linalg.eigh(some.T @ some)[1].flip(1)  # eigenvalues descend
+        return L @ torch.cat([Q[:, : K - 1], Q[:, K - 1 :] @ draw(rank - K + 1, 1)], 1)
+
+    def channels(self, features: torch.Tensor) -> torch.Tensor:
+        """(N, K) float32 scalars of (N, D) features, whose squared differences add up to that of the features."""
+        return (features.detach().double().cpu() @ self.directions(features)).float().to(features.device)
 
     def squares(self, features: torch.Tensor) -> torch.Tensor:
         """(...) gamma f^T M f of (..., D) features, exactly."""

@@ -1,0 +1,212 @@
+"""What it costs to know what features say about the geometry, and how far the estimates of it are off.
+
+    python benchmarks/coupled.py RUN [--quick] [--print]     the table of docs/semantic.md, benchmarks/coupled.json
+
+RUN is a run that was fitted with features. Times are CPU time of the process, which other programs on the machine
+change little, peers taking turns, medians; run it with DRGS_THREADS=1. Errors are against the estimate `exact`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from chain import kendall  # noqa: E402
+
+import drgs  # noqa: E402
+from drgs import fisher, runtime  # noqa: E402
+from drgs.cameras import Camera  # noqa: E402
+from drgs.data import load  # noqa: E402
+from drgs.ellipsoids import Gaussians  # noqa: E402
+from drgs.files import Run  # noqa: E402
+from drgs.fisher import SemanticMetric  # noqa: E402
+from drgs.fitting.records import load_run  # noqa: E402
+from drgs.gain import information_gain  # noqa: E402
+
+Preset = drgs.RenderSettings.preset
+BEGIN, END = "<!-- coupled: begin -->", "<!-- coupled: end -->"
+GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")
+COUNTS = (1, 2, 4, 8, 16)
+CRITERIA = ("eig", "logdet")
+
+
+def interleaved(runs: dict[str, Callable], turns: int) -> dict[str, float]:
+    """Median CPU seconds of each, peers taking turns after a warm-up."""
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(turns + 1):
+        for name, run in runs.items():
+            start = time.process_time()
+            run()
+            if turn:
+                seconds[name].append(time.process_time() - start)
+    return {name: float(np.median(x)) for name, x in seconds.items()}
+
+
+def costs(g: Gaussians, camera: Camera, metric: SemanticMetric, preset: str, turns: int) -> dict[str, float]:
+    """Seconds of one view: rendered, its diagonal of colors, and with features by every estimate."""
+    settings = Preset(preset)
+    colors = g.replace(features=None)
+    runs = {
+        "render": lambda: drgs.render(colors, camera, settings, outputs=()),
+        "colors": lambda: fisher.diagonal(colors, camera, settings),
+        "colors, blocks": lambda: fisher.blocks(colors, camera, settings),
+    }
+    for K in COUNTS:
+        m = dataclasses.replace(metric, samples=K)
+        runs[f"{K}"] = lambda m=m: fisher.diagonal(g, camera, settings, semantics=m)
+    runs["8, blocks"] = lambda: fisher.blocks(g, camera, settings, semantics=metric)
+    exact = dataclasses.replace(metric, estimate="exact")
+    runs["exact"] = lambda: fisher.diagonal(g, camera, settings, semantics=exact)
+    return interleaved(runs, turns)
+
+
+def added(a: dict, b: dict) -> dict:
+    """Information of two kinds of rows."""
+    return {name: a.get(name, 0) + b.get(name, 0) for name in {**a, **b}}
+
+
+def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int) -> dict:
+    """Of entries and of the scores of all views but the first two, which are known, by estimate; preset `fast`."""
+    settings = Preset("fast")
+    colors = [fisher.diagonal(g, view, settings, groups=(*GEOMETRY, "sh")) for view in views]
+
+    def features(m: SemanticMetric) -> list[dict]:
+        groups, none = (*GEOMETRY, "features"), (0.0, 0.0, 0.0)
+        return [fisher.diagonal(g, x, settings, semantics=m, channel_weights=none, groups=groups) for x in views]
+
+    def scores(found: list[dict], criterion: str) -> np.ndarray:
+        both = [added(a, b) for a, b in zip(colors, found, strict=True)]
+        H = added(both[0], both[1])
+        return np.array([information_gain(x, H, criterion).total for x in both[2:]])
+
+    exact = features(dataclasses.replace(metric, estimate="exact"))
+    truth = {criterion: scores(exact, criterion) for criterion in CRITERIA}
+    only = scores([{"features": x["features"]} for x in exact], "eig")
+    trace = [sum(float(x[name].sum()) for x in kind for name in GEOMETRY) for kind in (exact, colors)]
+    best, second = np.sort(truth["eig"])[::-1][:2]
+    result: dict = {
+        "share of the trace": trace[0] / sum(trace),
+        "tau of uncoupled": kendall(only, truth["eig"]),
+        "margin": float((best - second) / best),
+        "views": len(views) - 2,
+    }
+    for estimate in ("collapsed", "principal"):
+        for K in COUNTS:
+            rows = []
+            for seed in range(seeds):
+                found = features(dataclasses.replace(metric, estimate=estimate, samples=K, seed=seed))
+                ratios = torch.cat(
+                    [
+                        (a[name] / b[name])[b[name] > 1e-6 * b[name].max()].reshape(-1) - 1
+                        for a, b in zip(found, exact, strict=True)
+                        for name in GEOMETRY
+                    ]
+                )
+                row = [float(ratios.abs().median()), float(ratios.square().mean().sqrt())]
+                for criterion, x in truth.items():
+                    y = scores(found, criterion)
+                    row += [float(np.std(y / x)), kendall(x, y), float(1 - x[y.argmax()] / x.max())]
+                rows.append(row)
+            result[f"{estimate} {K}"] = np.mean(rows, 0).tolist()
+            print(estimate, K, result[f"{estimate} {K}"], flush=True)
+    return result
+
+
+def report(r: dict) -> str:
+    """The part of the page between the marks."""
+    e, fast, exact = r["errors"], r["fast"], r["exact"]
+    lines = [
+        BEGIN,
+        "",
+        f"Made by `python benchmarks/coupled.py`, {r['machine']}, {r['date']}, commit {r['commit']}.",
+        f"Run `{r['run']}`: {r['gaussians']:,} Gaussians with {r['width']} feature channels, a decoder of rank "
+        f"{r['rank']}.",
+        f"CPU time of one view's diagonal in ms, `fast` at {r['size']['fast']}, `exact` at {r['size']['exact']},",
+        "in brackets its ratio to that of the colors. Errors against `exact`, `fast` at 80x60: of the entries of what",
+        f"features say about the geometry, and of the scores of {e['views']} views, two being known.",
+        "",
+        "| estimate | `fast` | `exact` | entries: median, rms | `eig`: error, tau, regret "
+        "| `logdet`: error, tau, regret |",
+        "|---|---|---|---|---|---|",
+        f"| colors alone | {1e3 * fast['colors']:.0f} (1) | {1e3 * exact['colors']:.0f} (1) | | "
+        f"tau {e['tau of uncoupled']:.2f} (uncoupled) | |",
+    ]
+    for estimate in ("collapsed", "principal"):
+        for K in COUNTS:
+            x = e[f"{estimate} {K}"]
+            cells = [f"{1e3 * t[str(K)]:.0f} ({t[str(K)] / t['colors']:.2f})" for t in (fast, exact)]
+            judged = [f"{100 * x[i]:.2g} %, {x[i + 1]:.2f}, {100 * x[i + 2]:.2g} %" for i in (2, 5)]
+            lines.append(
+                f"| `{estimate}`, {K} | {cells[0]} | {cells[1]} | {100 * x[0]:.2g} %, {100 * x[1]:.2g} % | "
+                f"{judged[0]} | {judged[1]} |"
+            )
+    cells = [f"{1e3 * t['exact']:.0f} ({t['exact'] / t['colors']:.1f})" for t in (fast, exact)]
+    blocks = [t["8, blocks"] / t["colors, blocks"] for t in (fast, exact)]
+    lines += [
+        f"| `exact` | {cells[0]} | {cells[1]} | 0 | 0 | 0 |",
+        "",
+        f"Blocks with 8 channels beside the colors take {blocks[0]:.2f} times those of the colors with `fast`, "
+        f"{blocks[1]:.2f} times with `exact`.",
+        f"Features make {100 * e['share of the trace']:.0f} % of the summed information about the geometry here.",
+        f"The best view's margin is {100 * e['margin']:.2g} % of its `eig`.",
+        "",
+        END,
+    ]
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("run", type=Path, help="a run that was fitted with features")
+    parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
+    parser.add_argument("--print", action="store_true", help="do not touch docs/semantic.md")
+    args = parser.parse_args()
+    loaded = load_run(Run(args.run))
+    if loaded.decoder is None or loaded.gaussians.features is None:
+        sys.exit(f"{args.run}: must be a run with features, has none; fit a data set with teacher maps")
+    views = load(Run(args.run).config()["data"], points=False).views
+    cameras = [view.camera.undistorted() for view in views]
+    g, metric = loaded.gaussians.detach(), SemanticMetric(loaded.decoder.metric())
+    sizes = {"fast": (40, 30) if args.quick else (320, 240), "exact": (40, 30) if args.quick else (160, 120)}
+    count, width = (4, 40) if args.quick else (14, 80)
+    few = [cameras[k].resized(width, width * 3 // 4) for k in np.linspace(0, len(cameras) - 1, count).astype(int)]
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    result = {
+        "machine": f"{runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
+        f"{runtime.backend().variant}",
+        "date": datetime.date.today().isoformat(),
+        "commit": commit.stdout.strip(),
+        "run": args.run.name,
+        "gaussians": len(g),
+        "width": metric.width,
+        "rank": int(torch.linalg.matrix_rank(metric.matrix)),
+        "size": {preset: f"{w}x{h}" for preset, (w, h) in sizes.items()},
+    }
+    for preset, turns in (("fast", 5), ("exact", 3)):
+        camera = cameras[len(cameras) // 2].resized(*sizes[preset])
+        result[preset] = costs(g, camera, metric, preset, 1 if args.quick else turns)
+        print(preset, result[preset], flush=True)
+    result["errors"] = errors(g, few, metric, 1 if args.quick else 3)
+    text = report(result)
+    print(text)
+    if not (args.print or args.quick):
+        page = ROOT / "docs" / "semantic.md"
+        before, rest = page.read_text().split(BEGIN)
+        page.write_text(before + text + rest.split(END)[1])
+        (ROOT / "benchmarks" / "coupled.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
