@@ -139,6 +139,7 @@ def fisher(pool: Pool) -> Selection:
         seen = pool.scene.at(pool.candidates[0].time)
         blocks = scoring.blocks_of(seen)
         if "semantic" in blocks:
+            assert seen.features is not None  # else there is no such block
             options["semantics"] = metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
             without = ()
         if "geometry" not in blocks:

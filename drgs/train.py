@@ -324,7 +324,8 @@ class _Loop:
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""
         trainer = self.trainer
-        frame, record = plan.pick(trainer.scene(), trainer.frames, trainer.step_index, trainer.network("decoder"))
+        decoder: Any = trainer.network("decoder")
+        frame, record = plan.pick(trainer.scene(), trainer.frames, trainer.step_index, decoder)
         points, colors, dense = plan.points(frame, trainer.scene())
         if len(points):
             trainer.add_points(points, colors, *trainer.config.start_of(dense))

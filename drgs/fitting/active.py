@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Scene
+    from drgs.features.decoder import Decoder
     from drgs.fitting.config import ActiveConfig, FitConfig
 
 __all__ = [
@@ -152,16 +153,14 @@ class ActiveViews:
         """Whether a view is to be added before step `step` (from 0)."""
         return len(self.picks) < min(self.active.add, step // self.active.every)
 
-    def pick(
-        self, scene: Scene, frames: list[Frame], step: int, decoder: torch.nn.Module | None = None
-    ) -> tuple[Frame, dict]:
+    def pick(self, scene: Scene, frames: list[Frame], step: int, decoder: Decoder | None = None) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
         Args:
             scene: As it is now, seen by each view at its time.
             frames: The photographs seen so far; of these, too, only the cameras matter.
             step: Steps done.
-            decoder: Of the features as it is now, `drgs.features.decoder.Decoder`, whose metric they count in.
+            decoder: Of the features as it is now; they count in its metric.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """

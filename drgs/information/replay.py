@@ -60,8 +60,10 @@ class Replay:
     ) -> None:
         # Without a graph of torch: information is a number, and its derivatives are taken here.
         slices: list[torch.Tensor | None] = [None]
-        if semantics is not None and geometry and (channels := semantics.channels(gaussians.features)).shape[1]:
-            slices = list(channels.split(_BESIDE, 1))
+        if semantics is not None and geometry:
+            assert gaussians.features is not None  # `SemanticMetric.check` has refused it
+            channels = semantics.channels(gaussians.features)
+            slices = list(channels.split(_BESIDE, 1)) if channels.shape[1] else slices
         self.semantics, self.slices = semantics, slices
         seen = gaussians.detach().replace(features=slices[0])
         self.call = call = Call(seen, camera, settings, frozenset())

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
@@ -92,7 +92,7 @@ class SemanticMetric:
         self._factor  # noqa: B018  refuses what is not positive semidefinite
 
     @classmethod
-    def of(cls, decoder: _Decodes | None, width: int, **fields) -> SemanticMetric:
+    def of(cls, decoder: _Decodes | None, width: int, **fields: Any) -> SemanticMetric:
         """Of a decoder as it is now; without one of the features themselves, `width` channels that count alike."""
         return cls(torch.eye(width, dtype=torch.float64) if decoder is None else decoder.metric(), **fields)
 
