@@ -182,9 +182,9 @@ def test_outside_a_mask_a_teacher_has_no_say(taught):
     def at(column, mask):
         other = values.clone()
         other[:, :, column] += 5
-        return float(term(shown, dataclasses.replace(frame, mask=mask, teacher=lambda: other), g))
+        return float(term(shown, dataclasses.replace(frame, mask=mask, teacher=lambda: other), g).detach())
 
-    plain = float(term(shown, dataclasses.replace(frame, mask=left), g))
+    plain = float(term(shown, dataclasses.replace(frame, mask=left), g).detach())
     assert at(MAP - 1, left) == plain
     assert at(0, left) > plain
     assert term(shown, dataclasses.replace(frame, mask=0 * left), g) is None
