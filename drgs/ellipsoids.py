@@ -238,8 +238,8 @@ class Gaussians:
         """Raise ValueError, naming the first index, if a parameter is NaN or infinite or a quaternion is 0."""
         with torch.no_grad():  # a check, which leaves no graph
             for name, x in self.parameters().items():
-                # One reduction decides; the index is looked for only when there is something to report.
-                if x.numel() and not math.isfinite(float(x.abs().sum(dtype=torch.float64))):
+                # One reduction decides, NaN passes through it; the index is looked for only if there is one to report.
+                if x.numel() and not all(math.isfinite(float(end)) for end in torch.aminmax(x)):
                     bad = ~torch.isfinite(x).reshape(len(x), -1).all(1)
                     if bool(bad.any()):
                         i = int(bad.nonzero()[0, 0])

@@ -126,7 +126,7 @@ class Weights:
     def scalars(self, features: torch.Tensor, cotangent: torch.Tensor) -> Float:
         """f (dL/dF)^T, laid out like the weights; 0 where these are."""
         width = features.shape[1]
-        flat = features.new_zeros(self.rows + 1, PIXELS)
+        flat = _matrix(self.zeros())
         for group in self._grouped(width):
             g = _gathered(cotangent, group).mT
             for rows, index in group.slices(width):
@@ -137,19 +137,17 @@ class Weights:
     def totals(self, buffer: Float, scalars: Float) -> Float:
         """(T 64) Float64: sum over the entries of w s, as precise as the adjoint takes it apart again."""
         lib = self.lib
-        start = self.lengths.cumsum(0) - self.lengths
-        begin, count = (lib.UInt32(lib.Int32(x.to(torch.int32))) for x in (start, self.lengths))
+        rows, starts, ends = (_unsigned(lib, x) for x in (self._touched, *self._bounds()))
         lane = dr.arange(lib.UInt32, len(self.lengths) * PIXELS)
-        first, count = (dr.gather(lib.UInt32, x, lane // PIXELS) for x in (begin, count))
-        at = first * PIXELS + lane % PIXELS
+        start, end = (dr.gather(lib.UInt32, x, lane // PIXELS) for x in (starts, ends))
 
         def body(k: UInt32, total: Float) -> tuple[UInt32, Float]:
-            w, s = (lib.Float64(dr.gather(lib.Float, x, at + k * PIXELS)) for x in (buffer, scalars))
+            at = dr.gather(lib.UInt32, rows, k) * PIXELS + lane % PIXELS
+            w, s = (lib.Float64(dr.gather(lib.Float, x, at)) for x in (buffer, scalars))
             return k + 1, dr.fma(w, s, total)
 
-        state = (dr.zeros(lib.UInt32, dr.width(lane)), dr.zeros(lib.Float64, dr.width(lane)))
         with dr.suspend_grad():  # part of a derivative
-            total = dr.while_loop(state, lambda k, total: k < count, body)[1]
+            total = dr.while_loop((start, dr.zeros(lib.Float64, dr.width(lane))), lambda k, total: k < end, body)[1]
         dr.eval(total)
         return total
 
@@ -158,15 +156,17 @@ class Weights:
         self._touched = _matrix(buffer)[:-1].sum(1).nonzero()[:, 0]  # weights are >= 0
         self._groups = None
 
+    def _bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(T,) where each tile's entries begin and end among those that any pixel composites."""
+        ends = torch.searchsorted(self._touched, self.lengths.cumsum(0))
+        return torch.cat([ends.new_zeros(1), ends[:-1]]), ends
+
     def _grouped(self, width: int) -> list[_Group]:
         """The tiles in groups, those with most entries first; tiles without any are in none."""
         if self._groups is not None and self._width == width:
             return self._groups
-        ends = self.lengths.cumsum(0)
-        ends = torch.searchsorted(self._touched, ends)
-        counts = torch.diff(ends, prepend=ends.new_zeros(1))
-        starts = ends - counts
-        counts, tiles = torch.sort(counts, descending=True, stable=True)
+        starts, ends = self._bounds()
+        counts, tiles = torch.sort(ends - starts, descending=True, stable=True)
         touched = torch.cat([self._touched, self._touched.new_full((1,), self.rows)])
         ascending, filled, k = counts.flip(0), int((counts > 0).sum()), 0
         self._groups, self._width = [], width
@@ -179,7 +179,8 @@ class Weights:
             at = torch.where(j < counts[k : k + count, None], starts[own, None] + j, -1)  # -1: the row that is 0
             rows = touched[at]
             inside = self.inside[own].view(-1)
-            self._groups.append(_Group(rows, self.index[rows], self.pixels[own].view(-1), inside))
+            index = self.index[rows].long()  # what int32 would take to add is twice the time
+            self._groups.append(_Group(rows, index, self.pixels[own].view(-1), inside))
             k += count
         return self._groups
 
@@ -229,3 +230,8 @@ def _matrix(buffer: Float) -> torch.Tensor:
 def signed(x: UInt32) -> torch.Tensor:
     """In torch, which knows few operations of unsigned integers."""
     return x.torch().view(torch.int32)
+
+
+def _unsigned(lib: Lib, x: torch.Tensor) -> UInt32:
+    """In Dr.Jit."""
+    return lib.UInt32(lib.Int32(x.to(torch.int32)))
