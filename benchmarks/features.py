@@ -1,0 +1,204 @@
+"""What feature channels cost: forward + backward of 0 to 512 channels beside the colors.
+
+    python benchmarks/features.py [--quick] [--clock cpu]     prints, writes benchmarks/features.json, docs/semantic.md
+
+100,000 Gaussians, 320x240. Peers take turns in one process; what counts are the ratios to the colors alone. Three ways:
+products with the weights of a tile (drgs/tracing/weights.py), coupled to the geometry and not, and the traversals of 32
+channels each that they replace, which `bvh` still takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import functools
+import json
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import cubes  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+
+import drgs  # noqa: E402
+from drgs import runtime  # noqa: E402
+from drgs.tracing import weights  # noqa: E402
+from drgs.tracing.tiles import TileTraversal  # noqa: E402
+
+Preset = drgs.RenderSettings.preset
+WIDTHS = (3, 16, 32, 64, 128, 512)
+BEGIN, END = "<!-- made by benchmarks/features.py -->", "<!-- end of benchmarks/features.py -->"
+
+
+def camera() -> drgs.Camera:
+    """320x240, 45 degrees, distance 4."""
+    f = 0.5 * 320 / np.tan(np.radians(45) / 2)
+    w2c = np.eye(4)
+    w2c[2, 3] = 4
+    return drgs.Camera(K=np.array([[f, 0, 160], [0, f, 120], [0, 0, 1]]), w2c=w2c, width=320, height=240)
+
+
+@contextlib.contextmanager
+def traversals():
+    """Feature channels come out of traversals, 32 each, on tiles as on `bvh`."""
+    held = TileTraversal.weighed
+    TileTraversal.weighed = lambda view, share, size: view.parts(1)
+    try:
+        yield
+    finally:
+        TileTraversal.weighed = held
+
+
+def frame(gaussians: drgs.Gaussians, settings: drgs.RenderSettings, couple: bool, products: bool = True):
+    """A frame and the gradients of the sum of its images with respect to every parameter."""
+    leaves = {k: v.clone().requires_grad_() for k, v in gaussians.parameters().items()}
+    moving, cam = gaussians.replace(**leaves), camera()
+
+    def run():
+        with contextlib.nullcontext() if products else traversals():
+            out = drgs.render(moving, cam, settings, outputs=(), couple_features=couple)
+            loss = out.rgb.sum() if out.features is None else out.rgb.sum() + out.features.square().sum()
+            loss.backward()
+        for leaf in leaves.values():
+            leaf.grad = None
+
+    return run
+
+
+def with_features(count: int, width: int) -> drgs.Gaussians:
+    """The cube scene; of width 0 without features."""
+    g = cubes.cube(count)
+    features = torch.randn(len(g), width, generator=torch.Generator().manual_seed(0))
+    return g.replace(features=features) if width else g
+
+
+def against_colors(count: int, preset: str, width: int, ways: dict, turns: int, clock) -> dict:
+    """Median seconds of the colors alone and of each way, and medians of the ratios within a turn."""
+    settings = Preset(preset)
+    runs = {"colors": frame(with_features(count, 0), settings, True)}
+    runs |= {name: frame(with_features(count, width), settings, *way) for name, way in ways.items()}
+    seconds = {name: [] for name in runs}
+    for run in runs.values():
+        run()
+    for _ in range(turns):
+        for name, run in runs.items():
+            start = clock()
+            run()
+            seconds[name].append(clock() - start)
+    ratios = {
+        name: statistics.median(a / b for a, b in zip(seconds[name], seconds["colors"], strict=True)) for name in ways
+    }
+    row = {"preset": preset, "width": width, "seconds": {k: statistics.median(s) for k, s in seconds.items()}}
+    print(json.dumps(row | {"ratios": ratios}), flush=True)
+    return row | {"ratios": ratios}
+
+
+def held(count: int, preset: str, width: int) -> dict:
+    """Bytes of the largest buffer of weights of a frame and its gradients, and how full it is."""
+    zeros, survey, sizes, shares = weights.Weights.zeros, weights.Weights.survey, [], []
+
+    def noted(self):
+        sizes.append(4 * (self.rows + 1) * weights.PIXELS)
+        return zeros(self)
+
+    @functools.wraps(survey)
+    def looked(self, buffer):
+        shares.append((int((buffer.torch() != 0).sum()), buffer.torch().numel()))
+        survey(self, buffer)
+
+    weights.Weights.zeros, weights.Weights.survey = noted, looked
+    try:
+        frame(with_features(count, width), Preset(preset), True)()
+    finally:
+        weights.Weights.zeros, weights.Weights.survey = zeros, survey
+    return {"bytes": max(sizes), "blocks": len(shares), "share": sum(a for a, _ in shares) / sum(b for _, b in shares)}
+
+
+def growth(rows: list[dict], way: str) -> dict:
+    """A straight line through the ratios over the widths: at no channels, and per 100 channels; its largest error."""
+    x = np.array([row["width"] for row in rows], float)
+    y = np.array([row["ratios"][way] for row in rows])
+    slope, base = np.polyfit(x, y, 1, w=1 / y)
+    return {"at 0": base, "per 100": 100 * slope, "error": float(np.abs((base + slope * x) / y - 1).max())}
+
+
+def report(result: dict) -> str:
+    """The table and what it says."""
+    lines = [
+        f"Made by `python benchmarks/features.py` on {result['machine']}, {result['date']}, commit {result['commit']}:",
+        f"{result['gaussians']:,} Gaussians, 320x240, forward + backward, times that of the colors alone "
+        f"(medians of {result['turns']} interleaved turns, {result['clock']} time).",
+        "",
+        "| preset | channels | not coupled | coupled | coupled, by traversals |",
+        "|---|---|---|---|---|",
+    ]
+    for row in result["rows"]:
+        r = row["ratios"]
+        old = f"{r['traversals']:.1f}x" if "traversals" in r else ""
+        cells = f"{r['not coupled']:.2f}x | {r['coupled']:.2f}x | {old}"
+        lines.append(f"| `{row['preset']}` | {row['width']} | {cells} |")
+    lines.append("")
+    for way, fit in result["growth"].items():
+        lines.append(
+            f"{way.capitalize()}, the cost of `fast` is {fit['at 0']:.1f} + {fit['per 100']:.2f} per 100 channels, "
+            f"within {100 * fit['error']:.0f} %."
+        )
+    lines += ["", "Weights held at once (the bound is 128 MiB, or what a single tile needs):", ""]
+    for preset, x in result["held"].items():
+        lines.append(
+            f"- `{preset}`: {x['bytes'] / 2**20:.0f} MiB in {x['blocks']} block(s), {100 * x['share']:.0f} % not 0."
+        )
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
+    parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="cpu: where others compute as well")
+    parser.add_argument("--turns", type=int, default=7)
+    args = parser.parse_args()
+    clock = {"wall": time.perf_counter, "cpu": time.process_time}[args.clock]
+    count, turns = (2000, 2) if args.quick else (100_000, args.turns)
+    both = {"not coupled": (False,), "coupled": (True,)}
+    old = {"traversals": (True, False)}
+    rows = [
+        against_colors(count, "fast", width, both | (old if width <= 128 else {}), turns, clock)
+        for width in (WIDTHS[:2] if args.quick else WIDTHS)
+    ]
+    fits = {way: growth(rows, way) for way in both}
+    rows += [
+        against_colors(count, "exact", width, both, min(turns, 3), clock) for width in ((3,) if args.quick else (128,))
+    ]
+    info = runtime.info()
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
+    ).stdout.strip()
+    result = {
+        "machine": f"{info.get('cpu', 'CPU')}, {runtime.backend().threads} threads, {runtime.backend().variant}",
+        "date": datetime.date.today().isoformat(),
+        "commit": commit,
+        "gaussians": count,
+        "turns": turns,
+        "clock": args.clock,
+        "rows": rows,
+        "growth": fits,
+        "held": {preset: held(count, preset, 16) for preset in ("fast", "exact")},
+    }
+    text = report(result)
+    print(text)
+    if not args.quick:
+        page = ROOT / "docs" / "semantic.md"
+        before, rest = page.read_text().split(BEGIN)
+        page.write_text(before + BEGIN + "\n\n" + text + "\n\n" + END + rest.split(END)[1])
+        (ROOT / "benchmarks" / "features.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
