@@ -398,6 +398,7 @@ def test_without_labels_the_teacher_is_the_reference(taught):
     told = metrics.evaluate(g, frames, FAST, segmentation=segmentation_of(g, decoder, names, known, frames))
     assert told["segmentation"] is None
     assert "text_embeddings.npy" in told["reasons"]["segmentation"]
+    assert "has no decoder" in segmentation_of(g, None, classes, known, frames)
     assert "segmentation" not in metrics.evaluate(g.replace(features=None), frames, FAST)
 
 

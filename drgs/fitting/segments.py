@@ -129,8 +129,10 @@ def segmentation_of(
     Returns:
         None where a run has no features; in words why it cannot be measured.
     """
-    if decoder is None or record is None or gaussians.features is None:
+    if record is None:
         return None
+    if decoder is None or gaussians.features is None:
+        return "only the PLY of the run could be read, which has no decoder: restore state.safetensors"
     if classes is None or classes.embeddings is None:
         return "the run has no text embeddings of its classes: add text_embeddings.npy and classes.json to the data set"
     if any(frame.labels is not None for frame in frames):
