@@ -316,7 +316,7 @@ def test_label_pictures():
     assert (mixed[3, 1] < mixed[3, 0]).any()
     mask = mask_picture(photo, labels == 2)
     assert mask[3, 0].tolist() == [round(0.55 * 128 + 0.45 * c) for c in (255, 120, 0)]
-    assert mask[0, 0].tolist() == [64] * 3
+    assert mask[0, 0].tolist() == [round(0.7 * 128)] * 3
 
 
 def test_legends_fit():

@@ -152,7 +152,7 @@ def mask_picture(image: np.ndarray, mask: np.ndarray, color: tuple[int, int, int
         color: What is mixed in.
     """
     photo = (image if image.dtype == np.uint8 else to_bytes(image)).astype(np.float32)
-    gray = 0.5 * photo.mean(2, keepdims=True).repeat(3, 2)
+    gray = 0.7 * photo.mean(2, keepdims=True).repeat(3, 2)
     shown = 0.55 * photo + 0.45 * np.array(color, np.float32)
     return np.rint(np.where(mask[..., None], shown, gray)).astype(np.uint8)
 
