@@ -135,7 +135,10 @@ class SemanticMetric:
 
     def channels(self, features: torch.Tensor) -> torch.Tensor:
         """(N, K) float32 scalars of (N, D) features, whose squared differences add up to that of the features."""
-        return (features.detach().double().cpu() @ self.directions(features)).float().to(features.device)
+        P = self.directions(features)
+        # A part at a time: float64 of all would be twice the features, and fit no cache.
+        parts = [(part.double().cpu() @ P).float() for part in features.detach().split(_SAMPLE)]
+        return torch.cat(parts).to(features.device) if parts else features.new_zeros(0, P.shape[1])
 
     def squares(self, features: torch.Tensor) -> torch.Tensor:
         """(...) gamma f^T M f of (..., D) features, exactly."""
