@@ -354,6 +354,13 @@ def test_the_report_says_gain_and_loss(tmp_path):
     assert "No verdicts: 3 units" in few
     assert "**gain**" not in few
     assert told([]) == "No cell is finished."
+    leaked = [
+        {**row, "protocol": "paper", "metrics": {**row["metrics"], "psnr": 1 + row["metrics"]["psnr"]}} for row in rows
+    ]
+    text = told([*rows, *leaked[:6]])
+    assert text.count("| p | +1.00 [+1.00, +1.00], 3 of 3 |") == 1
+    assert "### Protocol `paper`: initial points of the whole data set" in text
+    assert "`paper` against `blind`" not in told(rows)
 
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- x: begin -->\nold\n<!-- x: end -->\nb\n")
@@ -371,3 +378,24 @@ def test_a_page_comes_from_its_rows(monkeypatch):
     text = active.page_of("small", "first")
     assert text in (root / "docs" / "active-static.md").read_text()
     assert "72 fits" in text
+
+
+def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
+    """Whatever has run: all nine policies on a unit before the next, each scene's first unit before any second one, the
+    paper's protocol on the first room alone; every cell's configs are legal and all differ.
+    """
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    semantic = importlib.import_module("semantic")
+    monkeypatch.setattr(semantic, "distinct_seeds", lambda study, scene, split, count: list(range(count)))
+    for scale in semantic.SCALES:
+        study = semantic.study_of(scale, tmp_path)
+        cells = study.cells(semantic.units_of(study, 3))
+        assert len(cells) == len({cell.name for cell in cells}) == 3 * 5 * 9
+        for start in range(0, len(cells), 9):
+            assert [cell.policy for cell in cells[start : start + 9]] == list(semantic.POLICIES)
+            assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 9]}) == 1
+        assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
+        assert {cell.scene for cell in cells if cell.protocol == "paper"} == {"room-1"}
+        assert len({repr(study.configs(cell)) for cell in cells[:9]}) == 9
+        assert {policy for pair in study.comparisons for policy in pair} <= set(study.policies)
+    assert not list(tmp_path.iterdir()), "nothing is made before it is needed"

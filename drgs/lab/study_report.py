@@ -59,6 +59,8 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
                 table += "\n\n" + verdicts
             parts += [f"{below} Other pairs", table]
         parts += [f"{below} Every unit", _points(study, mine)]
+    if len(protocols) > 1:
+        parts += [f"{'#' * level} `paper` against `blind`", _leaked(study, rows)]
     return "\n\n".join(parts)
 
 
@@ -169,6 +171,21 @@ def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], n
         return "No pair of policies has a unit in common yet."
     last = [f"{np.median(sizes[m.key]):.{m.digits}f}" if sizes[m.key] else "none" for m in study.metrics]
     return _table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
+
+
+def _leaked(study: Study, rows: StudyRows) -> str:
+    """What the points of views that are not picked are worth to each policy, on the units that have both protocols."""
+    lines = []
+    for label in _labels(study, rows):
+        both = [{**row, "policy": row["protocol"]} for row in rows if row["policy"] == label]
+        found = _estimates(study, both, "paper", "blind")
+        if any(found.values()):
+            cells = [_difference(metric, one) if (one := found[metric.key]) else "none" for metric in study.metrics]
+            lines.append([label, *cells])
+    if not lines:
+        return "No policy has a unit in common yet."
+    told = "The same policy on the same unit; how to read the numbers is said above."
+    return told + "\n\n" + _table(["policy", *(_title(metric) for metric in study.metrics)], lines)
 
 
 def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Effect | None]:
