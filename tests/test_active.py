@@ -307,6 +307,9 @@ def test_the_seed_draws_the_first_view(still, tmp_path):
     assert record["start_rule"] == Run(run).config()["active"]["start"] == "seed"
     assert Run(run).config()["fit"]["test_offset"] == 1
     assert Run(run).config()["test"] == ["1", "5"]
+    (run / "metrics.json").unlink()
+    assert cli.main(["eval", str(run), "--quiet"]) == 0
+    assert [view["name"] for view in json.loads((run / "metrics.json").read_text())["views"]] == ["1", "5"]
     for words, other in (
         ("start was 'seed' and is 'first'", {"active": plan(), "config": config(**fields)}),
         (
