@@ -55,8 +55,8 @@ def truth(g, out, m: SemanticMetric) -> tuple[dict, torch.Tensor]:
 @pytest.mark.parametrize(
     ("response", "order", "D"),
     [
-        *itertools.product(("peak",), ("ray", "center"), (1, 3)),
-        *itertools.product(("integral",), ("ray", "center"), (3,)),
+        ("peak", "ray", 1),
+        *itertools.product(("peak", "integral"), ("ray", "center"), (3,)),
         ("ewa", "center", 3),
         ("peak", "center", 128),  # in eight traversals
         *(pytest.param(*kind, marks=pytest.mark.slow) for kind in (("integral", "ray", 128), ("peak", "ray", 512))),
@@ -108,10 +108,10 @@ def test_columns_and_probes(seen):
 
 @pytest.mark.parametrize(("estimate", "samples"), [("collapsed", 1), ("principal", 2)])
 def test_estimates_are_unbiased(seen, estimate, samples):
-    """The mean over 60 draws of signs is the exact sum, within 4 standard errors of the measured spread."""
+    """The mean over 40 draws of signs is the exact sum, within 4 standard errors of the measured spread."""
     g, cam, settings, m, exact = seen
     draws = []
-    for seed in range(60):
+    for seed in range(40):
         drawn = dataclasses.replace(m, estimate=estimate, samples=samples, seed=seed)
         again = fisher.diagonal(g, cam, settings, semantics=drawn, groups=COUPLED)
         draws.append(torch.stack([again[name].sum() for name in COUPLED]))
