@@ -102,7 +102,7 @@ def test_any_width(rng, width, monkeypatch):
     """Images, all gradients and forward mode against the oracle; in exact order with rays that are redone."""
     settings = settings_of(width)
     monkeypatch.setattr(walk, "BUFFER", 2)  # too short for these rays
-    # Opaque Gaussians leave R_i / (1 - a_i) without digits unless the sums are float64, s included.
+    # Opacities from nearly none to nearly 1, behind which there is next to nothing.
     cam, g = camera(rng, (11, 9)), gaussians(rng, 24, 4, width, scale=0.3, opacity=6.0)
     errors = compare(g, cam, settings, Oracle(g, cam, settings, rng))
     assert errors.finite
