@@ -10,11 +10,12 @@ processes may run side by side, with or without --shard: the lock of a run folde
 (benchmarks/semantic.jsonl) and runs are kept, killed ones resumed.
 
 Sizes at `small` (1,400 steps, a pick every 40, at most 10,800 pixels and 8,000 Gaussians, 32 channels, maps of 40x30)
-are so that 135 cells fit into about five hours of two processes, 266 s each. Measured on a machine that others used as
-well, in seconds of processor: 0.2 a step (500 steps of `farthest` on a room of seed 0, 5,100 Gaussians at the end),
-0.07 to 0.2 a view whose information is computed (55 a pick, ten picks), 20 for the metrics. As the steps are a fifth of
-the paper's, features and decoder go five times as fast as Feature 3DGS's. On the room of seed 0 that was compared with
-its own rates, the only two variants tried: mIoU 0.061 after 320 steps against 0.024 after 402.
+are so that 135 cells fit into about five hours of two processes. Measured on a machine that others used as well, in
+seconds of processor: 0.15 a step and 235 for the whole first cell (`random`, room 1), about 20 of them the metrics of
+28 views. Policies that score information add 55 views a pick, ten picks, 0.06 to 0.2 s a view (2,000 Gaussians), that
+is 40 to 110 s. 280 s a cell on average, 135 * 280 / 2 = 5.3 hours. As the steps are a fifth of the paper's, features
+and decoder go five times as fast as Feature 3DGS's. On the room of seed 0 that was compared with its own rates, the
+only two variants tried: mIoU 0.061 after 320 steps against 0.024 after 402.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             ]
             if verdicts := _verdicts(study, mine, others):
                 parts.append(verdicts)
-        if study.comparisons:
+        if any(_estimates(study, mine, *pair)[study.metrics[0].key] for pair in study.comparisons):
             table = _compared(study, mine, study.comparisons, named=True)
             if verdicts := _verdicts(study, mine, study.comparisons):
                 table += "\n\n" + verdicts
@@ -96,8 +96,9 @@ def _size(rows: StudyRows) -> str:
         f"{scene} {len(found)}" + (f" ({_range(views[scene])} test views)" if scene in views else "")
         for scene, found in units.items()
     ]
+    fits = f"{len(rows)} fit{'s' if len(rows) > 1 else ''}, on commits {', '.join(commits)}"
     return (
-        f"{len(rows)} fits, on commits {', '.join(commits)}. Units (scene, split, initial views): {', '.join(each)}. "
+        f"{fits}. Units (scene, split, initial views): {', '.join(each)}. "
         "Fits of one unit that differ by the seed alone are averaged."
     )
 
@@ -232,8 +233,11 @@ def _points(study: Study, rows: StudyRows) -> str:
     """One table a metric: policies against units, every fit's number; of one unit in the order of their seeds."""
     units = sorted({unit_of(row) for row in rows})
     names = _unit_names(units)
-    key = [f"- {names[unit]}: every {unit[1][0]}th view from index {unit[1][1]} on held out, initial views "
-           f"{', '.join(unit[2])}" for unit in units]  # fmt: skip
+    key = [
+        f"- {names[unit]}: one view in {unit[1][0]} held out, from index {unit[1][1]} on; initial views "
+        f"{', '.join(unit[2])}"
+        for unit in units
+    ]
     parts = ["\n".join(key)]
     for metric in study.metrics:
         lines = []
