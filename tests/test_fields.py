@@ -11,6 +11,7 @@ from scenes_random import camera, gaussians
 
 from drgs import fisher
 from drgs.ellipsoids import DeformableScene, Gaussians
+from drgs.fisher import SemanticMetric
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
 
@@ -228,6 +229,29 @@ def test_a_name_means_the_scene_everywhere(view):
         fisher.diagonal(scene, cam, FAST, groups=["means"])
     with pytest.raises(ValueError, match="group 'features' must be 'columns', got 'probes'"):
         fisher.diagonal(scene, cam, FAST, "probes", groups=["features"])
+
+
+class Colored(Swarm):
+    """Its network moves features and nothing else."""
+
+    def deform(self, parameters, time):
+        p = dict(parameters)
+        weights = {name: p.pop(name) for name in self.weights}
+        hidden = torch.tanh(p["means"] @ weights["in.weight"].T[:3] + time * weights["in.bias"])
+        return self.start.replace(**{**p, "features": p["features"] + hidden @ weights["out.weight"].T})
+
+
+def test_semantic_information_of_weights(view):
+    """Weights that only features depend on are told about by decoded features: by columns, and by probes on average."""
+    scene, cam = Colored(view[0].start.replace(features=torch.ones(10, 3))), view[1]
+    metric = SemanticMetric(torch.eye(3, dtype=torch.float64))
+    groups = ["in.bias", "out.weight"]
+    H = fisher.diagonal(scene, cam, FAST, "columns", groups=groups, semantics=metric)
+    probed = fisher.diagonal(scene, cam, FAST, "probes", groups=groups, probes=64, semantics=metric)
+    for name in groups:
+        assert float(H[name].min()) > 0
+        assert abs(float((probed[name] / H[name]).mean()) - 1) < 0.27, name  # as above
+        assert not fisher.diagonal(scene, cam, FAST, "probes", groups=groups, probes=1)[name].any()
 
 
 def test_every_sum_takes_scenes_that_move(view):

@@ -57,7 +57,8 @@ def by_probes(
     with dr.suspend_grad():
         record, sh, features, carried = dr.detach(list(arguments))
         compositor.forward(record, sh, features, carried, keep=True)
-    attached = {"record": arguments.record, "sh": arguments.sh}
+    # Features move where a scene computes them; those of Gaussians are nobody's input here (`groups`).
+    attached = {"record": arguments.record, "sh": arguments.sh, "features": arguments.features if scene else None}
     root = torch.tensor(weights).sqrt()
     for _ in range(probes if groups else 0):
         sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1
