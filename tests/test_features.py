@@ -154,6 +154,35 @@ def test_blocks_of_weights(rng, width, monkeypatch):
     assert all(tiles == 1 or 4 * (len(x) - weights.PIXELS) <= 12 << 10 for tiles, x in sizes)
 
 
+def test_threads_of_torch_do_not_matter(rng):
+    """A list of 2,000 faint Gaussians in one tile: the same bits of the image with any number of torch's threads."""
+    cam, threads, images = camera(rng, (8, 8)), torch.get_num_threads(), []
+    g = gaussians(rng, 2000, 1, 24, scale=0.3).detach().replace(logit_opacities=torch.full((2000,), -5.0))
+    settings = Preset("exact", order="center", transmittance_min=0.0)
+    try:
+        for count in (1, 2, 3, 8):
+            torch.set_num_threads(count)
+            images.append(render(g, cam, settings).features.detach())
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(images[0], image) for image in images)
+
+
+def test_products_are_bounded(rng, monkeypatch):
+    """However few entries tiles have, no product holds more rows of features, or of pixels, than there is room for."""
+    sizes, gathered = [], weights._gathered
+
+    def noted(cotangent, group):
+        sizes.append(gathered(cotangent, group))
+        return sizes[-1]
+
+    monkeypatch.setattr(weights, "_WORK", 4 * 24 * 64 * 2)  # bytes of the pixels of two tiles
+    monkeypatch.setattr(weights, "_gathered", noted)
+    g, cam = gaussians(rng, 40, 4, 24), camera(rng, (29, 21))
+    render(g, cam, settings_of(128)).features.square().sum().backward()
+    assert 2 == max(len(x) for x in sizes)
+
+
 def test_without_features_nothing_is_held(rng, monkeypatch):
     """A scene without features asks for no weights and no products; one without Gaussians has an image of zeros."""
     cam, g = camera(rng, (9, 7)), gaussians(rng, 12, 4, 0)

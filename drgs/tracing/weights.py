@@ -35,6 +35,7 @@ PIXELS = 64  # of a tile
 MATRIX = 128 << 20
 """Bytes of the weights that are held at once; more where the list of a single tile has more."""
 _WORK = 4 << 20  # bytes of the features of the entries that one product takes
+_UNSPLIT = 512  # entries (measured with MKL: 512 are summed by one thread of 16, 813 are not)
 _SLACK = 8  # tiles of one product: the most entries may be more than the fewest by 1/8, or by as many entries
 
 
@@ -58,6 +59,8 @@ class _Group:
         """(rows, Gaussians) of as many entries at a time as there is room for."""
         tiles, entries = self.rows.shape
         step = max(1, _WORK // (4 * width * tiles))
+        if tiles == 1:  # a longer sum of one product is split between threads, and rounds by their number
+            step = min(step, _UNSPLIT)
         for k in range(0, entries, step):
             yield self.rows[:, k : k + step].reshape(-1), self.index[:, k : k + step].reshape(-1)
 
@@ -174,7 +177,7 @@ class Weights:
             most = int(counts[k])
             fewest = max(most - max(most // _SLACK, _SLACK), 1)
             similar = len(tiles) - int(torch.searchsorted(ascending, fewest)) - k
-            count = max(min(similar, _WORK // (4 * width * most)), 1)
+            count = max(min(similar, _WORK // (4 * width * max(most, PIXELS))), 1)  # rows of features, or of pixels
             own, j = tiles[k : k + count], torch.arange(most, device=tiles.device)
             at = torch.where(j < counts[k : k + count, None], starts[own, None] + j, -1)  # -1: the row that is 0
             rows = touched[at]
