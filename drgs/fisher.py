@@ -318,8 +318,8 @@ def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings 
     """
     seen = gaussians_at("fisher.pose_information", gaussians, camera)
     check_view("fisher.pose_information", seen, camera, settings)
-    columns = jacobian_columns(seen, camera, {"camera": range(6)}, settings)[..., :3]
-    flat = columns.reshape(6, -1).double()
+    colors = seen.replace(features=None)  # else their columns would be computed, too, for nothing
+    flat = jacobian_columns(colors, camera, {"camera": range(6)}, settings).reshape(6, -1).double()
     return flat @ flat.T
 
 

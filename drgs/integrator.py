@@ -70,7 +70,6 @@ def render(
 
 
 def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wanted: frozenset, couple: bool) -> Output:
-    must_be("render", "couple_features", couple, bool, "True or False")
     seen = gaussians_at("render", gaussians, camera)
     check_view("render", seen, camera, settings)
     call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted, couple=couple)

@@ -9,7 +9,7 @@ from scenes_random import FIELDS, Oracle, camera, compare, gaussians, gradients,
 
 import drgs
 from drgs import reference
-from drgs.integrator import OUTPUTS, render, render_jvp
+from drgs.integrator import OUTPUTS, render, render_jvp, render_rays
 from drgs.tracing import composite, walk, weights
 
 IMAGE, GRADIENT = 1e-5, 1e-4  # those of tests/test_integrator.py
@@ -79,8 +79,14 @@ def test_uncoupled_through_torch(rng):
     _, tangent = torch.func.jvp(image, (values,), (v,))
     only = render(drgs.Gaussians(**{**values, "features": v["features"]}), still, Preset("fast")).features
     torch.testing.assert_close(tangent, only, rtol=1e-6, atol=1e-6)  # linear in the features, in float32
-    with pytest.raises(ValueError, match="couple_features must be a bool, got the int 0"):
-        render(g, cam, couple_features=0)
+    rays = torch.zeros(3), torch.ones(3)
+    for call in (
+        lambda: render(g, cam, couple_features=0),
+        lambda: render_jvp(g, cam, {"camera": torch.zeros(6)}, couple_features=0),
+        lambda: render_rays(g, *rays, couple_features=0),
+    ):
+        with pytest.raises(ValueError, match="couple_features must be a bool, got the int 0"):
+            call()
 
 
 WIDTHS = {

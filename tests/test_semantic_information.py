@@ -22,6 +22,7 @@ from drgs.information.moments import moments_map
 from drgs.oracle import sh_colors
 from drgs.select import POLICIES, Cache, select
 from drgs.settings import RenderSettings
+from drgs.tracing.weights import Weights
 
 Preset = RenderSettings.preset
 COUPLED = ("means", "rotations", "log_scales", "logit_opacities")
@@ -149,6 +150,14 @@ def test_colors_only_make_no_metric(world, monkeypatch):
     for criterion in ("eig", "block_logdet"):
         select(g.replace(features=None), candidates, train, criterion=criterion)
         select(g, candidates, train, criterion=criterion, blocks=("geometry",))
+
+
+def test_the_pose_is_told_by_colors(seen, monkeypatch):
+    """Of a scene with features the pose's information is that of its colors, and no feature image is made for it."""
+    g, cam, settings, _, _ = seen
+    want = fisher.pose_information(g.replace(features=None), cam, settings)
+    monkeypatch.setattr(Weights, "__init__", lambda *arguments: pytest.fail("a feature image was made"))
+    assert torch.equal(fisher.pose_information(g, cam, settings), want)
 
 
 def test_blocks_of_the_image_add_up(seen):

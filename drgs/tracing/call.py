@@ -13,7 +13,7 @@ from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.guards import memory
-from drgs.guards.arguments import ArgumentError, kind_of
+from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.composite import Compositor
@@ -92,6 +92,7 @@ class Call:
         couple: bool = True,
     ):
         self.lib, self.settings, self.camera, self.want = runtime.dr_types(), settings, camera, want
+        must_be("render", "couple_features", couple, bool, "True or False")
         self.couple = couple
         if settings.traversal == "tiles" and camera.is_distorted:
             raise NotImplementedError(
