@@ -144,6 +144,11 @@ def fisher(pool: Pool) -> Selection:
             without = ()
         if "geometry" not in blocks:
             options["channel_weights"], without = (0.0, 0.0, 0.0), ("sh",)
+        if scoring.groups is not None and set(scoring.groups) <= set(without):
+            raise ValueError(
+                f"select: groups must have one that blocks {', '.join(blocks)} tell about, got "
+                f"{', '.join(scoring.groups) or 'none'}; add the other block, or another group"
+            )
     if scoring.criterion == "block_logdet":
         selection = _greedy(pool, "blocks", (), **options)
     else:

@@ -186,7 +186,7 @@ def test_products_are_bounded(rng, monkeypatch):
     monkeypatch.setattr(weights, "_gathered", noted)
     g, cam = gaussians(rng, 40, 4, 24), camera(rng, (29, 21))
     render(g, cam, settings_of(128)).features.square().sum().backward()
-    assert 2 == max(len(x) for x in sizes)
+    assert max(len(x) for x in sizes) == 2
 
 
 def test_without_features_nothing_is_held(rng, monkeypatch):

@@ -217,7 +217,7 @@ class ActiveConfig:
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         if self.blocks is not None:
-            object.__setattr__(self, "blocks", checked_blocks("active", self.blocks))
+            object.__setattr__(self, "blocks", checked_blocks("active", self.blocks, self.method))
         count = (1, 10**9)
         ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
         check_fields("active", self, ranges)

@@ -36,11 +36,11 @@ BLOCK_NAMES: tuple[Block, ...] = typing.get_args(Block)
 """In the order in which results name them."""
 
 
-def checked_blocks(where: str, names: Sequence[str]) -> tuple[Block, ...]:
+def checked_blocks(where: str, names: Sequence[str], method: str) -> tuple[Block, ...]:
     """The blocks that are named, each once and in their order.
 
     Raises:
-        ValueError: If one is unknown, or none is named.
+        ValueError: If one is unknown, or the method does not know it, or none is named.
     """
     known = ", ".join(BLOCK_NAMES)
     if not isinstance(names, tuple | list) or not names:
@@ -48,6 +48,8 @@ def checked_blocks(where: str, names: Sequence[str]) -> tuple[Block, ...]:
     for name in names:
         if name not in BLOCK_NAMES:
             raise ValueError(f"{where}: blocks must be among {known}, got {name!r}; correct it")
+    if method == "fisherrf" and "semantic" in names:
+        raise ValueError(f"{where}: blocks must be geometry with method fisherrf, got semantic; use method exact")
     return tuple(name for name in BLOCK_NAMES if name in names)
 
 

@@ -59,7 +59,7 @@ class Scoring:
             must_be("select", "groups", self.groups, (tuple, list), 'e.g. ("means", "sh")')
             object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
         if self.blocks is not None:
-            object.__setattr__(self, "blocks", checked_blocks("select", self.blocks))
+            object.__setattr__(self, "blocks", checked_blocks("select", self.blocks, self.method))
         if self.semantics is not None:
             must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
 
