@@ -118,6 +118,10 @@ def _fit(
     # Parts of a caller's own say themselves what is fitted to what.
     begun = [plan.views[i] for i in plan.chosen] if plan else train
     taught = SemanticRecord.of(dataset, config, begun) if parts is None else None
+    if active and active.policy == "fisher" and "semantic" in (active.blocks or ()) and parts is None and not taught:
+        raise ValueError(  # else the first pick would be where it is found out
+            "active: blocks must be of what is fitted, got semantic for a fit without a teacher's maps; use geometry"
+        )
     tensors, header = last_checkpoint(run) if resume else (None, None)
     if tensors is not None and header is not None:
         was, now = ("active" if x else "all" for x in (header.get("active"), plan))

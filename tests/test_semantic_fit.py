@@ -360,6 +360,14 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
         assert "features" in pick["parts"]
 
 
+def test_blocks_that_the_fit_does_not_have(taught, tmp_path, monkeypatch):
+    """Semantic information of a fit without features is refused before the first step, not at the first pick."""
+    monkeypatch.setattr("drgs.train.Trainer", lambda *arguments: pytest.fail("it began"))
+    active = ActiveConfig(policy="fisher", add=2, every=2, blocks=("geometry", "semantic"))
+    with pytest.raises(ValueError, match="active: blocks must be of what is fitted, got semantic for a fit without"):
+        fit(taught, tmp_path / "run", config(semantics="ignore", **FIT), active=active, progress=False)
+
+
 def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, capsys):
     """metrics.json names the reference and has the run's figures beside the teacher's own; `drgs eval` repeats them,
     prints them, and puts labels, reference, features and an overlay beside the picture of the colors.
