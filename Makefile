@@ -39,6 +39,10 @@ smoke: setup
 	$(BIN)/drgs tradeoff out/smoke/run --limit 1 --max-pixels 768 --repeats 1 -o out/smoke/tradeoff
 	$(BIN)/drgs stress --match "1 Gaussian"
 	$(BIN)/drgs scene room -o out/smoke/room --size 64x48 --views 3 --spp 2
+	rm -rf out/smoke/semantic
+	$(BIN)/drgs fit out/smoke/room -o out/smoke/semantic --max-steps 40 --feature-width 8
+	$(BIN)/drgs query out/smoke/semantic --class wall --threshold 0 --limit 1 -o out/smoke/query
+	$(BIN)/drgs teach --help
 
 lint: setup
 	$(BIN)/ruff check .
