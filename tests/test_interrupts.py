@@ -8,9 +8,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import drgs
 from drgs.guards import interrupts
+from drgs.tracing.composite import Compositor
 
 # A command that waits in Python, or in native code that no signal ends, which takes minutes.
 _COMMAND = """
@@ -95,6 +98,19 @@ def test_signal_ends_a_command(start, tmp_path, kind, signum, code, name):
     assert time.perf_counter() - began < 3
     assert (process.returncode, error) == (code, f"{name}\n")
     assert not list(tmp_path.iterdir())
+
+
+def test_an_operation_of_drjit_is_interrupted_as_python_is(monkeypatch):
+    """Most of a render is inside Dr.Jit's operation, which makes errors of its own of whatever is raised there."""
+
+    def interrupted(*_):
+        raise interrupts.Terminated(signal.SIGTERM)
+
+    monkeypatch.setattr(Compositor, "forward", interrupted)
+    one = drgs.Gaussians.from_arrays([[0, 0, 2.0]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.5], [[[0.0] * 3]])
+    K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+    with pytest.raises(interrupts.Terminated):
+        drgs.render(one, drgs.Camera(K=K, w2c=np.eye(4), width=8, height=8))
 
 
 def test_step_is_finished_and_the_same_signal_twice_is_one(start):

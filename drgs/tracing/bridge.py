@@ -28,12 +28,13 @@ def to_drjit(lib: ModuleType, x: torch.Tensor) -> Any:
 
 @contextlib.contextmanager
 def own_errors() -> Iterator[None]:
-    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said."""
+    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said, and who
+    interrupted is obeyed."""
     try:
         yield
     except RuntimeError as error:
         cause = error.__cause__
-        while cause is not None and not isinstance(cause, ValueError | NotImplementedError):
+        while cause is not None and not isinstance(cause, ValueError | NotImplementedError | KeyboardInterrupt):
             cause = cause.__cause__
         if cause is None:
             raise
