@@ -7,6 +7,7 @@ import shutil
 import pytest
 from test_active import SIZE, write_still
 
+from drgs import cli
 from drgs.cameras import orbit
 from drgs.commands.given import Given
 from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
@@ -165,3 +166,26 @@ def test_a_split_is_the_runs_offset_included(place, tmp_path):
     for text in (place / "data", tmp_path / "run"):
         source = Source.of("--cameras", str(text))
         assert [view.name for view in source.split(source.dataset(False), "test", its)] == ["2", "5", "8"]
+
+
+def test_a_run_whose_data_set_was_moved_says_so(place, tmp_path, capsys):
+    """By the run, where its photographs were, and which option names cameras instead; `drgs eval` alike."""
+    shutil.copytree(place / "run", tmp_path / "run")
+    path = tmp_path / "run/config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"data": str(tmp_path / "moved")}))
+    gone = r"run: the data set of the run must be at .*moved, found none; move it back, or name cameras with --"
+    with pytest.raises(FileNotFoundError, match=gone + "cameras"):
+        seen_views(*given(tmp_path, Tradeoff))
+    with pytest.raises(FileNotFoundError, match=gone + "train"):
+        known_views(None, *given(tmp_path, Select))
+    assert cli.main(["eval", str(tmp_path / "run")]) == 2
+    assert "moved, found none; move it back\n" in capsys.readouterr().err
+
+
+def test_cameras_are_taken_of_a_data_set_whose_maps_are_bad(place, tmp_path):
+    """What a teacher's files hold is no matter of cameras."""
+    shutil.copytree(place / "data", tmp_path / "data")
+    (tmp_path / "data/rgb_feature_langseg").mkdir()
+    (tmp_path / "data/rgb_feature_langseg/another_fmap_CxHxW.pt").write_bytes(b"damaged")
+    args, shown = given(place, Tradeoff, cameras=str(tmp_path / "data"), limit=2)
+    assert len(seen_views(args, shown)[0]) == 2

@@ -28,6 +28,7 @@ def run(args: Eval) -> None:
     """`drgs eval RUN`."""
     run = Run(args.run)
     recorded = fit_record(run)
+    recorded.check_data(run.path)
     output = claim_run(run, "eval")
     loaded = load_run(run)
     g = loaded.gaussians

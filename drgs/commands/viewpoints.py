@@ -91,9 +91,16 @@ class Source:
         return load_cameras_json(Path(self.text))
 
     def dataset(self, strict: bool, lazy: bool = True) -> Dataset:
-        """The data set, or that of a run, without points."""
-        record = self.record
-        return data.load(record.data if record else Path(self.text), lazy=lazy, points=False, strict=strict)
+        """The data set, or that of a run, without points, maps and labels.
+
+        Raises:
+            FileNotFoundError, ValueError: If there is none, or a run's is no longer where it was.
+        """
+        place = Path(self.text)
+        if self.record is not None:
+            self.record.check_data(place, f"name cameras with {self.option}")
+            place = self.record.data
+        return data.load(place, lazy=lazy, points=False, strict=strict, semantics=False)
 
     def split(self, dataset: Dataset, part: str, given: Given) -> list[View]:
         """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of
@@ -185,7 +192,7 @@ def _captured(given: Given) -> list[Camera]:
         return []
     try:
         names = set(fitted_views(given.run))
-        views = data.load(given.record.data, lazy=True, points=False).views
+        views = data.load(given.record.data, lazy=True, points=False, semantics=False).views
     except (ValueError, OSError, KeyError):
         return []
     return [view.camera.undistorted() for view in views if view.name in names]

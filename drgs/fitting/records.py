@@ -73,6 +73,12 @@ class FitRecord:
     is_active: bool
     semantics: SemanticRecord | None = None
 
+    def check_data(self, run: Path, otherwise: str = "") -> None:
+        """Raise FileNotFoundError if the data set is no longer where it was fitted; `otherwise` is advice, too."""
+        if not self.data.exists():
+            advice = f"move it back, or {otherwise}" if otherwise else "move it back"
+            raise FileNotFoundError(f"{run}: the data set of the run must be at {self.data}, found none; {advice}")
+
 
 @dataclasses.dataclass(frozen=True)
 class LoadedRun:
