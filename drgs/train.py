@@ -165,8 +165,8 @@ def _fit(
         }
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
-    if taught and dataset.semantics:
-        taught.write_embeddings(run.path, dataset.semantics.classes)
+    if taught:
+        taught.write_embeddings(run.path, dataset.semantics)
     if plan:
         plan.write(run)  # forgets picks that no checkpoint knows of
     run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.rows))

@@ -337,6 +337,14 @@ def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkey
     assert load_run(done.run).decoder is not None
 
 
+def test_without_embeddings_no_label_is_read(tmp_path):
+    """Classes that no file names would be the numbers of all label images, those of views that were not picked too."""
+    known = Semantics(labels="labels", label_images=(tmp_path / "not_picked.png",))
+    record = SemanticRecord("rgb_feature_langseg", "labels", CHANNELS, WIDTH, (MAP, MAP), None, False)
+    record.write_embeddings(tmp_path, known)
+    assert not list(tmp_path.iterdir())
+
+
 def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path, monkeypatch):
     """At every pick features count in the metric of the decoder at that step; selection.json says what was coupled."""
     metrics_of, real = [], drgs.select.select

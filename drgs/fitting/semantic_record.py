@@ -19,7 +19,7 @@ from drgs.guards.json_files import check_json
 if TYPE_CHECKING:
     import torch
 
-    from drgs.data import Dataset, View
+    from drgs.data import Dataset, Semantics, View
     from drgs.ellipsoids import Gaussians
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
@@ -116,8 +116,9 @@ class SemanticRecord:
         names = None if self.classes is None else list(self.classes)
         return {**dataclasses.asdict(self), "map_size": list(self.map_size), "classes": names}
 
-    def write_embeddings(self, run: Path, classes: Classes | None) -> None:
-        """Write `EMBEDDINGS` into a run folder, atomically, if there are any."""
+    def write_embeddings(self, run: Path, semantics: Semantics | None) -> None:
+        """Write `EMBEDDINGS` of a data set into a run folder, atomically, if there are any; no label image is read."""
+        classes = semantics.classes if self.embeddings and semantics is not None else None
         if classes is None or classes.embeddings is None:
             return
         with atomic_write(run / EMBEDDINGS) as file:
