@@ -239,6 +239,33 @@ def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
     assert len(faked) == len(cells)
 
 
+def test_a_data_set_that_another_process_makes_is_waited_for(still, faked, tmp_path, monkeypatch, caplog):
+    """The first processes of a study all want the same data set: one makes it, the others wait, and say so once."""
+    calls = []
+
+    def folder(scene, split):
+        calls.append(scene)
+        if len(calls) < 3:
+            raise InUse(f"{still}: must not be written by two commands at once")
+        return still
+
+    monkeypatch.setattr(engine, "_PATIENCE", 0.0)
+    study = dataclasses.replace(small(still), folder=folder)
+    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, tmp_path / "rows.jsonl", str) == ([], [])
+    assert len(calls) == 3
+    assert caplog.text.count("waiting: ") == 1
+
+
+def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
+    """`drgs eval` writes metrics.json anew, without the seconds of the fit: the row is taken all the same."""
+    real, said, rows = engine._row, [], tmp_path / "rows.jsonl"
+    monkeypatch.setattr(engine, "_row", lambda *arguments: {**real(*arguments), "seconds": None})
+    study = small(still)
+    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, rows, said.append) == ([], [])
+    assert [row["seconds"] for row in read_study(rows)] == [None]
+    assert said[-1].endswith("steps 10.0")
+
+
 # ---- one real cell
 
 
@@ -347,6 +374,10 @@ def test_the_report_says_gain_and_loss(tmp_path):
     for row in rows:
         assert f" {row['metrics']['psnr']:.2f} " in text
     assert "abcdefg" in text
+    assert "Of 3 intervals about 0.1 would if policies did not differ at all." in " ".join(text.split())
+    assert "more than one commit" not in text
+    other = told([*rows[:-1], {**rows[-1], "commit": "9"}])
+    assert "In 1 of 8 units fits are of more than one commit" in " ".join(other.split())
     for row in rows[::2]:
         row["metrics"]["psnr"] = row["metrics"]["flip"] = float(rng.normal())
     assert "- `p` against `Random, 1`: no difference that this study can see." in told(rows)

@@ -12,6 +12,7 @@ import json
 import logging
 import os
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -34,6 +35,7 @@ Protocol = Literal["blind", "paper"]
 """`blind`: nothing of a view is read before it is picked. `paper`: initial points of the whole data set (pool_leak)."""
 
 _log = logging.getLogger(__name__)
+_PATIENCE = 5.0  # seconds until a data set that another process makes is asked for again
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +144,18 @@ class Study:
         active = dataclasses.replace(self.active, start=cell.start, **self.policies[cell.policy])
         return dataclasses.replace(self.fit, **changed), active
 
+    def _made(self, cell: Cell) -> Path:
+        """The folder of a cell's data set, once no other process is making it any more."""
+        told = False
+        while True:
+            try:
+                return self.folder(cell.scene, cell.split)
+            except InUse as busy:
+                if not told:
+                    _log.warning("waiting: %s", busy)
+                told = True
+                time.sleep(_PATIENCE)
+
     def dataset(self, cell: Cell) -> data.Dataset:
         """The views of a cell, none of them opened.
 
@@ -150,7 +164,7 @@ class Study:
         """
         every, offset = cell.split
         dataset = data.load(
-            self.folder(cell.scene, cell.split),
+            self._made(cell),
             test_every=every,
             test_offset=offset,
             background=self.fit.settings.background,
@@ -300,7 +314,7 @@ def run_cells(
             continue
         append_row(rows, row)
         numbers = ", ".join(f"{m.title} {row['metrics'][m.key]}" for m in study.metrics)
-        say(f"{cell.name}: {numbers}, {row['seconds']:.0f} s")
+        say(f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else ""))
     return taken, failed
 
 

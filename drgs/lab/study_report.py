@@ -48,7 +48,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             others = [(label, study.reference) for label in study.policies if label != study.reference]
             parts += [
                 f"{below} Against `{study.reference}`",
-                _wrapped(_explained(mine)),
+                _wrapped(_explained(mine, len(others) * len(study.metrics))),
                 _compared(study, mine, others),
             ]
             if verdicts := _verdicts(study, mine, others):
@@ -99,8 +99,18 @@ def _size(rows: StudyRows) -> str:
     fits = f"{len(rows)} fit{'s' if len(rows) > 1 else ''}, on commits {', '.join(commits)}"
     return (
         f"{fits}. Units (scene, split, initial views): {', '.join(each)}. "
-        "Fits of one unit that differ by the seed alone are averaged."
+        f"Fits of one unit that differ by the seed alone are averaged.{_mixed(rows)}"
     )
+
+
+def _mixed(rows: StudyRows) -> str:
+    """A sentence about units whose fits were not all made by the same code."""
+    commits: dict[tuple[str, Unit], set] = {}
+    for row in rows:
+        commits.setdefault((row["protocol"], unit_of(row)), set()).add(row.get("commit"))
+    mixed = sum(len(found) > 1 for found in commits.values())
+    told = f" In {mixed} of {len(commits)} units fits are of more than one commit: there the code may matter, too."
+    return told if mixed else ""
 
 
 def _range(numbers: set[int]) -> str:
@@ -136,11 +146,12 @@ def _title(metric: Metric) -> str:
     return metric.title if metric.larger else f"{metric.title} (lower is better)"
 
 
-def _explained(rows: StudyRows) -> str:
-    """How to read the table of differences."""
+def _explained(rows: StudyRows, intervals: int) -> str:
+    """How to read the table of differences, which has so many intervals."""
     scenes, units = len({row["scene"] for row in rows}), len({unit_of(row) for row in rows})
     told = (
-        "**Gain** and **loss**: the interval leaves out 0."
+        f"**Gain** and **loss**: the interval leaves out 0. Of {intervals} intervals about {intervals / 20:.1f} would "
+        "if policies did not differ at all."
         if units >= _FEWEST
         else f"No verdicts: {units} units cannot tell a difference from chance, even if all of them agree."
     )
