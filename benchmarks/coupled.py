@@ -34,9 +34,9 @@ from drgs.files import Run  # noqa: E402
 from drgs.fisher import SemanticMetric  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
+from drgs.lab.study_report import fill_between  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
-BEGIN, END = "<!-- coupled: begin -->", "<!-- coupled: end -->"
 GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")
 COUNTS = (1, 2, 4, 8, 16)
 CRITERIA = ("eig", "logdet")
@@ -125,11 +125,9 @@ def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int
 
 
 def report(r: dict) -> str:
-    """The part of the page between the marks."""
+    """What docs/semantic.md says."""
     e, fast, exact = r["errors"], r["fast"], r["exact"]
     lines = [
-        BEGIN,
-        "",
         f"Made by `python benchmarks/coupled.py`, {r['machine']}, {r['date']}, commit {r['commit']}.",
         f"Run `{r['run']}`: {r['gaussians']:,} Gaussians with {r['width']} feature channels, a decoder of rank "
         f"{r['rank']}.",
@@ -161,8 +159,6 @@ def report(r: dict) -> str:
         f"{blocks[1]:.2f} times with `exact`.",
         f"Features make {100 * e['share of the trace']:.0f} % of the summed information about the geometry here.",
         f"The best view's margin is {100 * e['margin']:.2g} % of its `eig`.",
-        "",
-        END,
     ]
     return "\n".join(lines)
 
@@ -202,9 +198,7 @@ def main():
     text = report(result)
     print(text)
     if not (args.print or args.quick):
-        page = ROOT / "docs" / "semantic.md"
-        before, rest = page.read_text().split(BEGIN)
-        page.write_text(before + text + rest.split(END)[1])
+        fill_between(ROOT / "docs" / "semantic.md", "coupled", text)
         (ROOT / "benchmarks" / "coupled.json").write_text(json.dumps(result, indent=1) + "\n")
 
 

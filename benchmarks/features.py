@@ -29,12 +29,12 @@ import torch  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
+from drgs.lab.study_report import fill_between  # noqa: E402
 from drgs.tracing import weights  # noqa: E402
 from drgs.tracing.tiles import TileTraversal  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 WIDTHS = (3, 16, 32, 64, 128, 512)
-BEGIN, END = "<!-- made by benchmarks/features.py -->", "<!-- end of benchmarks/features.py -->"
 
 
 def camera() -> drgs.Camera:
@@ -194,9 +194,7 @@ def main():
     text = report(result)
     print(text)
     if not args.quick:
-        page = ROOT / "docs" / "semantic.md"
-        before, rest = page.read_text().split(BEGIN)
-        page.write_text(before + BEGIN + "\n\n" + text + "\n\n" + END + rest.split(END)[1])
+        fill_between(ROOT / "docs" / "semantic.md", "features", text)
         (ROOT / "benchmarks" / "features.json").write_text(json.dumps(result, indent=1) + "\n")
 
 

@@ -353,6 +353,27 @@ def test_intervals_are_those_of_all_resamples(rng, sizes):
     assert found.positive + found.negative == found.units
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sizes", "spread", "share"),
+    [((3, 3, 6), 0.0, 0.94), ((3, 3, 6), 0.5, 0.89), ((3, 3, 6), 1.0, 0.82), ((1, 1, 1), 0.0, 0.75)],
+)
+def test_how_often_intervals_hold_the_truth(rng, sizes, spread, share):
+    """The shares that study_statistics states, of scenes whose means spread that much as units of one scene do.
+
+    Within 4 standard errors of a share in as many studies, and 0.005 of rounding.
+    """
+    studies, held = 1000, 0
+    for _ in range(studies):
+        means = spread * rng.normal(size=len(sizes))
+        values = {
+            (f"s{s}", (8, 0), (str(k),)): float(means[s] + rng.normal()) for s, n in enumerate(sizes) for k in range(n)
+        }
+        found = estimate(values, draws=1000)
+        held += found.low <= 0 <= found.high
+    assert abs(held / studies - share) < 4 * np.sqrt(share * (1 - share) / studies) + 0.005
+
+
 def told(rows):
     study = dataclasses.replace(small(Path("x")), policies={"p": {}, "Random, 1": {}})
     return study_report(study, rows)
