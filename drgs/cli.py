@@ -175,7 +175,7 @@ def _ending(error: KeyboardInterrupt) -> str:
 
 
 def _complain(command: str | None, message: str) -> None:
-    """One line on stderr: `drgs COMMAND: message`."""
+    """One line on stderr: `drgs COMMAND: message`; functions that are called as the command name it themselves."""
     where = f"drgs {command}" if command else "drgs"
-    message = " ".join(message.removeprefix("drgs: ").split())
+    message = " ".join(message.removeprefix("drgs: ").removeprefix(f"{command}: ").split())
     print(f"{where}: {message}", file=sys.stderr)

@@ -120,7 +120,11 @@ def test_queries_that_cannot_be():
         (lambda: TextQuery.of_vectors(torch.ones(5), threshold=1.5), r"in \[-1, 1\], got 1.5"),
         (lambda: TextQuery.of_classes(classes, ["wall"], threshold=-0.1), r"in \[0, 1\], got -0.1"),
         (lambda: TextQuery.of_classes(classes, ["wall"], temperature=0.0), "must be a number > 0"),
-        (lambda: TextQuery.of_vectors(torch.ones(5), threshold=0.1).score(torch.ones(2, 8)), "8 channels .* got 5"),
+        (lambda: TextQuery.of_vectors(torch.ones(5), threshold=0.1).score(torch.ones(2, 3)), "3 channels .* got 5"),
+        (
+            lambda: TextQuery.of_vectors(torch.ones(5), threshold=0.1).score(torch.ones(2, WIDTH), decoder()),
+            "8 channels of the decoded features, got 5",
+        ),
     ]
     for call, message in cases:
         with pytest.raises(ValueError, match=message) as caught:
@@ -185,7 +189,11 @@ def test_bad_queries_write_nothing(files, capsys):
         (("--class", "chair"), {}, "has no classes to take --class from"),
         (chair, {}, "--threshold must be given"),
         ((*chair, "--threshold", "0.9"), {"scene": "plain.ply"}, "must have semantic features, has none"),
-        ((*chair, "--threshold", "0.9"), {"decoder": False}, "must have the 3 channels of the decoded features"),
+        (
+            (*chair, "--threshold", "0.9"),
+            {"decoder": False},
+            "which no decoder was given for, got 8; name theirs (--decoder)",
+        ),
         ((*chair, "--threshold", "0.9", "--decoder", files / "wide.pth"), {"decoder": False}, "takes 4"),
         ((*chair, "--threshold", "0.9", "--decoder", files / "no.pth"), {"decoder": False}, "found none"),
         (("--text-embedding", files / "short.npy", "--threshold", "0.9"), {}, "must have the 8 channels"),
@@ -204,7 +212,7 @@ def test_bad_queries_write_nothing(files, capsys):
         assert query(files, *options, **how) == 2, message
         error = capsys.readouterr().err
         assert message in error
-        assert error.count("\n") == 1
+        assert error.count("\n") == error.count("query: ") == 1
         assert not (files / "out").exists()
 
 

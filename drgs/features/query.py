@@ -150,9 +150,11 @@ class TextQuery:
         """
         channels = features.shape[-1] if decoder is None else decoder.channels
         if channels != self.channels:
+            what, advice = "decoded features", "take those of the teacher's own text encoder"
+            if decoder is None:
+                what, advice = "features, which no decoder was given for", "name theirs (--decoder), or other texts"
             raise ValueError(
-                f"query: text embeddings must have the {channels} channels of the decoded features, got "
-                f"{self.channels}; take those of the teacher's own text encoder"
+                f"query: text embeddings must have the {channels} channels of the {what}, got {self.channels}; {advice}"
             )
         wanted = len(self.wanted)
         if self.others is None:
