@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 
     from drgs.integrator import Output
 
-__all__ = ["PAINTINGS", "Painter", "painters"]
+__all__ = ["OPAQUE", "PAINTINGS", "Painter", "painters"]
 
 PAINTINGS = ("features", "labels", "overlay")
+OPAQUE = 0.5
+"""A pixel is something where at least this much of the light stops."""
 
 Painter = Callable[["Output"], np.ndarray]
 """From what `drgs.render` gives, features included, to (H, W, 3) uint8."""
@@ -57,10 +59,13 @@ def painters(kinds: Iterable[str], given: Given, scene: Path) -> dict[str, Paint
                 "text embeddings of classes, has not; fit a data set that has text_embeddings.npy"
             )
         known, count = classes, len(classes)
-        made["labels"] = lambda out: label_picture(classify(_shown(out), known, decoder).numpy(), count)
-        made["overlay"] = lambda out: overlay(
-            out.rgb.cpu().clamp(0, 1).numpy(), classify(_shown(out), known, decoder).numpy(), count
-        )
+
+        def labels(out: Output) -> np.ndarray:
+            """Where next to nothing is, the decoder answers by its bias alone: that is no label."""
+            return np.where(out.alpha.cpu() < OPAQUE, 0, classify(_shown(out), known, decoder))
+
+        made["labels"] = lambda out: label_picture(labels(out), count)
+        made["overlay"] = lambda out: overlay(out.rgb.cpu().clamp(0, 1).numpy(), labels(out), count)
     return {kind: made[kind] for kind in kinds}
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.commands.given import Given
+from drgs.commands.painters import OPAQUE
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.camera_lists import described
 from drgs.data.checks import read_npy
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
 __all__ = ["read_embeddings", "run"]
-
-_OPAQUE = 0.5  # a pixel is something where at least this much of the light stops
 
 
 def run(args: Query) -> None:
@@ -157,7 +156,7 @@ def _view(
     with torch.no_grad():  # a picture
         out = render(g, camera, settings, ())
     _, selected = query.score(out.features, decoder)
-    mask = (selected & (out.alpha.cpu() >= _OPAQUE)).numpy()
+    mask = (selected & (out.alpha.cpu() >= OPAQUE)).numpy()
     files = [f"{name}.mask.png", f"{name}.png"]
     pictures.write_png(folder / files[0], mask[..., None].repeat(3, 2).astype("uint8") * 255)
     pictures.write_png(folder / files[1], mask_picture(out.rgb.cpu().numpy(), mask))
