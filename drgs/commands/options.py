@@ -94,7 +94,7 @@ class Fit(Choosing, Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
-    """A data set: COLMAP, transforms.json, LLFF, or a folder made by drgs sfm."""
+    """A data set: COLMAP, transforms.json, LLFF, Replica, or a folder made by drgs sfm."""
     output: OutputPath
     """The run folder."""
     preset: Preset = "fast"
@@ -126,9 +126,9 @@ class Fit(Choosing, Data):
     semantics: SemanticUse = FitConfig.semantics
     """Fit features and a decoder, too, where the data set has maps of a teacher (auto), or never (ignore)."""
     feature_width: int = FitConfig.feature_width
-    """Channels of the features; the decoder makes the teacher's of them."""
+    """Feature channels of a Gaussian; a linear decoder makes the teacher's of them."""
     feature_weight: float = FitConfig.feature_weight
-    """Of the features' distance to the teacher's maps, against the photographs'."""
+    """Weight of the features' distance to the teacher's maps in the loss; that of the photographs' is 1."""
     feature_resolution: FeatureSize = FitConfig.feature_resolution
     """Features are rendered at the size of the image and then reduced, or at that of the teacher's map: faster."""
     couple_features: bool = FitConfig.couple_features
