@@ -114,6 +114,9 @@ def test_render_refuses_what_does_not_fit(gaussians, one_gigabyte):
     assert memory.frame_bytes(100, TILES, gradients=True) > memory.frame_bytes(100, TILES)
     with pytest.raises(ValueError, match=f"render_jvp: {TOLD}take fewer at a time"):
         drgs.render_jvp(gaussians, camera(512), {"camera": np.zeros((64, 6))}, TILES)
+    wide = gaussians.replace(features=torch.zeros(len(gaussians), 512))
+    with pytest.raises(ValueError, match=f"render_jvp: {TOLD}take fewer at a time"):
+        drgs.render_jvp(wide, camera(256), {"camera": np.zeros((16, 6))}, TILES)
     with pytest.raises(ValueError, match=TOLD):
         drgs.fisher.diagonal(gaussians, camera(4096), TILES)
 

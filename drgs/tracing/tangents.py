@@ -18,7 +18,8 @@ def push_forward(call: Call, tangents: dict) -> Output:
     """`render_jvp`: the images' tangents along those of the parameters."""
     columns, batched = _columns(call, tangents)
     what = f"{len(columns)} tangents of {call.pixels} pixels"
-    needed = memory.frame_bytes(call.pixels, call.settings, call.width) + memory.TANGENT * call.pixels * len(columns)
+    each = memory.TANGENT + 4 * call.width  # of the features only their images: a lower bound
+    needed = memory.frame_bytes(call.pixels, call.settings, call.width) + each * call.pixels * len(columns)
     memory.require("render_jvp", needed, what, "take fewer at a time", call.home.type == "cuda")
     if call.count == 0:
         still = call.output(call.nothing())
