@@ -305,4 +305,7 @@ def test_teach_refuses_bad_options(capture, model, capsys):
         assert message in capsys.readouterr().err
     assert teach(capture / "nowhere", model) == 2
     assert "found no such file or folder" in capsys.readouterr().err
+    shutil.copytree(capture / "images", capture / "alone/images")
+    assert teach(capture / "alone", capture / "nowhere") == 2  # before a model is looked for
+    assert "must hold camera poses, found" in capsys.readouterr().err
     assert options.Teach.scales == ",".join(f"{scale:g}" for scale in SCALES)

@@ -53,12 +53,11 @@ def run(args: Teach) -> None:
     output.sweep(_FOLDER)
     _refuse_others(output)
     names = _names(args, output)
+    files = _files(data.load(args.data, points=False, strict=args.strict, semantics=False).views)
     with Bar("loading the model", show=not args.quiet):
         on_cuda = args.variant != "llvm_ad_rgb" and torch.cuda.is_available()
         encoder = ClipEncoder(args.model, "cuda" if on_cuda else "cpu")
         digest = _digest(encoder)
-    dataset = data.load(args.data, points=False, strict=args.strict, semantics=False)
-    files = _files(dataset.views)
     record = {
         "schema": SCHEMA,
         "command": "teach",
