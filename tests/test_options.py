@@ -24,7 +24,7 @@ def _choices(command: type, name: str) -> tuple:
 @pytest.mark.parametrize("config", [FitConfig, ActiveConfig])
 def test_fit_options_are_those_of_its_configs(config):
     """Every option of `fit` named as a field of FitConfig or ActiveConfig has its default and its type, choices
-    included; and every field of ActiveConfig is an option.
+    included; and every field of ActiveConfig is an option, and of FitConfig all of features.
     """
     fields, offered = typing.get_type_hints(config), typing.get_type_hints(options.Fit)
     shared = set(fields) & {field.name for field in dataclasses.fields(options.Fit)}
@@ -34,6 +34,7 @@ def test_fit_options_are_those_of_its_configs(config):
         assert offered[name] == fields[name], name
     if config is ActiveConfig:
         assert shared == set(fields)
+    assert {name for name in fields if "feature" in name or "decoder" in name} <= shared
 
 
 @pytest.mark.parametrize("command", [options.Select, options.Fisher])

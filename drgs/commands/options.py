@@ -129,6 +129,10 @@ class Fit(Choosing, Data):
     """Feature channels of a Gaussian; a linear decoder makes the teacher's of them."""
     feature_weight: float = FitConfig.feature_weight
     """Weight of the features' distance to the teacher's maps in the loss; that of the photographs' is 1."""
+    feature_rate: float = FitConfig.feature_rate
+    """Learning rate of the features; some times as much for fits of few steps (docs/semantic.md)."""
+    decoder_rate: float = FitConfig.decoder_rate
+    """Learning rate of the decoder, a tenth of the features' as a rule."""
     feature_resolution: FeatureSize = FitConfig.feature_resolution
     """Features are rendered at the size of the image and then reduced, or at that of the teacher's map: faster."""
     couple_features: bool = FitConfig.couple_features
