@@ -121,6 +121,20 @@ def held(count: int, preset: str, width: int) -> dict:
     return {"bytes": max(sizes), "blocks": len(shares), "share": sum(a for a, _ in shares) / sum(b for _, b in shares)}
 
 
+def grown(count: int, width: int) -> int:
+    """Bytes that a coupled `fast` frame and its gradients add to a process that has the Gaussians and the kernels."""
+    code = (
+        "import torch, features\n"
+        "def peak(): return next(int(x.split()[1]) for x in open('/proc/self/status') if x.startswith('VmHWM'))\n"
+        f"small, large = (features.frame(features.with_features(n, {width}), features.Preset('fast'), True)"
+        f" for n in (100, {count}))\n"
+        "small(); open('/proc/self/clear_refs', 'w').write('5')\n"  # the peak is what there is now
+        "before = peak(); large(); print(1024 * (peak() - before))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "benchmarks", capture_output=True, check=True)
+    return int(told.stdout.split()[-1])
+
+
 def growth(rows: list[dict], way: str) -> dict:
     """A straight line through the ratios over the widths: at no channels, and per 100 channels; its largest error."""
     x = np.array([row["width"] for row in rows], float)
@@ -155,6 +169,9 @@ def report(result: dict) -> str:
         lines.append(
             f"- `{preset}`: {x['bytes'] / 2**20:.0f} MiB in {x['blocks']} block(s), {100 * x['share']:.0f} % not 0."
         )
+    added = ", ".join(f"{int(x) / 2**20:.0f} MiB with {width} channels" for width, x in result["grown"].items())
+    lines += ["", "A coupled `fast` frame and its gradients add to a process that has the Gaussians and the kernels:"]
+    lines.append(f"{added}.")
     return "\n".join(lines)
 
 
@@ -190,6 +207,7 @@ def main():
         "rows": rows,
         "growth": fits,
         "held": {preset: held(count, preset, 16) for preset in ("fast", "exact")},
+        "grown": {width: grown(count, width) for width in (0, 16, 128)},
     }
     text = report(result)
     print(text)
