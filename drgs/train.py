@@ -135,6 +135,10 @@ def _fit(
         check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
     frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
     held_out = load_frames(test, config.max_pixels, config.mask)
+    if taught and taught.embeddings:
+        from drgs.fitting.segments import check_references
+
+        check_references(held_out)
     if tensors is not None and header is not None:
         made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made)

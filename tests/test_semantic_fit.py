@@ -400,6 +400,22 @@ def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, caps
     assert width > 4 * SIZE
 
 
+@pytest.mark.parametrize("kind", ["labels", "map"])
+def test_references_are_looked_at_before_the_first_step(taught, tmp_path, monkeypatch, kind):
+    """A held-out view with labels of no class, or NaN in its map, is refused when hours of fitting are yet to come."""
+    test = taught.split(config(**FIT).test_every)[1][0]
+    if kind == "labels":
+        write_png(tmp_path / "bad.png", np.full((SIZE, SIZE, 3), 77 / 255))
+        bad, message = {"label_path": tmp_path / "bad.png"}, "bad.png: must hold classes .* got 77"
+    else:
+        torch.save(torch.full((CHANNELS, MAP, MAP), torch.nan), tmp_path / "bad.pt")
+        bad, message = {"teacher_path": tmp_path / "bad.pt"}, "bad.pt: must be finite"
+    views = [dataclasses.replace(view, **bad) if view is test else view for view in taught.views]
+    monkeypatch.setattr(Trainer, "step", lambda self: pytest.fail("a step was made"))
+    with pytest.raises(ValueError, match=message):
+        fit(dataclasses.replace(taught, views=views), tmp_path / "run", config(**FIT), progress=False)
+
+
 def test_without_labels_the_teacher_is_the_reference(taught):
     """Then the output says `teacher`, and has no second row of its own figures, which would be 1."""
     trainer = semantic_trainer(taught)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from drgs.display.pictures import to_bytes, write_png
+from drgs.display.progress import Bar
 from drgs.features.pictures import FeatureColors, label_picture, overlay, with_legend
 from drgs.features.segmentation import SCORE_DEFINITIONS, classify, scores
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.fitting.semantic_record import SemanticRecord
 
-__all__ = ["Segmentation", "feature_colors", "segmentation_of", "teacher_labels"]
+__all__ = ["Segmentation", "check_references", "feature_colors", "segmentation_of", "teacher_labels"]
 
 _KEPT = 0.5  # of a mask, from which on a pixel counts
 _SAMPLES = 20_000  # Gaussians that the colors of features are made from
@@ -140,6 +141,20 @@ def segmentation_of(
     if any(frame.teacher is not None for frame in frames):
         return Segmentation(gaussians, decoder, classes, "teacher", record.teacher)
     return "no view has labels or a map of the teacher"
+
+
+def check_references(frames: list[Frame]) -> None:
+    """Read labels and maps that labels are measured against: what is wrong with them is not found after the last step.
+
+    Raises:
+        FileNotFoundError, ValueError: As `drgs.data.views.View.labels` and `teacher`.
+    """
+    with Bar("labels and maps of held-out views", len(frames)) as bar:
+        for frame in frames:
+            for read in (frame.labels, frame.teacher):
+                if read is not None:
+                    read()
+            bar.advance()
 
 
 def teacher_labels(values: torch.Tensor, classes: Classes, width: int, height: int) -> np.ndarray:
