@@ -31,6 +31,7 @@ from drgs.fitting.segments import segmentation_of
 from drgs.fitting.semantic_record import SemanticRecord
 from drgs.fitting.threads import one_thread
 from drgs.fitting.trainer import Trainer
+from drgs.tracing.weights import Weights
 from drgs.train import fit
 
 WIDTH, CHANNELS, CLASSES, MAP = 4, 6, 3, 16
@@ -123,9 +124,18 @@ def test_features_tell_the_teachers_classes(taught, size):
 
 
 @pytest.mark.parametrize("size", ["image", "teacher"])
-def test_features_leave_the_geometry_alone(taught, size):
-    """Uncoupled, the gradients of everything but features are those of a fit of colors, to the bit; coupled, not."""
-    grads = []
+def test_features_leave_the_geometry_alone(taught, size, monkeypatch):
+    """Uncoupled, the gradients of everything but features are those of a fit of colors, to the bit; coupled, not.
+
+    What the features say about the weights of compositing is computed where it is coupled only.
+    """
+    grads, computed, scalars = [], [], Weights.scalars
+
+    def noted(weights, *arguments):
+        computed.append(len(grads))
+        return scalars(weights, *arguments)
+
+    monkeypatch.setattr(Weights, "scalars", noted)
     for fields in ({}, {"couple_features": True}):
         trainer = semantic_trainer(taught, feature_resolution=size, **fields)
         # Features of 0 have no gradient with respect to where they are.
@@ -133,6 +143,7 @@ def test_features_leave_the_geometry_alone(taught, size):
         with one_thread():
             trainer.step()
         grads.append({name: trainer.rows.tensors[name].grad for name in GEOMETRY})
+    assert set(computed) == {1}, "by the second trainer"
     plain = semantic_trainer(taught)
     plain.parts = parts_of(plain.config, 3.0)
     plain.rows = GaussianRows({k: x for k, x in plain.rows.tensors.items() if k != "features"})

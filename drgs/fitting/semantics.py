@@ -91,7 +91,8 @@ class FeatureDistance:
             return small[0].permute(1, 2, 0)
         # Constants but for the features: what an uncoupled derivative needs not compute.
         seen = gaussians if self.couple else gaussians.detach().replace(features=gaussians.features)
-        shown = render(seen, frame.camera.resized(width, height), self.settings, outputs=()).features
+        camera = frame.camera.resized(width, height)
+        shown = render(seen, camera, self.settings, outputs=(), couple_features=self.couple).features
         assert shown is not None
         return shown
 
