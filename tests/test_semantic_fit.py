@@ -348,6 +348,15 @@ def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkey
     assert load_run(done.run).decoder is not None
 
 
+def test_maps_of_held_out_views_alone_teach_nothing(taught):
+    """Where no view that is fitted has a map, no features are fitted: none would ever move."""
+    held_out = {view.name for view in taught.split(3)[1]}
+    views = [view if view.name in held_out else dataclasses.replace(view, teacher_path=None) for view in taught.views]
+    data = dataclasses.replace(taught, views=views)
+    assert SemanticRecord.of(data, config(test_every=3), data.split(3)[0]) is None
+    assert SemanticRecord.of(taught, config(test_every=3), data.split(3)[0]).channels == CHANNELS
+
+
 def test_without_embeddings_no_label_is_read(tmp_path):
     """Classes that no file names would be the numbers of all label images, those of views that were not picked too."""
     known = Semantics(labels="labels", label_images=(tmp_path / "not_picked.png",))

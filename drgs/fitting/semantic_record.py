@@ -69,14 +69,18 @@ class SemanticRecord:
         Args:
             dataset: As loaded.
             config: Of the fit.
-            views: Those that may be read at the start: no other's map is looked at, as long as one of them has a map.
+            views: Those that may be read at the start: no other's map is looked at, as long as one of them has a map,
+                and never that of a held-out view.
         """
         known = dataset.semantics if config.semantics == "auto" else None
         if known is None or not known.maps:
             return None
+        train, _ = dataset.split(config.test_every, config.test_offset)
+        path = next((view.teacher_path for view in (*views, *train) if view.teacher_path is not None), None)
+        if path is None:  # maps of held-out views alone teach nothing
+            return None
         from drgs.features.teacher import read_map
 
-        path = next((view.teacher_path for view in views if view.teacher_path is not None), known.maps[0])
         channels, height, width = read_map(path).shape
         # Without either file, classes would be the numbers that are found in all label images, of any view.
         classes = known.classes if known.class_file or known.embedding_file else None
