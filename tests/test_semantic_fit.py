@@ -20,6 +20,7 @@ from drgs.display.pictures import write_png
 from drgs.features.pictures import label_colors
 from drgs.features.segmentation import Classes, classify
 from drgs.files import Run
+from drgs.fitting import semantics
 from drgs.fitting import trainer as trainer_module
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig
@@ -89,6 +90,21 @@ def semantic_trainer(data, **fields):
 
 def decoder_of(trainer):
     return trainer.parts.networks[0].module
+
+
+def test_the_distance_goes_a_few_cells_at_a_time(monkeypatch, rng):
+    """Loss and gradients are those of one large product, with fewer cells left over at the end; float32 sums."""
+    monkeypatch.setattr(semantics, "_CHUNK", 5 * CHANNELS)
+    f, W, b = (
+        torch.tensor(rng.normal(size=x), dtype=torch.float32) for x in ((13, WIDTH), (CHANNELS, WIDTH), CHANNELS)
+    )
+    cells = torch.tensor(rng.normal(size=(CHANNELS, 13)), dtype=torch.float16)
+    leaves = [x.requires_grad_() for x in (f, W, b)]
+    whole = 3 * (f @ W.T + b - cells.T.float()).abs().mean()
+    parts = 3 * semantics._Distance.apply(*leaves, cells)
+    torch.testing.assert_close(parts, whole, rtol=1e-6, atol=0)
+    for found, want in zip(torch.autograd.grad(parts, leaves), torch.autograd.grad(whole, leaves), strict=True):
+        torch.testing.assert_close(found, want, rtol=1e-5, atol=1e-7)
 
 
 def test_all_learn_from_features_of_zero(taught):

@@ -14,7 +14,7 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["FeatureDistance", "with_features"]
 
 _INSIDE = 0.5  # share of a cell of the teacher's map that the mask must keep
+_CHUNK = 1 << 22  # decoded numbers at a time: 16 MB, where a map of 512x360x480 has 354 MB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,14 +74,14 @@ class FeatureDistance:
                 f"{channels}; make it again"
             )
         shown = self._shown(output, frame, gaussians, width, height).reshape(height * width, -1)
-        cells = target.reshape(channels, height * width).T
+        cells = target.reshape(channels, height * width)
         if frame.mask is not None:
             kept = torch.nn.functional.interpolate(frame.mask[None, None], (height, width), mode="area").flatten()
             kept = kept > _INSIDE
             if not bool(kept.any()):
                 return None
-            shown, cells = shown[kept], cells[kept]
-        return self.weight * (self.decoder(shown) - cells).abs().mean()
+            shown, cells = shown[kept], cells[:, kept]
+        return self.weight * _Distance.apply(shown, self.decoder.matrix, self.decoder.bias, cells)
 
     def _shown(self, output: Output, frame: Frame, gaussians: Gaussians, width: int, height: int) -> torch.Tensor:
         """(h, w, D) features at the size of the teacher's map."""
@@ -95,6 +96,39 @@ class FeatureDistance:
         shown = render(seen, camera, self.settings, outputs=(), couple_features=self.couple).features
         assert shown is not None
         return shown
+
+
+class _Distance(torch.autograd.Function):
+    """Mean |W f + b - t|, with its gradients, some cells at a time: nothing as large as a map is held.
+
+    Args:
+        features: (n, D).
+        matrix, bias: W (C, D) and b (C,).
+        cells: (C, n) t, of any floating type; gets no gradient.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, features: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor, cells: torch.Tensor
+    ) -> torch.Tensor:
+        """The loss is a number, so that its gradients are known with it, up to a factor."""
+        total, step = 0.0, max(1, _CHUNK // len(matrix))
+        slopes = torch.empty_like(features), torch.zeros_like(matrix), torch.zeros_like(bias)
+        for k in range(0, len(features), step):
+            f = features[k : k + step]
+            error = torch.addmm(bias, f, matrix.T).sub_(cells[:, k : k + step].T)
+            total += float(error.abs().sum())
+            sign = error.sign_()
+            torch.mm(sign, matrix, out=slopes[0][k : k + step])
+            slopes[1].addmm_(sign.T, f)
+            slopes[2].add_(sign.sum(0))
+        ctx.save_for_backward(*(x.div_(cells.numel()) for x in slopes))
+        return features.new_tensor(total / cells.numel())
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Of everything but the map."""
+        return (*(grad * x for x in ctx.saved_tensors), None)
 
 
 def with_features(parts: Parts, config: FitConfig, channels: int) -> Parts:
