@@ -309,3 +309,11 @@ def test_teach_refuses_bad_options(capture, model, capsys):
     assert teach(capture / "alone", capture / "nowhere") == 2  # before a model is looked for
     assert "must hold camera poses, found" in capsys.readouterr().err
     assert options.Teach.scales == ",".join(f"{scale:g}" for scale in SCALES)
+
+
+def test_numbers_of_labels_are_not_named_by_a_teacher(capture, model, capsys):
+    """Label images without a file of classes: --classes would call their numbers what they may not be."""
+    (capture / "labels").mkdir()
+    assert teach(capture, model, "--classes", "chair,table") == 2
+    assert "found no classes.json; name them there" in capsys.readouterr().err
+    assert not (capture / "classes.json").exists()

@@ -21,7 +21,7 @@ import torch
 from drgs import data
 from drgs.commands.overrides import parsed_size
 from drgs.data.class_names import CLASS_FILES, read_class_names
-from drgs.data.semantics import TEACHER_FOLDERS
+from drgs.data.semantics import LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
 from drgs.features.encoders import TEMPLATES, ClipEncoder
 from drgs.files import SCHEMA, atomic_write, write_json
@@ -125,6 +125,12 @@ def _names(args: Teach, output: Claim) -> list[str]:
         names = list(read_class_names(path)[0].values())
     else:
         names = [name.strip() for name in args.classes.split(",") if name.strip()]
+    labels = next((output.path / name for name in LABEL_FOLDERS if (output.path / name).is_dir()), None)
+    if held is None and labels is not None and not (output.path / _CLASSES).exists():
+        raise ValueError(
+            f"{labels}: the numbers in label images must have names before a teacher's classes get numbers, found no "
+            f"{_CLASSES}; name them there, or in classes.txt, and leave out --classes"
+        )
     if not names:
         raise ValueError(f"--classes must name a class or more, got {args.classes!r}; say e.g. chair,table,lamp")
     if held is not None and names != known:
