@@ -140,6 +140,8 @@ class Weights:
     def totals(self, buffer: Float, scalars: Float) -> Float:
         """(T 64) Float64: sum over the entries of w s, as precise as the adjoint takes it apart again."""
         lib = self.lib
+        if not len(self._touched):  # as where all rays are walked again: Dr.Jit gathers nothing from an empty array
+            return dr.zeros(lib.Float64, len(self.lengths) * PIXELS)
         rows, starts, ends = (_unsigned(lib, x) for x in (self._touched, *self._bounds()))
         lane = dr.arange(lib.UInt32, len(self.lengths) * PIXELS)
         start, end = (dr.gather(lib.UInt32, x, lane // PIXELS) for x in (starts, ends))
