@@ -229,13 +229,16 @@ def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     assert report["full"]["forward"]["size"] == report["full"]["forward"]["drawn"] == [80, 64]
 
     g, variants = load_ply(place / "scene.ply"), tuple(v for v in TRADEOFF_VARIANTS if v.name in ("exact", "fast"))
-    measured = measure(g, [camera.resized(20, 16) for camera in large], variants, repeats=1)
 
     def timed(seconds):
         monkeypatch.setattr("drgs.lab.tradeoff_full.clocked", lambda work: (None, seconds))  # whatever is done
         return measure_full(measured, g, large, BUDGETS, 1, 60.0, 0, lambda text: None)["forward"]
 
-    smaller = timed(8.0)
+    for _ in range(10):  # beside other work times may scatter so much that nothing leads
+        measured = measure(g, [camera.resized(20, 16) for camera in large], variants, repeats=1)
+        smaller = timed(8.0)
+        if smaller.names:
+            break
     assert [20, 16] < smaller.size < smaller.drawn == [80, 64]
     assert 1 <= smaller.rounds < 3
     assert tradeoff._size(smaller).endswith("(of 80x64: --seconds)")
