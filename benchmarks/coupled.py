@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import json
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -24,9 +22,10 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from chain import kendall  # noqa: E402
+from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs import fisher, runtime  # noqa: E402
+from drgs import fisher  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.data import load  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
@@ -178,12 +177,8 @@ def main():
     sizes = {"fast": (40, 30) if args.quick else (320, 240), "exact": (40, 30) if args.quick else (160, 120)}
     count, width = (4, 40) if args.quick else (14, 80)
     few = [cameras[k].resized(width, width * 3 // 4) for k in np.linspace(0, len(cameras) - 1, count).astype(int)]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     result = {
-        "machine": f"{runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
-        f"{runtime.backend().variant}",
-        "date": datetime.date.today().isoformat(),
-        "commit": commit.stdout.strip(),
+        **ran(),
         "run": args.run.name,
         "gaussians": len(g),
         "width": metric.width,

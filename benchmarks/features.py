@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import datetime
 import functools
 import json
 import statistics
@@ -26,9 +25,9 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs import runtime  # noqa: E402
 from drgs.lab.study_report import fill_between  # noqa: E402
 from drgs.tracing import weights  # noqa: E402
 from drgs.tracing.tiles import TileTraversal  # noqa: E402
@@ -193,14 +192,8 @@ def main():
     rows += [
         against_colors(count, "exact", width, both, min(turns, 3), clock) for width in ((3,) if args.quick else (128,))
     ]
-    info = runtime.info()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
-    ).stdout.strip()
     result = {
-        "machine": f"{info.get('cpu', 'CPU')}, {runtime.backend().threads} threads, {runtime.backend().variant}",
-        "date": datetime.date.today().isoformat(),
-        "commit": commit,
+        **ran(),
         "gaussians": count,
         "turns": turns,
         "clock": args.clock,

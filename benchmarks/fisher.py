@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import json
 import resource
 import subprocess
@@ -25,9 +24,10 @@ import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from render import backward, forward, interleaved  # noqa: E402
+from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs import fisher, runtime  # noqa: E402
+from drgs import fisher  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
 from drgs.select import select  # noqa: E402
 
@@ -212,12 +212,8 @@ def main():
         print(score(args.run, args.task))
         return
     turns = 2 if args.quick else 5
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     result = {
-        "machine": f"{runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
-        f"{runtime.backend().variant}",
-        "date": datetime.date.today().isoformat(),
-        "commit": commit.stdout.strip(),
+        **ran(),
         "headline": headline(turns),
         "tangents": tangents(turns),
     }

@@ -8,9 +8,7 @@ The same rows as `drgs stress`.
 from __future__ import annotations
 
 import argparse
-import datetime
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,7 +16,8 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
-from drgs import runtime  # noqa: E402
+from where import ran  # noqa: E402
+
 from drgs.commands.stress import markdown  # noqa: E402
 from drgs.lab.extremes import CASES  # noqa: E402
 from drgs.lab.refusals import REFUSALS  # noqa: E402
@@ -36,11 +35,8 @@ def main() -> int:
         for row in rows(case):
             found.append(row)
             print(markdown([row])[-1], flush=True)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    made = (
-        f"`python benchmarks/numerics.py`, {runtime.info().get('cpu', 'CPU')}, {runtime.backend().variant}, "
-        f"{datetime.date.today().isoformat()}, commit {commit.stdout.strip()}."
-    )
+    at = ran()
+    made = f"`python benchmarks/numerics.py`, {at['machine']}, {at['date']}, commit {at['commit']}."
     if not args.print:
         page = ROOT / "docs" / "numerics.md"
         text = page.read_text()

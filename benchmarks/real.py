@@ -9,7 +9,6 @@ pictures beside it. `wolf` is rendered, not fitted; the `model-*` runs compare t
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import os
 import subprocess
@@ -22,9 +21,9 @@ sys.path.insert(0, str(ROOT))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs import runtime  # noqa: E402
 from drgs.data import load  # noqa: E402
 from drgs.metrics import psnr  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
@@ -164,12 +163,8 @@ def main():
     results = {name: run(name, args.data, args.runs) for name in names}
     small = [n.removeprefix("model-") for n in names if n.startswith("model-")]
     crossed = cross(args.runs, args.data, small)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    machine = (
-        f"{runtime.info().get('cpu', 'a CPU')}, {runtime.backend().threads} cores, "
-        f"{datetime.date.today().isoformat()}, commit {commit.stdout.strip()}"
-    )
-    page = report(results, crossed, machine)
+    at = ran()
+    page = report(results, crossed, f"{at['machine']}, {at['date']}, commit {at['commit']}")
     pictures = ROOT / "docs" / "pictures"
     pictures.mkdir(exist_ok=True)
     lines = ["", "", "Held-out views, photograph left, rendering right:", ""]

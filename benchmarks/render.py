@@ -9,7 +9,6 @@ one process, every figure is the median of at least five turns after a warm-up, 
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import os
 import resource
@@ -26,6 +25,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
@@ -360,15 +360,7 @@ def main():
     if args.task:
         print(json.dumps({"memory": task_memory, "first": task_first}[args.task]()))
         return
-    info = runtime.info()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
-    ).stdout.strip()
-    result = {
-        "machine": f"{info.get('cpu', 'CPU')}, {runtime.backend().threads} threads, {runtime.backend().variant}",
-        "date": datetime.date.today().isoformat(),
-        "commit": commit,
-    }
+    result = ran()
     with tempfile.TemporaryDirectory() as cache:
         result["first"], result["second"] = child("first", cache), child("first", cache)
     result["memory"] = child("memory")

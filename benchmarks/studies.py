@@ -9,17 +9,16 @@ Studies of fits are cells of `drgs.lab.study`, their statistics are in `drgs.lab
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from drgs import runtime  # noqa: E402
+from where import ran  # noqa: E402
+
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
 from drgs.fitting.active import initial_views  # noqa: E402
@@ -116,11 +115,8 @@ def rank_correlation(a, b, kind: str = "spearman") -> float:
 
 def stamp(script: str) -> str:
     """Where and when a study ran."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    return (
-        f"`python benchmarks/{script}.py`, {runtime.info().get('cpu', 'CPU')}, {runtime.backend().threads} threads, "
-        f"{runtime.backend().variant}, {datetime.date.today().isoformat()}, commit {commit.stdout.strip()}."
-    )
+    at = ran()
+    return f"`python benchmarks/{script}.py`, {at['machine']}, {at['date']}, commit {at['commit']}."
 
 
 def write_rows(path: Path, rows) -> None:
