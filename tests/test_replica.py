@@ -106,7 +106,7 @@ def test_rounded_poses_are_repaired(tmp_path):
         (" ".join(["nan"] * 12 + ["0 0 0 1"]), "pose must be finite"),
         ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "pose 0"),
         ("1 0 0 0 0 1 0 0 0 0 1 0 5 6 7 1", "must end in 0 0 0 1, got 5 6 7 1"),
-        ("\udcff\udcfe", "got other words"),
+        ("\udcff\udcfe", "in UTF-8, got other bytes"),
     ],
 )
 def test_poses_that_are_wrong(text, words, tmp_path):

@@ -20,7 +20,16 @@ from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["IMAGE_SUFFIXES", "image_size", "inverse_pose", "list_images", "read_image", "read_npy", "repaired_pose"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "image_size",
+    "inverse_pose",
+    "list_images",
+    "read_image",
+    "read_npy",
+    "read_text",
+    "repaired_pose",
+]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
@@ -38,6 +47,28 @@ _log = logging.getLogger(__name__)
 def list_images(folder: Path) -> list[Path]:
     """Image files directly in a folder, by name; hidden files are left out."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+
+
+def read_text(path: Path, what: str, largest: int) -> str:
+    """The content of a text file in UTF-8.
+
+    Args:
+        what: It must be, for messages, e.g. "a list of poses".
+        largest: Bytes that it may have.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: larger, of another format, or bytes that are no text.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be {what}, found none; check the path")
+    refuse_foreign(path, what)
+    if path.stat().st_size > largest:
+        raise ValueError(f"{path}: must be {what} of at most {largest >> 20} MiB, is larger; name another")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: must be {what} in UTF-8, got other bytes; write it again") from None
 
 
 def read_npy(path: Path) -> np.ndarray:

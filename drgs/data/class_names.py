@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drgs.guards.foreign import refuse_foreign
+from drgs.data.checks import read_text
 from drgs.guards.json_files import check_json, read_json
 
 __all__ = ["CLASS_FILES", "NO_CLASS", "read_class_names"]
@@ -62,15 +62,7 @@ def _json_rows(path: Path) -> list[tuple[str, int, str]]:
 
 def _text_rows(path: Path) -> list[tuple[str, int, str]]:
     """(where, number, name) of each line of a text file; empty lines and those that begin with # are left out."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a file of class names, found none; check the path")
-    refuse_foreign(path, "a file of class names")
-    if path.stat().st_size > _LARGEST:
-        raise ValueError(f"{path}: must be a text file of class names, is larger than 1 MiB; name another")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: must be a text file in UTF-8, got other bytes; write it again") from None
+    lines = read_text(path, "a file of class names", _LARGEST).splitlines()
     rows = [(number, line.split()) for number, line in enumerate(lines, 1)]
     rows = [(number, words) for number, words in rows if words and not words[0].startswith("#")]
     numbered = [words[0].isascii() and words[0].isdigit() and len(words) > 1 for _, words in rows]

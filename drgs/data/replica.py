@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, repaired_pose
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, read_text, repaired_pose
 from drgs.data.views import Dataset, View
-from drgs.guards.foreign import refuse_foreign
 
 __all__ = ["POSES", "load_replica"]
 
@@ -94,15 +93,10 @@ def load_replica(
 
 def _poses(file: Path) -> np.ndarray:
     """(N, 4, 4) camera-to-world."""
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: must hold the poses, found none; check the path")
-    refuse_foreign(file, "a list of poses")
-    if file.stat().st_size > _LARGEST:
-        raise ValueError(f"{file}: must be a list of poses of at most {_LARGEST >> 20} MiB, is larger; name another")
+    words = read_text(file, "a list of poses", _LARGEST).split()
     try:
-        words = file.read_text(encoding="utf-8").split()
         numbers = np.array(words, dtype=np.float64)
-    except ValueError:  # UnicodeDecodeError is one
+    except ValueError:
         raise ValueError(f"{file}: must hold numbers, 16 a pose, got other words; copy it again") from None
     if not len(numbers) or len(numbers) % 16:
         raise ValueError(f"{file}: must hold 16 numbers a pose, got {len(numbers)}; it is cut short, copy it again")
