@@ -28,6 +28,7 @@ from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
+from drgs.fitting.records import config_record
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
@@ -122,17 +123,7 @@ def _fit(
         raise ValueError(  # else the first pick would be where it is found out
             "active: blocks must be of what is fitted, got semantic for a fit without a teacher's maps; use geometry"
         )
-    tensors, header = last_checkpoint(run) if resume else (None, None)
-    if tensors is not None and header is not None:
-        was, now = ("active" if x else "all" for x in (header.get("active"), plan))
-        if was != now:
-            raise ValueError(
-                f"{run.path}: --resume must continue the same fit, --views was {was!r} and is {now!r}; "
-                "repeat the options or choose another run folder"
-            )
-        if plan:
-            plan.restore(tensors, header, str(run.path))
-        check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
+    tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
     frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
     held_out = load_frames(test, config.max_pixels, config.mask)
     if taught and taught.embeddings:
@@ -147,26 +138,7 @@ def _fit(
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
         trainer, source = _start(dataset, views, frames, config, parts, taught, plan is not None, room)
         seconds = 0.0
-    recorded = {
-        "command": "fit",
-        "data": str(Path(dataset.path).resolve()),
-        "format": dataset.format,
-        "split_rule": dataset.split_rule(config.test_every, config.test_offset),
-        "train": [frame.name for frame in frames],
-        "test": [frame.name for frame in held_out],
-        "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
-        "masks": sorted({_mask_kind(frame) for frame in frames}),
-        "points": source,
-        **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
-        **({"semantics": taught.to_json()} if taught else {}),
-        "fit": config.to_json(),
-    }
-    if plan:
-        recorded |= {
-            "active": plan.active.to_json(),
-            "pool": [view.name for view in train],
-            "pool_leak": plan.pool_leak,
-        }
+    recorded = config_record(dataset, config, plan, taught, frames, held_out, source)
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -199,6 +171,25 @@ def _fit(
     )
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"])
     return FitResult(g, written, run, loop.seconds)
+
+
+def _checkpoint(
+    run: Run, plan: ActiveViews | None, taught: SemanticRecord | None
+) -> tuple[dict[str, torch.Tensor], dict] | tuple[None, None]:
+    """The last checkpoint of the same fit, if there is one; the plan goes on from the views that it has."""
+    tensors, header = last_checkpoint(run)
+    if tensors is None or header is None:
+        return None, None
+    was, now = ("active" if x else "all" for x in (header.get("active"), plan))
+    if was != now:
+        raise ValueError(
+            f"{run.path}: --resume must continue the same fit, --views was {was!r} and is {now!r}; "
+            "repeat the options or choose another run folder"
+        )
+    if plan:
+        plan.restore(tensors, header, str(run.path))
+    check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
+    return tensors, header
 
 
 def _start(
@@ -390,9 +381,3 @@ class _Loop:
         shown = "" if psnr is None else f", held-out PSNR {psnr:.2f} dB"
         total = trainer.config.max_steps
         bar.note(f"step {done} of {total}: {len(trainer.rows)} Gaussians{shown}, {self.seconds:.0f} s")
-
-
-def _mask_kind(frame: Frame) -> str:
-    if frame.mask is None:
-        return "none"
-    return "object" if frame.is_object else "valid"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -21,15 +21,19 @@ from drgs.fitting.semantic_record import SemanticRecord
 from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
+    from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.files import Run
+    from drgs.fitting.active import ActiveViews
+    from drgs.fitting.frames import Frame
 
 __all__ = [
     "FitRecord",
     "LoadedRun",
     "check_checkpoint",
+    "config_record",
     "fit_record",
     "fitted_views",
     "is_fit_config",
@@ -173,6 +177,39 @@ def is_fit_config(path: Path) -> bool:
     return isinstance(value, dict) and value.get("command") == "fit" and isinstance(value.get("schema"), int)
 
 
+def config_record(
+    dataset: Dataset,
+    config: FitConfig,
+    plan: ActiveViews | None,
+    taught: SemanticRecord | None,
+    frames: list[Frame],
+    held_out: list[Frame],
+    source: str,
+) -> dict:
+    """What config.json is to say of a fit, for `drgs.files.Run.start`; `fit_record` reads it."""
+    recorded: dict[str, Any] = {
+        "command": "fit",
+        "data": str(Path(dataset.path).resolve()),
+        "format": dataset.format,
+        "split_rule": dataset.split_rule(config.test_every, config.test_offset),
+        "train": [frame.name for frame in frames],
+        "test": [frame.name for frame in held_out],
+        "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
+        "masks": sorted({_mask_kind(frame) for frame in frames}),
+        "points": source,
+        **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
+        **({"semantics": taught.to_json()} if taught else {}),
+        "fit": config.to_json(),
+    }
+    if plan:
+        recorded |= {
+            "active": plan.active.to_json(),
+            "pool": [view.name for view in plan.views],
+            "pool_leak": plan.pool_leak,
+        }
+    return recorded
+
+
 def fit_record(run: Run) -> FitRecord:
     """The record of a run.
 
@@ -271,3 +308,9 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     generators = ("rng",) if header.get("active") is None else ("rng", "policy_rng")
     expected |= {name: (state.dtype, tuple(state.shape)) for name in generators}
     return expected | {"queue": (torch.int64, (length("queue", 0),))}
+
+
+def _mask_kind(frame: Frame) -> str:
+    if frame.mask is None:
+        return "none"
+    return "object" if frame.is_object else "valid"
