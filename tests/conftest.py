@@ -1,4 +1,4 @@
-"""What every test gets: fixed seeds, two threads, a clean slate afterwards, and skips that say why.
+"""What every test gets: fixed seeds, one thread, a clean slate afterwards, and skips that say why.
 
 The suite runs on the backend that DRGS_VARIANT names (default LLVM, so that a machine with a card
 tests the CPU unless asked otherwise). Nothing heavy is imported until a test does so itself.
@@ -18,9 +18,9 @@ import pytest
 from drgs.libllvm import prepare
 
 prepare()  # tests may import drjit before drgs
-# Before torch or Dr.Jit is imported, and inherited by the processes that tests start.
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"):
-    os.environ.setdefault(_name, "2")
+# Before torch or Dr.Jit is imported, and inherited by the processes that tests start. One thread: sums of several
+# differ in their last digits, which some tests compare; the suite's processes share the cores already.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"), "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # OpenMP threads that spin take cores from Dr.Jit's
 os.environ.setdefault("DRGS_VARIANT", "llvm_ad_rgb")
 
@@ -86,6 +86,20 @@ def _flags() -> dict:
     dr = sys.modules["drjit"]
     names = ("Debug", "FastMath", "KernelHistory", "OptimizeLoops", "SymbolicLoops")
     return {getattr(dr.JitFlag, name): dr.flag(getattr(dr.JitFlag, name)) for name in names}
+
+
+@pytest.fixture
+def two_threads():
+    """Dr.Jit and torch have two threads each during the test."""
+    import drjit as dr
+    import torch
+
+    before = dr.thread_count(), torch.get_num_threads()
+    dr.set_thread_count(2)
+    torch.set_num_threads(2)
+    yield
+    dr.set_thread_count(before[0])
+    torch.set_num_threads(before[1])
 
 
 @pytest.fixture

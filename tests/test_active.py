@@ -426,36 +426,31 @@ def without_times(path: Path) -> dict:
 
 @pytest.mark.parametrize("policy", ["fisher", "random"])
 @pytest.mark.parametrize("moment", ["between picks", "between choosing and saving"])
-def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, moment):
+def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, moment, two_threads):
     """With `deterministic`, a run killed after or during its second pick ends in the same bits."""
-    import drjit as dr
+    active, cfg = plan(policy=policy, add=3), config(deterministic=True)
+    fit(lazily(still), tmp_path / "a", cfg, active=active, progress=False)
+    step, state = Trainer.step, Trainer.state
 
-    threads, active, cfg = dr.thread_count(), plan(policy=policy, add=3), config(deterministic=True)
-    try:
-        fit(lazily(still), tmp_path / "a", cfg, active=active, progress=False)
-        step, state = Trainer.step, Trainer.state
+    def killed_step(self):
+        if self.step_index == 10 and moment == "between picks":
+            raise Killed
+        return step(self)
 
-        def killed_step(self):
-            if self.step_index == 10 and moment == "between picks":
-                raise Killed
-            return step(self)
+    def killed_state(self):
+        if len(self.frames) == 4 and moment != "between picks":  # two at the start, and two picks
+            raise Killed
+        return state(self)
 
-        def killed_state(self):
-            if len(self.frames) == 4 and moment != "between picks":  # two at the start, and two picks
-                raise Killed
-            return state(self)
-
-        monkeypatch.setattr(Trainer, "step", killed_step)
-        monkeypatch.setattr(Trainer, "state", killed_state)
-        with pytest.raises(Killed):
-            fit(lazily(still), tmp_path / "b", cfg, active=active, progress=False)
-        monkeypatch.undo()
-        header = load_state(tmp_path / "b/state.safetensors")[1]
-        assert (header["step"], len(header["active"]["picks"])) == (8, 2 if moment == "between picks" else 1)
-        assert len(without_times(tmp_path / "b/selection.json")["picks"]) == 2
-        fit(lazily(still), tmp_path / "b", cfg, active=active, resume=True, progress=False)
-    finally:
-        dr.set_thread_count(threads)
+    monkeypatch.setattr(Trainer, "step", killed_step)
+    monkeypatch.setattr(Trainer, "state", killed_state)
+    with pytest.raises(Killed):
+        fit(lazily(still), tmp_path / "b", cfg, active=active, progress=False)
+    monkeypatch.undo()
+    header = load_state(tmp_path / "b/state.safetensors")[1]
+    assert (header["step"], len(header["active"]["picks"])) == (8, 2 if moment == "between picks" else 1)
+    assert len(without_times(tmp_path / "b/selection.json")["picks"]) == 2
+    fit(lazily(still), tmp_path / "b", cfg, active=active, resume=True, progress=False)
     assert without_times(tmp_path / "a/selection.json") == without_times(tmp_path / "b/selection.json")
     assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
     assert not list((tmp_path / "b").rglob("*.tmp"))

@@ -83,24 +83,11 @@ def trainer_of(dataset, state=None) -> Trainer:  # noqa: F811
     return Trainer(cfg, frames, GaussianRows({**rows.tensors, "features": torch.zeros(len(rows), 3)}), 3.0, parts)
 
 
-@pytest.fixture
-def one_thread():
-    """Sums of several threads come in any order."""
-    import drjit as dr
-
-    threads = dr.thread_count(), torch.get_num_threads()
-    dr.set_thread_count(1)
-    torch.set_num_threads(1)
-    yield
-    dr.set_thread_count(threads[0])
-    torch.set_num_threads(threads[1])
-
-
 def steps(trainer: Trainer, count: int) -> list[StepResult]:
     return [trainer.step() for _ in range(count)]
 
 
-def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path, one_thread):  # noqa: F811
+def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path):  # noqa: F811
     """A term, features and a network take part in every step, and a checkpoint in the middle changes no bit."""
     whole, first = trainer_of(dataset), trainer_of(dataset)
     rows = steps(whole, 20)

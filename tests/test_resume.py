@@ -56,11 +56,15 @@ def test_two_fits_in_one_folder(dataset, run, capsys):  # noqa: F811
     assert not (run.path / locks.NAME).exists()
 
 
-def test_terminated_fit_saves_and_goes_on_with_the_same_bits(dataset, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_terminated_fit_saves_and_goes_on_with_the_same_bits(
+    dataset,  # noqa: F811
+    tmp_path,
+    monkeypatch,
+    capsys,
+    two_threads,
+):
     """SIGTERM during step 4 of 8: exit code 143, one line, a checkpoint, and the same end as without."""
-    import drjit as dr
-
-    threads, step = dr.thread_count(), Trainer.step
+    step = Trainer.step
     options = "--max-steps 8 --deterministic --sh-degree 1 --max-gaussians 80 --quiet"
     monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
 
@@ -69,17 +73,14 @@ def test_terminated_fit_saves_and_goes_on_with_the_same_bits(dataset, tmp_path, 
             signal.raise_signal(signal.SIGTERM)
         return step(self)
 
-    try:
-        assert cli.main(f"fit data -o {tmp_path / 'a'} {options}".split()) == 0
-        monkeypatch.setattr(Trainer, "step", terminated)
-        capsys.readouterr()
-        assert cli.main(f"fit data -o {tmp_path / 'b'} {options}".split()) == 143
-        assert capsys.readouterr().err == "drgs fit: terminated: saved at step 5, --resume goes on\n"
-        monkeypatch.setattr(Trainer, "step", step)
-        assert load_state(tmp_path / "b" / "state.safetensors")[1]["step"] == 5
-        assert cli.main(f"fit data -o {tmp_path / 'b'} {options} --resume".split()) == 0
-    finally:
-        dr.set_thread_count(threads)
+    assert cli.main(f"fit data -o {tmp_path / 'a'} {options}".split()) == 0
+    monkeypatch.setattr(Trainer, "step", terminated)
+    capsys.readouterr()
+    assert cli.main(f"fit data -o {tmp_path / 'b'} {options}".split()) == 143
+    assert capsys.readouterr().err == "drgs fit: terminated: saved at step 5, --resume goes on\n"
+    monkeypatch.setattr(Trainer, "step", step)
+    assert load_state(tmp_path / "b" / "state.safetensors")[1]["step"] == 5
+    assert cli.main(f"fit data -o {tmp_path / 'b'} {options} --resume".split()) == 0
     assert (tmp_path / "a" / "point_cloud.ply").read_bytes() == (tmp_path / "b" / "point_cloud.ply").read_bytes()
     assert not [p for p in (tmp_path / "b").rglob(".drgs*") if p.name != ".drgs.jsonl"]
 

@@ -159,7 +159,7 @@ def test_diagonal_picks_against_mutual_information(world):
 
 
 @pytest.mark.parametrize("policy", ["fisher", "fisherrf", "coverage", "farthest"])
-def test_batch_is_single_picks(world, policy, one_thread):
+def test_batch_is_single_picks(world, policy):
     """k at once are k calls that move each pick to the training views: same picks, scores and margins."""
     g, train, candidates, _ = world
     batch = select(g, candidates, train, 4, policy)
@@ -176,7 +176,7 @@ def test_batch_is_single_picks(world, policy, one_thread):
 
 
 @pytest.mark.parametrize("prior", [Prior(0.0), Prior(1e-2, relative=True)])
-def test_batch_with_a_prior_that_moves(world, prior, one_thread):
+def test_batch_with_a_prior_that_moves(world, prior):
     """lambda = 0 and relative lambda follow H from pick to pick, as single calls do; nothing is scored lazily then."""
     g, train, candidates, _ = world
     batch = select(g, candidates, train[:1], 4, prior=prior)
@@ -356,18 +356,7 @@ def test_cache():
     assert cache.misses == counter.calls - 6
 
 
-@pytest.fixture
-def one_thread():
-    """Sums of several threads differ in their last bit from call to call, which nearly singular blocks magnify."""
-    import drjit as dr
-
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(threads)
-
-
-def test_cache_keeps_kinds_apart(world, one_thread):
+def test_cache_keeps_kinds_apart(world):
     """Policies, methods and settings that share a cache do not get each other's information."""
     g, train, candidates, _ = world
     cache = Cache()
@@ -445,7 +434,7 @@ class _Moving:
         return {**self.g.parameters(), "speed": self.speed}
 
 
-def test_scene_that_moves(world, one_thread):
+def test_scene_that_moves(world):
     """Each camera sees the Gaussians of its time, known views too; a weight that changes is another scene."""
     g, train, candidates, _ = world
     moving, cache = _Moving(g), Cache()

@@ -30,7 +30,6 @@ from drgs.fitting.records import load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.segments import segmentation_of
 from drgs.fitting.semantic_record import SemanticRecord
-from drgs.fitting.threads import one_thread
 from drgs.fitting.trainer import Trainer
 from drgs.tracing.weights import Weights
 from drgs.train import fit
@@ -156,15 +155,13 @@ def test_features_leave_the_geometry_alone(taught, size, monkeypatch):
         trainer = semantic_trainer(taught, feature_resolution=size, **fields)
         # Features of 0 have no gradient with respect to where they are.
         trainer.rows.tensors["features"].data.normal_(generator=torch.Generator().manual_seed(1))
-        with one_thread():
-            trainer.step()
+        trainer.step()
         grads.append({name: trainer.rows.tensors[name].grad for name in GEOMETRY})
     assert set(computed) == {1}, "by the second trainer"
     plain = semantic_trainer(taught)
     plain.parts = parts_of(plain.config, 3.0)
     plain.rows = GaussianRows({k: x for k, x in plain.rows.tensors.items() if k != "features"})
-    with one_thread():
-        plain.step()
+    plain.step()
     for name in GEOMETRY:
         assert torch.equal(grads[0][name], plain.rows.tensors[name].grad), name
     for name in ("means", "log_scales", "logit_opacities"):

@@ -19,7 +19,6 @@ from drgs.data.camera_lists import save_cameras_json
 from drgs.files import load_state, save_ply
 from drgs.fisher import SemanticMetric
 from drgs.fitting.config import ActiveConfig
-from drgs.fitting.threads import one_thread
 from drgs.information.moments import moments_map
 from drgs.oracle import sh_colors
 from drgs.select import POLICIES, Cache, select
@@ -31,13 +30,6 @@ COUPLED = ("means", "rotations", "log_scales", "logit_opacities")
 # Rounding of float32 hits against float64, relative to the largest entry of a group; measured: 4e-7.
 BOUND = 1e-5
 ZERO = (0.0, 0.0, 0.0)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    """Sums of two threads differ in their last digits, and some of these tests compare all digits."""
-    with one_thread():
-        yield
 
 
 def metric(D: int, draw: int = 0, **fields) -> SemanticMetric:

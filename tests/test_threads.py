@@ -8,10 +8,12 @@ import sys
 import threading
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import torch
 from scenes_random import camera, gaussians
 
+from drgs import fisher
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
 from drgs.tracing.call import Call
@@ -28,6 +30,28 @@ def everything(seed: int) -> list[torch.Tensor]:
     (out.rgb.square().sum() + out.depth.sum()).backward()
     pushed = render_jvp(g, cam, {"means": torch.ones_like(g.means), "sh": torch.ones_like(g.sh)}, SETTINGS)
     return [out.rgb.detach(), pushed.rgb, cam.w2c.grad, *(x.grad for x in g.parameters().values())]
+
+
+def test_two_workers(two_threads):
+    """With two threads of Dr.Jit images, gradients, tangents and information are those of one, to rounding."""
+    rng = np.random.default_rng(3)
+    g, cam = gaussians(rng, 40, 4), camera(rng, (80, 60))  # several packets a worker
+
+    def found() -> list[torch.Tensor]:
+        fresh = g.detach()
+        for x in fresh.parameters().values():
+            x.requires_grad_()
+        out = render(fresh, cam, SETTINGS)
+        out.rgb.square().sum().backward()
+        pushed = render_jvp(fresh, cam, {"means": torch.ones_like(fresh.means)}, SETTINGS)
+        sums = fisher.diagonal(fresh, cam, SETTINGS)
+        return [out.rgb.detach(), pushed.rgb, *sums.values(), *(x.grad for x in fresh.parameters().values())]
+
+    got = found()
+    dr.set_thread_count(1)
+    for a, b in zip(got, found(), strict=True):
+        # Sums of some thousand float32 terms, in another order.
+        assert float((a - b).abs().max()) <= 1e-5 * float(b.abs().max())
 
 
 def test_four_threads(monkeypatch):
@@ -74,6 +98,7 @@ SCENE = """
 import os, sys
 import numpy as np
 from drgs.lab.accuracy import random_camera, random_gaussians
+from drgs import fisher
 from drgs.integrator import render
 from drgs.tracing.call import Call
 from drgs.settings import RenderSettings

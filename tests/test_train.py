@@ -162,29 +162,23 @@ def test_viewers_widen_what_is_small():
     assert psnr[1] > 32
 
 
-def test_resumed_run_equals_an_uninterrupted_one(dataset, tmp_path, monkeypatch):
+def test_resumed_run_equals_an_uninterrupted_one(dataset, tmp_path, monkeypatch, two_threads):
     """With `deterministic`, interrupting at step 33 and resuming gives the same PLY, bit for bit."""
-    import drjit as dr
+    cfg = config(deterministic=True)
+    fit(dataset, tmp_path / "a", cfg, progress=False)
+    step = Trainer.step
 
-    threads = dr.thread_count()
-    try:
-        cfg = config(deterministic=True)
-        fit(dataset, tmp_path / "a", cfg, progress=False)
-        step = Trainer.step
+    def interrupt(self):
+        if self.step_index == 32:
+            signal.raise_signal(signal.SIGINT)  # Ctrl-C during step 32: done once the step is
+        return step(self)
 
-        def interrupt(self):
-            if self.step_index == 32:
-                signal.raise_signal(signal.SIGINT)  # Ctrl-C during step 32: done once the step is
-            return step(self)
-
-        monkeypatch.setattr(Trainer, "step", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            fit(dataset, tmp_path / "b", cfg, progress=False)
-        monkeypatch.setattr(Trainer, "step", step)
-        assert load_state(tmp_path / "b" / "state.safetensors")[1]["step"] == 33
-        fit(dataset, tmp_path / "b", cfg, resume=True, progress=False)
-    finally:
-        dr.set_thread_count(threads)
+    monkeypatch.setattr(Trainer, "step", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        fit(dataset, tmp_path / "b", cfg, progress=False)
+    monkeypatch.setattr(Trainer, "step", step)
+    assert load_state(tmp_path / "b" / "state.safetensors")[1]["step"] == 33
+    fit(dataset, tmp_path / "b", cfg, resume=True, progress=False)
     assert (tmp_path / "a" / "point_cloud.ply").read_bytes() == (tmp_path / "b" / "point_cloud.ply").read_bytes()
     events = [json.loads(x)["event"] for x in (tmp_path / "b" / "log.jsonl").read_text().splitlines()]
     assert events.index("interrupted") < events.index("resume") < events.index("done")
