@@ -378,11 +378,17 @@ def _cpu_model() -> str:
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that this package lies in, `-dirty` appended; None when installed."""
+    """Commit of the checkout that this package lies in, `-dirty` appended if its code has changed since.
+
+    None when installed. Results that a study has added to the checkout are no change of what it computes.
+    """
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return None
-    return _output("git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*")
+    git = "git", "-C", str(root)
+    commit = _output(*git, "describe", "--always", "--exclude=*")
+    is_dirty = commit and _output(*git, "status", "--porcelain", "--untracked-files=no", "--", "*.py", "*.toml")
+    return f"{commit}-dirty" if is_dirty else commit
 
 
 def _gpu_name() -> str | None:
