@@ -10,11 +10,11 @@ from tyro.conf import UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from drgs.commands.overrides import parsed
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import ActiveConfig, Dynamics, FeatureSize, FieldPreset, FitConfig, SemanticUse
 from drgs.information.choices import Block, Criterion, Method, Policy
 from drgs.settings import Preset, RenderSettings
 
-__all__ = ["Around", "Choosing", "Common", "Data", "Informed", "OutputPath", "Settings", "Split"]
+__all__ = ["Around", "Choosing", "Common", "Data", "Informed", "Moving", "OutputPath", "Settings", "Split", "Taught"]
 
 OutputPath = Annotated[Path, arg(aliases=["-o"])]
 Split = Literal["all", "train", "test"]
@@ -26,6 +26,13 @@ _BLOCKS: Any = PrimitiveConstructorSpec(
     instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
     is_instance=lambda x: x is None or isinstance(x, tuple),
     str_from_instance=lambda x: ["all there is" if x is None else ",".join(x)],
+)
+_CAMERAS: Any = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="CAMERA,CAMERA",
+    instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
+    is_instance=lambda x: x is None or isinstance(x, tuple),
+    str_from_instance=lambda x: ["the first" if x is None else ",".join(x)],
 )
 
 
@@ -124,3 +131,53 @@ class Choosing(Informed):
     """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
     seed: int = 0
     """Seed of everything random."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Taught:
+    """Options of a fit to a teacher's maps."""
+
+    semantics: SemanticUse = FitConfig.semantics
+    """Fit features and a decoder, too, where the data set has maps of a teacher (auto), or never (ignore)."""
+    feature_width: int = FitConfig.feature_width
+    """Feature channels of a Gaussian; a linear decoder makes the teacher's of them."""
+    feature_weight: float = FitConfig.feature_weight
+    """Weight of the features' distance to the teacher's maps in the loss; that of the photographs' is 1."""
+    feature_rate: float = FitConfig.feature_rate
+    """Learning rate of the features; some times as much for fits of few steps (docs/semantic.md)."""
+    decoder_rate: float = FitConfig.decoder_rate
+    """Learning rate of the decoder, a tenth of the features' as a rule."""
+    feature_resolution: FeatureSize = FitConfig.feature_resolution
+    """Features are rendered at the size of the image and then reduced, or at that of the teacher's map: faster."""
+    couple_features: bool = FitConfig.couple_features
+    """Let features move the geometry, too; else only colors do."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Moving:
+    """Options of a fit to what moves."""
+
+    times: int = FitConfig.times
+    """Synchronous frames that are taken of videos, evenly spaced."""
+    test_cameras: Annotated[tuple[str, ...] | None, _CAMERAS] = FitConfig.test_cameras
+    """Cameras of videos that are held out, e.g. cam00,cam07."""
+    dynamics: Dynamics = FitConfig.dynamics
+    """Fit what moves where the views have several times (auto), or what stands still to all of them (ignore)."""
+    static_share: float = FitConfig.static_share
+    """Part of the steps that fit the first time alone, before anything moves."""
+    field_preset: FieldPreset = FitConfig.field_preset
+    """Size of the deformation field: for videos of several cameras (neu3d), or one camera around an object (dnerf)."""
+    grid_rate: tuple[float, float] = FitConfig.grid_rate
+    """First and last learning rate of the field's planes."""
+    field_rate: tuple[float, float] = FitConfig.field_rate
+    """First and last learning rate of the field's MLP."""
+    motion_rate: float = FitConfig.motion_rate
+    """Learning rate of the gates that say which Gaussians move."""
+    motion_weight: float = FitConfig.motion_weight
+    """Weight of the mean gate in the loss: the larger, the fewer Gaussians move."""
+    smooth_weight: float = FitConfig.smooth_weight
+    """Weight of the field's smoothness along time."""
+    plane_weight: float = FitConfig.plane_weight
+    """Weight of the smoothness of its planes of space."""
+    l1_time_weight: float = FitConfig.l1_time_weight
+    """Weight of what its planes of space and time do at all."""

@@ -12,17 +12,26 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from drgs.commands.option_groups import Around, Choosing, Common, Data, Informed, OutputPath, Settings, Split
+from drgs.commands.option_groups import (
+    Around,
+    Choosing,
+    Common,
+    Data,
+    Informed,
+    Moving,
+    OutputPath,
+    Settings,
+    Split,
+    Taught,
+)
 from drgs.commands.overrides import check_color
 from drgs.fitting.config import (
     ActiveConfig,
     Degree,
-    FeatureSize,
     FitConfig,
     InitPoints,
     MaskUse,
     PickPoints,
-    SemanticUse,
     Start,
 )
 from drgs.settings import Preset, RenderSettings
@@ -90,7 +99,7 @@ class Render(Settings, Around, Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(Choosing, Data):
+class Fit(Choosing, Data, Taught, Moving):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
@@ -123,20 +132,6 @@ class Fit(Choosing, Data):
     """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
     background: tuple[float, float, float] = RenderSettings.background
     """RGB in [0, 1] behind everything."""
-    semantics: SemanticUse = FitConfig.semantics
-    """Fit features and a decoder, too, where the data set has maps of a teacher (auto), or never (ignore)."""
-    feature_width: int = FitConfig.feature_width
-    """Feature channels of a Gaussian; a linear decoder makes the teacher's of them."""
-    feature_weight: float = FitConfig.feature_weight
-    """Weight of the features' distance to the teacher's maps in the loss; that of the photographs' is 1."""
-    feature_rate: float = FitConfig.feature_rate
-    """Learning rate of the features; some times as much for fits of few steps (docs/semantic.md)."""
-    decoder_rate: float = FitConfig.decoder_rate
-    """Learning rate of the decoder, a tenth of the features' as a rule."""
-    feature_resolution: FeatureSize = FitConfig.feature_resolution
-    """Features are rendered at the size of the image and then reduced, or at that of the teacher's map: faster."""
-    couple_features: bool = FitConfig.couple_features
-    """Let features move the geometry, too; else only colors do."""
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
     initial: int = ActiveConfig.initial

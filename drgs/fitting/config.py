@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 __all__ = [
     "ActiveConfig",
     "Degree",
+    "Dynamics",
     "FeatureSize",
+    "FieldPreset",
     "FitConfig",
     "InitPoints",
     "MaskUse",
@@ -33,6 +35,8 @@ Start = Literal["first", "seed"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
 FeatureSize = Literal["image", "teacher"]
+Dynamics = Literal["auto", "ignore"]
+FieldPreset = Literal["neu3d", "dnerf"]
 
 _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
@@ -51,6 +55,11 @@ _RANGES = {
     "feature_weight": _WEIGHT,
     **dict.fromkeys(("feature_rate", "decoder_rate"), _RATE),
     "jitter": (0.0, 1e3),
+    "times": (1, 10**6),
+    "static_share": _SHARE,
+    **dict.fromkeys(("grid_rate", "field_rate"), (1e-30, 1e6)),  # their logarithms are interpolated
+    "motion_rate": _RATE,
+    **dict.fromkeys(("motion_weight", "smooth_weight", "plane_weight", "l1_time_weight"), _WEIGHT),
 }
 
 
@@ -68,6 +77,9 @@ class FitConfig:
         test_every: Every n-th view by name is held out; 0 holds out none.
         test_offset: Index of the first view that is held out, below `test_every`. A split that the data set's own files
             state wins over both.
+        test_cameras: Names of the cameras that are held out, with all their times, of videos and of captures by several
+            cameras; None: the first by name.
+        times: How many synchronous frames are taken of videos, evenly spaced.
         seed: Of everything random.
         sh_degree: Highest degree of the view-dependent color.
         deterministic: One Dr.Jit thread, hence the same bits for the same seed.
@@ -98,9 +110,26 @@ class FitConfig:
         couple_features: Let the feature image move the geometry, too; in [1] it reaches the features alone.
         feature_resolution: Features are rendered at the size of the `image` and then reduced to the teacher's, as in
             [1], or at the size of the `teacher`'s map.
+        dynamics: `auto` fits Gaussians that a deformation field moves [2] where the training views are of two times or
+            more; `ignore` fits Gaussians that stand still to the photographs of all times.
+        static_share: Fraction of the steps of the static stage, which fits Gaussians that stand still to the first time
+            of all training cameras (to all times, where fewer than 3 photographs show the first); 0 leaves it out. The
+            dynamic stage goes on with them, and with their moments in the optimizer, and adds the field. Rates and SH
+            follow one schedule over both; those of the field begin with the dynamic stage. Density control goes
+            through its schedule in each stage, `refine_start` to `refine_stop` of its steps: the static one up to half
+            of `max_gaussians`, the dynamic one up to all, so that there are some left for what appears later.
+        field_preset: Size of the deformation field, as in [2] for videos of several cameras (`neu3d`) or for one camera
+            around an object (`dnerf`).
+        grid_rate, field_rate: First and last learning rate of the field's planes and of its MLP, log-linear between.
+        motion_rate: Learning rate of the gates, one a Gaussian, that say what moves.
+        motion_weight: Of the mean of all gates: what no photograph shows to move comes to a rest, and is not deformed.
+        smooth_weight: Of the second differences along time of the field's planes of space and time, as in [2].
+        plane_weight: The same, of its planes of space.
+        l1_time_weight: Of the distance from 1, which is rest, of its planes of space and time, as in [2].
 
     Reference:
         [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
+        [2] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
     """
 
     settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
@@ -110,6 +139,8 @@ class FitConfig:
     init_points: InitPoints = "auto"
     test_every: int = 8
     test_offset: int = 0
+    test_cameras: tuple[str, ...] | None = None
+    times: int = 40
     seed: int = 0
     sh_degree: Degree = 3
     deterministic: bool = False
@@ -143,9 +174,21 @@ class FitConfig:
     decoder_rate: float = 1e-4
     couple_features: bool = False
     feature_resolution: FeatureSize = "image"
+    dynamics: Dynamics = "auto"
+    static_share: float = 3 / 17
+    field_preset: FieldPreset = "neu3d"
+    grid_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
+    field_rate: tuple[float, float] = (1.6e-4, 1.6e-5)
+    motion_rate: float = 0.05
+    motion_weight: float = 0.01
+    smooth_weight: float = 1e-3
+    plane_weight: float = 2e-4
+    l1_time_weight: float = 1e-4
 
     def __post_init__(self) -> None:
         check_fields("fit", self, _RANGES)
+        if self.static_share == 1:
+            raise ValueError("fit: static_share must be below 1, got 1; --dynamics ignore fits no motion at all")
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
         if self.test_offset >= max(self.test_every, 1):

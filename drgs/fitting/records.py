@@ -22,7 +22,7 @@ from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.files import Run
@@ -104,6 +104,11 @@ class LoadedRun:
     networks: dict[str, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
     decoder: Decoder | None = None
     classes: Classes | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """What is rendered: the Gaussians, or those that a deformation field moves."""
+        return self.gaussians
 
 
 def load_run(run: Run) -> LoadedRun:
