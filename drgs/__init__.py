@@ -19,6 +19,8 @@ __version__ = "0.1.0"
 # Public name -> module that defines it.
 _NAMES = {
     "Camera": "cameras",
+    "DeformationField": "deform",
+    "DynamicGaussians": "deform",
     "Gaussians": "ellipsoids",
     "RenderSettings": "settings",
     "load_ply": "files",
@@ -33,6 +35,7 @@ _MODULES = frozenset(
         "cli",
         "crossval",
         "data",
+        "deform",
         "ellipsoids",
         "files",
         "fisher",
@@ -51,10 +54,13 @@ _MODULES = frozenset(
 
 __all__ = [
     "Camera",
+    "DeformationField",
+    "DynamicGaussians",
     "Gaussians",
     "RenderSettings",
     "__version__",
     "data",
+    "deform",
     "fisher",
     "gain",
     "load_ply",
@@ -71,7 +77,7 @@ if TYPE_CHECKING:
     from drgs import cameras as cameras
     from drgs import cli as cli
     from drgs import crossval as crossval
-    from drgs import data, fisher, gain, reference, runtime, select
+    from drgs import data, deform, fisher, gain, reference, runtime, select
     from drgs import ellipsoids as ellipsoids
     from drgs import files as files
     from drgs import integrator as integrator
@@ -81,6 +87,7 @@ if TYPE_CHECKING:
     from drgs import testing as testing
     from drgs import train as train
     from drgs.cameras import Camera
+    from drgs.deform import DeformationField, DynamicGaussians
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply
     from drgs.integrator import render, render_jvp

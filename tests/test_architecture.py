@@ -27,6 +27,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"tracing"}, "the engine"),
     ({"integrator", "plugin"}, "rendering with it, from torch and from Mitsuba"),
     ({"rasterize"}, "the same under gsplat's names"),
+    ({"deform", "dynamics"}, "Gaussians that move: what comes above sees a scene, by its protocol"),
     ({"features"}, "what Gaussians and pixels are called: teacher maps, decoder, labels, queries"),
     ({"gain"}, "how information becomes a score, whatever computed it"),
     ({"information"}, "what a view's pixels say about each parameter: groups, Jacobian, replay"),

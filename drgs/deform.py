@@ -1,0 +1,319 @@
+"""Gaussians that move: a field of place and time deforms those that its gate lets move.
+
+The field is that of 4D Gaussian Splatting: a HexPlane (`drgs.dynamics.hexplane`) and a small MLP with a head each for
+position, rotation and scale, whose outputs are added to the raw parameters. It is the identity at the start. Opacities,
+colors and features stay what they are.
+
+Reference:
+    Wu et al. 2024 (4D Gaussian Splatting), section 4; Cao & Johnson 2023 (HexPlane).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from drgs.dynamics.hexplane import HexPlane, features
+from drgs.ellipsoids import Gaussians
+from drgs.guards.arguments import ArgumentError, must_be
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+__all__ = ["DeformationField", "Deltas", "DynamicGaussians", "FieldConfig"]
+
+_HEADS = {"means": 3, "quats": 4, "log_scales": 3}
+_BEYOND = 1e-6  # of the span: how far outside of it a time may lie, by rounding
+_FLATTEST = 1e-3  # of the longest side of the bounds: how short another may be
+PHI = "phi."
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FieldConfig:
+    """Sizes of a `DeformationField`.
+
+    Attributes:
+        channels: C, of a plane.
+        resolution: Nodes along an axis of space at level 1.
+        time_resolution: Nodes along the time, at all levels.
+        levels: By which the resolution in space is multiplied.
+        width: Of the MLP's layers.
+        depth: Layers before the heads; 0 and 1 are the same, one that mixes the features.
+        last_std: Standard deviation of the heads' last weights at the start. 0 is the identity, where only these
+            weights have gradients and information.
+    """
+
+    channels: int = 16
+    resolution: int = 64
+    time_resolution: int = 150
+    levels: tuple[int, ...] = (1, 2)
+    width: int = 128
+    depth: int = 0
+    last_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        least = {"channels": 1, "resolution": 2, "time_resolution": 2, "width": 1, "depth": 0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < low:
+                raise ArgumentError(
+                    f"FieldConfig: {name} must be a whole number >= {low}, got {value!r}; choose another"
+                )
+        object.__setattr__(self, "levels", tuple(self.levels))
+        if not self.levels or any(isinstance(x, bool) or not isinstance(x, int) or x < 1 for x in self.levels):
+            raise ArgumentError(f"FieldConfig: levels must be whole numbers >= 1, got {self.levels!r}; e.g. (1, 2)")
+        if not 0 <= self.last_std < math.inf:
+            raise ArgumentError(f"FieldConfig: last_std must be >= 0 and finite, got {self.last_std!r}; choose another")
+
+    @classmethod
+    def preset(cls, name: Literal["neu3d", "dnerf"], times: int | None = None, **fields: Any) -> FieldConfig:
+        """The sizes of 4D Gaussian Splatting for videos of rooms (`neu3d`) or for one synthetic object (`dnerf`).
+
+        Args:
+            name: Of the preset.
+            times: How many distinct times there are; there is a node in time for every two of them, as in 4DGS. None
+                for those of its own data sets: 300 (`neu3d`) and 100 (`dnerf`).
+            fields: Of the config that shall differ.
+        """
+        presets = {
+            "neu3d": {"channels": 16, "resolution": 64, "levels": (1, 2), "width": 128},
+            "dnerf": {"channels": 32, "resolution": 64, "levels": (1, 2), "width": 64},
+        }
+        if name not in presets:
+            raise ArgumentError(f"FieldConfig: preset must be among {', '.join(presets)}, got {name!r}; choose one")
+        times = {"neu3d": 300, "dnerf": 100}[name] if times is None else times
+        return cls(**{**presets[name], "time_resolution": max(2, math.ceil(times / 2)), **fields})
+
+
+class Deltas(NamedTuple):
+    """What is added to the raw parameters: (N, 3) means, (N, 4) quats, (N, 3) log_scales."""
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    log_scales: torch.Tensor
+
+
+class DeformationField(torch.nn.Module):
+    """(N, 3) canonical means and a time -> `Deltas`.
+
+    Args:
+        config: Sizes.
+        bounds: (2, 3) lowest and highest corner of the canonical means, in world units; means outside see the border.
+            A side shorter than 1e-3 of the longest is widened to that, and a single point to sides of 1.
+        span: First and last time that will ever be asked for.
+        seed: Of the weights at the start.
+    Attributes:
+        grid: The `HexPlane`; its parameters are `grid.0`, ..., its buffers `grid.bounds` and `grid.span`.
+        mlp: `mlp.trunk`, and the heads `mlp.means`, `mlp.quats` and `mlp.log_scales`.
+    """
+
+    def __init__(
+        self,
+        config: FieldConfig,
+        bounds: ArrayLike | torch.Tensor,
+        span: tuple[float, float] = (0.0, 1.0),
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        must_be("DeformationField", "config", config, FieldConfig, 'FieldConfig.preset("neu3d") makes one')
+        self.config = config
+        with torch.random.fork_rng(devices=[]):  # whoever draws random numbers besides draws the same
+            torch.manual_seed(seed)
+            resolutions = [config.resolution * level for level in config.levels]
+            box, times = _checked_bounds(bounds), _checked_span(span)
+            self.grid = HexPlane(config.channels, resolutions, config.time_resolution, box, times)
+            self.mlp = _mlp(config)
+
+    def forward(self, means: torch.Tensor, time: float | torch.Tensor, origin: ArrayLike | None = None) -> Deltas:
+        """Deltas of canonical means at a time.
+
+        Args:
+            means: (N, 3), relative to `origin`.
+            time: A number, or a scalar tensor, which the deltas are then differentiated by.
+            origin: (3,) world units, or None for 0.
+        Returns:
+            Of the dtype of the weights, differentiable in both modes by weights, means and time. By the time the
+            derivative is that of the cell above, at a node of the grid too: one-sided there, from the right (from the
+            left at the last one).
+        Raises:
+            ValueError: If the time lies outside of the span.
+        """
+        return self.evaluate(dict(self.named_parameters()), means, time, origin)
+
+    def evaluate(
+        self,
+        weights: Mapping[str, torch.Tensor],
+        means: torch.Tensor,
+        time: float | torch.Tensor,
+        origin: ArrayLike | None = None,
+    ) -> Deltas:
+        """`forward` of a field with these weights, named as in `named_parameters`; from any number of threads."""
+        planes = [weights[f"grid.{k}"] for k in range(len(self.grid))]
+        return _deltas(weights, features(planes, self._places(means, origin), self._moment(time)))
+
+    def _places(self, means: torch.Tensor, origin: ArrayLike | None) -> torch.Tensor:
+        """Means as parts of the way from the lower to the upper bound: float64 differences of what is far from 0."""
+        low, high = self.grid.bounds
+        start = low if origin is None else low - torch.as_tensor(np.asarray(origin, np.float64), device=low.device)
+        return (means - start.to(means.dtype)) / (high - low).to(means.dtype)
+
+    def _moment(self, time: float | torch.Tensor) -> torch.Tensor:
+        """The time as a part of the span."""
+        first, last = (float(x) for x in self.grid.span)
+        value = float(time)
+        slack = _BEYOND * (last - first)
+        if not first - slack <= value <= last + slack:
+            raise ArgumentError(
+                f"DeformationField: time must be in [{first:g}, {last:g}], the span of the field, got {value:g}; ask "
+                "for a time in it"
+            )
+        given = time if isinstance(time, torch.Tensor) else torch.tensor(value, dtype=torch.float64)
+        return (given.to(self.grid.span) - first) / ((last - first) or 1.0)
+
+
+def _mlp(config: FieldConfig) -> torch.nn.ModuleDict:
+    """Layers of the trunk and the heads, as they are at the start."""
+    width = config.width
+    trunk: list[torch.nn.Module] = [torch.nn.Linear(config.channels * len(config.levels), width)]
+    for _ in range(config.depth - 1):
+        trunk += [torch.nn.ReLU(), torch.nn.Linear(width, width)]
+    made = {"trunk": torch.nn.Sequential(*trunk)}
+    for name, size in _HEADS.items():
+        last = torch.nn.Linear(width, size)
+        torch.nn.init.normal_(last.weight, std=config.last_std)
+        torch.nn.init.zeros_(last.bias)
+        made[name] = torch.nn.Sequential(torch.nn.ReLU(), torch.nn.Linear(width, width), torch.nn.ReLU(), last)
+    return torch.nn.ModuleDict(made)
+
+
+def _deltas(weights: Mapping[str, torch.Tensor], features: torch.Tensor) -> Deltas:
+    """The MLP: hidden layers of all heads in one product."""
+    linear, relu = torch.nn.functional.linear, torch.nn.functional.relu
+    hidden, layer = features, 0
+    while f"mlp.trunk.{layer}.weight" in weights:
+        hidden = linear(hidden, weights[f"mlp.trunk.{layer}.weight"], weights[f"mlp.trunk.{layer}.bias"]).relu()
+        layer += 2
+    inner = [torch.cat([weights[f"mlp.{name}.1.{kind}"] for name in _HEADS]) for kind in ("weight", "bias")]
+    parts = relu(linear(hidden, *inner)).chunk(len(_HEADS), 1)
+    last = [(weights[f"mlp.{name}.3.weight"], weights[f"mlp.{name}.3.bias"]) for name in _HEADS]
+    return Deltas(*(linear(part, *own) for part, own in zip(parts, last, strict=True)))
+
+
+class DynamicGaussians:
+    """Canonical Gaussians, and the field that moves some of them: a `DeformableScene`.
+
+    A Gaussian's gate is sigmoid(motion). From 0.5 on it moves, by 2 gate - 1 times the field's deltas: continuously,
+    and at most as far as the field says. Below, it is still, and nothing is computed for it.
+
+    Args:
+        gaussians: The canonical ones.
+        field: What moves them.
+        motion: (N,) logit of the gate; None: all move as the field says.
+    """
+
+    def __init__(self, gaussians: Gaussians, field: DeformationField, motion: torch.Tensor | None = None) -> None:
+        must_be("DynamicGaussians", "gaussians", gaussians, Gaussians, "the canonical ones")
+        must_be(
+            "DynamicGaussians", "field", field, DeformationField, "DeformationField(config, bounds, span) makes one"
+        )
+        if motion is not None:
+            must_be("DynamicGaussians", "motion", motion, torch.Tensor, "a logit a Gaussian")
+            if tuple(motion.shape) != (len(gaussians),) or not motion.is_floating_point():
+                raise ArgumentError(
+                    f"DynamicGaussians: motion must be {len(gaussians)} floats, one a Gaussian, got {motion.dtype} of "
+                    f"shape {tuple(motion.shape)}; pass None to let all move"
+                )
+        self.gaussians, self.field, self.motion = gaussians, field, motion
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def moving(self) -> torch.Tensor:
+        """(N,) bool, which Gaussians the field is evaluated for."""
+        if self.motion is None:
+            return torch.ones(len(self), dtype=torch.bool, device=self.gaussians.means.device)
+        return self.motion.detach() >= 0  # who moves has no derivative
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """Raw parameters of the Gaussians, `motion` if there is one, and the field's: `phi.grid.*`, `phi.mlp.*`."""
+        gate = {} if self.motion is None else {"motion": self.motion}
+        return self.gaussians.parameters() | gate | {PHI + name: x for name, x in self.field.named_parameters()}
+
+    def at(self, time: float | torch.Tensor | None) -> Gaussians:
+        """The Gaussians at a time.
+
+        Args:
+            time: A number, or a scalar tensor, which they are then differentiated by.
+        Raises:
+            ValueError: If there is no time, it lies outside of the field's span, or what deforms is not finite (the
+                parameter is named).
+        """
+        parameters = self.parameters()
+        seen = self.deform(parameters, time)
+        with torch.no_grad():  # a check, which leaves no graph
+            if not all(_is_finite(x) for x in (seen.means, seen.quats, seen.log_scales, *self._gate())):
+                for name, x in parameters.items():
+                    if not _is_finite(x):
+                        bad = ~torch.isfinite(x)
+                        at = tuple(bad.nonzero()[0].tolist())
+                        raise ArgumentError(
+                            f"DynamicGaussians.at: {name} must be finite, got {float(x[at]):g} at index {list(at)} "
+                            f"({int(bad.sum())} of {x.numel()}); go back to the last weights that were"
+                        )
+        return seen
+
+    def _gate(self) -> list[torch.Tensor]:
+        return [] if self.motion is None else [self.motion]
+
+    def deform(self, parameters: dict[str, torch.Tensor], time: float | torch.Tensor | None) -> Gaussians:
+        """`at(time)` of a scene with these parameters, for `torch.func`; nothing is checked but the time."""
+        if time is None:
+            raise ArgumentError("DynamicGaussians.at: the view must have a time, got None; set Camera.time")
+        fields = dict(parameters)
+        phi = {name.removeprefix(PHI): fields.pop(name) for name in parameters if name.startswith(PHI)}
+        motion, means, index = fields.pop("motion", None), fields["means"], None
+        if motion is not None:
+            index = (motion.detach() >= 0).nonzero()[:, 0]  # who moves has no derivative
+            means = means[index]
+        deltas = self.field.evaluate(phi, means, time, self.gaussians.origin)
+        for name, delta in zip(Deltas._fields, deltas, strict=True):
+            delta = delta.to(fields[name].dtype)
+            if motion is None or index is None:
+                fields[name] = fields[name] + delta
+            else:
+                factor = (0.5 * motion[index]).tanh()  # 2 sigmoid(m) - 1
+                fields[name] = fields[name].index_add(0, index, delta * factor.to(delta.dtype)[:, None])
+        return self.gaussians.replace(**fields)
+
+
+def _is_finite(x: torch.Tensor) -> bool:
+    """NaN passes through the reduction."""
+    return x.numel() == 0 or all(math.isfinite(float(end)) for end in torch.aminmax(x))
+
+
+def _checked_bounds(bounds: ArrayLike | torch.Tensor) -> torch.Tensor:
+    """(2, 3) float64, no side of it too short to divide by."""
+    box = torch.as_tensor(bounds, dtype=torch.float64).detach()  # where the field lies is a constant
+    if tuple(box.shape) != (2, 3) or not bool(torch.isfinite(box).all()) or bool((box[0] > box[1]).any()):
+        raise ArgumentError(
+            f"DeformationField: bounds must be (2, 3), lowest and highest corner, finite, got {box.tolist()}; take "
+            "torch.stack([means.amin(0), means.amax(0)])"
+        )
+    middle, size = box.mean(0), box[1] - box[0]
+    size = size.clamp_min(_FLATTEST * float(size.max()) or 1.0)
+    return torch.stack([middle - size / 2, middle + size / 2])
+
+
+def _checked_span(span: tuple[float, float]) -> torch.Tensor:
+    first, last = (float(x) for x in span)
+    if not (math.isfinite(first) and math.isfinite(last) and first <= last):
+        raise ArgumentError(
+            f"DeformationField: span must be the first and the last time, finite, got {tuple(span)!r}; e.g. (0.0, 1.0)"
+        )
+    return torch.tensor([first, last], dtype=torch.float64)

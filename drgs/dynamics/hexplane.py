@@ -1,0 +1,123 @@
+"""HexPlane: features of a place at a time, as the product of six planes, looked up bilinearly.
+
+torch's `grid_sample` has no forward mode, so planes are looked up by gathers. All Gaussians of a view share its time:
+the three planes with a time axis are interpolated along it first, to lines, along which each Gaussian is looked up.
+
+Reference:
+    Cao & Johnson 2023 (HexPlane); Wu et al. 2024 (4D Gaussian Splatting), section 4.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+
+__all__ = ["SPACE_PAIRS", "TIME_AXES", "HexPlane", "features"]
+
+SPACE_PAIRS = ((0, 1), (0, 2), (1, 2))  # columns and rows of the planes of space
+TIME_AXES = (0, 1, 2)  # columns of the planes whose rows are times
+
+
+class HexPlane(torch.nn.ParameterList):
+    """The planes by which `features` gives (N, 3) places at a time (N, L C) features: the product over six planes,
+    concatenated over L levels.
+
+    Bilinear, corners on corners, constant outside (`grid_sample(align_corners=True, padding_mode="border")`). The
+    derivative by a place or a time is that of the cell above, at a node too: one-sided there, from the right, and from
+    the left at the last node.
+
+    Parameters `0` to `6 L - 1`, level by level: the planes (x, y), (x, z), (y, z), shaped (resolution, resolution, C)
+    with the second axis first, then (t, x), (t, y), (t, z), shaped (time_resolution, resolution, C). Those of space
+    begin uniform in [0.1, 0.5], those of time at 1.
+
+    Args:
+        channels: C.
+        resolutions: Nodes along an axis of space, a number a level.
+        time_resolution: Nodes along the time.
+        bounds: (2, 3) float64, lowest and highest corner of what the planes of space cover, in world units.
+        span: First and last time, which the first and the last node of the planes of time lie at.
+    Attributes:
+        bounds, span: As given, float64 whatever the parameters are: a buffer each.
+    """
+
+    bounds: torch.Tensor
+    span: torch.Tensor
+
+    def __init__(
+        self,
+        channels: int,
+        resolutions: Sequence[int],
+        time_resolution: int,
+        bounds: torch.Tensor,
+        span: torch.Tensor,
+    ) -> None:
+        planes = []
+        for r in resolutions:
+            planes += [torch.empty(r, r, channels).uniform_(0.1, 0.5) for _ in SPACE_PAIRS]
+            planes += [torch.ones(time_resolution, r, channels) for _ in TIME_AXES]
+        super().__init__(planes)
+        self.register_buffer("bounds", bounds.to(torch.float64))
+        self.register_buffer("span", span.to(torch.float64))
+
+    def _apply(self, fn: Callable, recurse: bool = True) -> HexPlane:
+        """Of `.to(...)`: bounds of a world far from 0 and times keep their digits."""
+        bounds, span = self.bounds, self.span
+        super()._apply(fn, recurse)
+        self.bounds, self.span = bounds.to(self.bounds.device), span.to(self.span.device)
+        return self
+
+
+def levels(planes: Sequence[torch.Tensor]) -> Iterator[tuple[Sequence[torch.Tensor], Sequence[torch.Tensor]]]:
+    """The planes of space and those of time of each level."""
+    for k in range(0, len(planes), 6):
+        yield planes[k : k + 3], planes[k + 3 : k + 6]
+
+
+def features(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+    """Look a HexPlane up.
+
+    Args:
+        planes: As in `HexPlane`.
+        places: (N, 3), 0 at the lower and 1 at the upper bound; beyond them the features of the border.
+        time: Scalar, 0 at the first and 1 at the last time.
+    Returns:
+        (N, L C) of the dtype of the planes, differentiable in both modes by planes, places and time.
+    """
+    out = []
+    for space, times in levels(planes):
+        columns = [_between(places[:, axis], space[0].shape[0]) for axis in range(3)]
+        below, part = _between(time, times[0].shape[0])
+        found = [_bilinear(plane, columns[a], columns[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
+        product = found[0] * found[1] * found[2]
+        for plane, axis in zip(times, TIME_AXES, strict=True):
+            line = torch.lerp(plane[int(below)], plane[int(below) + 1], part.to(plane.dtype))
+            product = product * _linear(line, *columns[axis])
+        out.append(product)
+    return torch.cat(out, 1)
+
+
+def _between(x: torch.Tensor, nodes: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The node below and how far it is to the next, of coordinates where 0 is the first node and 1 the last.
+
+    NaN stays NaN in the second, and is a legal index.
+    """
+    x = x.clamp(0, 1) * (nodes - 1)
+    below = x.detach().long().clamp(0, nodes - 2)  # which cell it is has no derivative
+    return below, x - below
+
+
+def _linear(line: torch.Tensor, below: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
+    part = part.to(line.dtype)[:, None]
+    pick = torch.nn.functional.embedding
+    return pick(below, line) * (1 - part) + pick(below + 1, line) * part
+
+
+def _bilinear(plane: torch.Tensor, column: tuple, row: tuple) -> torch.Tensor:
+    (a, s), (b, t) = column, row
+    width, rows = plane.shape[1], plane.reshape(-1, plane.shape[2])
+    s, t = s.to(plane.dtype)[:, None], t.to(plane.dtype)[:, None]
+    first, pick = b * width + a, torch.nn.functional.embedding
+    near = pick(first, rows) * (1 - s) + pick(first + 1, rows) * s
+    far = pick(first + width, rows) * (1 - s) + pick(first + width + 1, rows) * s
+    return near * (1 - t) + far * t
