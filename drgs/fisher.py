@@ -15,8 +15,8 @@ tell about means, rotations, log-scales and opacities, too (coupled), and a chan
 sum_p w_p^2 on average. Without, they tell about themselves only (uncoupled).
 
 Sources: Jiang et al. 2024 (FisherRF) for the criterion, with what its code computes instead under method "fisherrf";
-Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering
-(replay.py, jacobian.py).
+Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering (replay.py, jacobian.py).
+What views say about a network that moves the Gaussians is in information/network.py.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_any_scene, check_scene, check_view, gaussians_at
 from drgs.information.groups import GROUPS, Group, Information, groups_of, scene_groups
 from drgs.information.jacobian import GEOMETRY
+from drgs.information.network import network, network_variance_map
 from drgs.information.probes import by_probes
 from drgs.information.replay import Replay
 from drgs.information.semantics import SemanticMetric
@@ -53,6 +54,8 @@ __all__ = [
     "diagonal",
     "information_gain",
     "jacobian_columns",
+    "network",
+    "network_variance_map",
     "pose_information",
     "variance_map",
 ]

@@ -20,7 +20,7 @@ import itertools
 import math
 import re
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,12 +32,14 @@ from drgs.gain import CRITERIA, METHODS, Information
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import camera_list, check_any_scene
 from drgs.information.cache import Cache
+from drgs.information.combine import Asked, Combination, asked_of
 from drgs.information.greedy import ViewInformation, greedy
 from drgs.information.pool import Pick, Pool, Scoring, Selection
 from drgs.information.semantics import SemanticMetric
 
 __all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
 
+FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
 # One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
 
@@ -80,7 +82,7 @@ def select(
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
         **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
-            `groups`, `blocks`, `semantics`; None is the default.
+            `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, or information is negative, NaN
             or infinite.
@@ -132,28 +134,27 @@ def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:
 def fisher(pool: Pool) -> Selection:
     """Largest gain of Fisher information, of the blocks of the image that the scoring names."""
     scoring, metric = pool.scoring, None
-    blocks: tuple[str, ...] = ()
-    options: dict[str, Hashable] = {}  # none where colors are all there is
-    without: tuple[str, ...] = ("features",)
-    if pool.information is None:  # else it knows by itself what it is about
+    if pool.information is not None:  # it knows by itself what it is about
+        return _greedy(pool, ())
+    with torch.no_grad():
         seen = pool.scene.at(pool.candidates[0].time)
-        blocks = scoring.blocks_of(seen)
-        if "semantic" in blocks:
-            assert seen.features is not None  # else there is no such block
-            options["semantics"] = metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
-            without = ()
-        if "geometry" not in blocks:
-            options["channel_weights"], without = (0.0, 0.0, 0.0), ("sh",)
-        if scoring.groups is not None and set(scoring.groups) <= set(without):
-            raise ValueError(
-                f"select: groups must have one that blocks {', '.join(blocks)} tell about, got "
-                f"{', '.join(scoring.groups) or 'none'}; add the other block, or another group"
-            )
-    if scoring.criterion == "block_logdet":
-        selection = _greedy(pool, "blocks", (), **options)
-    else:
-        selection = _greedy(pool, "diagonal", without, method=scoring.method, groups=scoring.groups, **options)
+    blocks = scoring.blocks_of(seen, scene=pool.scene)
+    if "semantic" in blocks:
+        assert seen.features is not None  # else there is no such block
+        metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
+    asked, combination = asked_of(scoring, blocks, metric)
+    selection = _greedy(pool, asked, combination)
     selection.blocks, selection.semantics = list(blocks), metric.to_json() if metric else None
+    if "deformation" in blocks:
+        selection.network = {"score": scoring.network, "probes": scoring.probes}
+        if scoring.network == "ratio" and scoring.probes < FEW_PROBES:
+            selection.notes.append(
+                f"deformation: {scoring.probes} probes are few to divide by, where one view is all that is known of a "
+                f"parameter its ratio is too large; take {FEW_PROBES} or more"
+            )
+    if combination.apart:
+        selection.combine = "zscore"
+        selection.notes.append(f"scores are sums of z-scores of {', '.join(combination.apart)} over the candidates")
     return selection
 
 
@@ -161,41 +162,35 @@ def fisherrf(pool: Pool) -> Selection:
     """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations and no features."""
     prior, weights = pool.scoring.prior, _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
-    return _greedy(
-        _scored(pool, criterion="eig", prior=prior, weights=weights), "diagonal", ("features",), method="fisherrf"
-    )
+    asked = Asked("diagonal", ("features",), (("method", "fisherrf"),))
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights=weights), [asked])
 
 
 def coverage(pool: Pool) -> Selection:
     """Largest sum Wc / (W + lambda), W = sum over pixels of w^2."""
     prior = dataclasses.replace(pool.scoring.prior, groups={})
-    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), "coverage")
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), [Asked("coverage")])
 
 
-def _greedy(pool: Pool, function: str, without: tuple[str, ...] = (), **options: Hashable) -> Selection:
-    """`greedy` by what a function of `drgs.fisher` computes of each view, or by the pool's own information.
+def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None = None) -> Selection:
+    """`greedy` by what `drgs.fisher` says of each view, or by the pool's own information.
 
     Args:
         pool: Whose scoring says how much it counts.
-        function: Its name; where it returns one tensor, that is a group of the same name.
-        without: Groups that do not count.
-        **options: Of the function, besides scene, camera and settings.
+        asked: What is asked of a view.
+        combination: How that becomes a score; default by the pool's scoring, all groups together.
     """
-    settings = pool.scoring.settings
+    settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
 
     def compute(camera: Camera) -> Information:
-        from drgs import fisher  # loads Dr.Jit, which the other policies need not have
-
-        # `diagonal` also knows the parameters that a scene computes its Gaussians from.
-        scene = pool.scene if function == "diagonal" else pool.scene.at(camera.time)
-        found = getattr(fisher, function)(scene, camera, settings, **options)
-        if isinstance(found, torch.Tensor):
-            return {function: found}
-        return {name: x for name, x in found.items() if name not in without}
+        found: dict[str, torch.Tensor] = {}
+        for one in asked:
+            found |= one(pool.scene, camera, settings)
+        return found
 
     if pool.information:
-        return greedy(pool, ViewInformation(pool, pool.information, (pool.information, settings)))
-    return greedy(pool, ViewInformation(pool, compute, (function, settings, without, *sorted(options.items()))))
+        return greedy(pool, ViewInformation(pool, pool.information, (pool.information, settings)), combination)
+    return greedy(pool, ViewInformation(pool, compute, (settings, *asked)), combination)
 
 
 def _scored(pool: Pool, **fields: Any) -> Pool:

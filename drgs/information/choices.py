@@ -8,12 +8,18 @@ from typing import Literal
 
 __all__ = [
     "BLOCK_NAMES",
+    "COMBINES",
     "ESTIMATES",
     "METHODS",
+    "NETWORKS",
+    "NETWORK_ESTIMATES",
     "Block",
+    "Combine",
     "Criterion",
     "Estimate",
     "Method",
+    "Network",
+    "NetworkEstimate",
     "Policy",
     "checked_blocks",
 ]
@@ -29,8 +35,9 @@ Method = Literal["exact", "columns", "probes", "fisherrf"]
 
 METHODS: tuple[Method, ...] = typing.get_args(Method)
 
-Block = Literal["geometry", "semantic"]
-"""Parts of an image that can tell about a scene: its colors, and its features."""
+Block = Literal["geometry", "semantic", "deformation"]
+"""What is asked of a view: what its colors and its features tell about the Gaussians, and what the image tells about
+the network that moves them."""
 
 BLOCK_NAMES: tuple[Block, ...] = typing.get_args(Block)
 """In the order in which results name them."""
@@ -48,8 +55,9 @@ def checked_blocks(where: str, names: Sequence[str], method: str) -> tuple[Block
     for name in names:
         if name not in BLOCK_NAMES:
             raise ValueError(f"{where}: blocks must be among {known}, got {name!r}; correct it")
-    if method == "fisherrf" and "semantic" in names:
-        raise ValueError(f"{where}: blocks must be geometry with method fisherrf, got semantic; use method exact")
+    other = [name for name in BLOCK_NAMES[1:] if name in names]
+    if method == "fisherrf" and other:
+        raise ValueError(f"{where}: blocks must be geometry with method fisherrf, got {other[0]}; use method exact")
     return tuple(name for name in BLOCK_NAMES if name in names)
 
 
@@ -57,3 +65,19 @@ Estimate = Literal["principal", "collapsed", "exact"]
 """How `drgs.fisher.SemanticMetric` sums over the channels of decoded features; the first is the default everywhere."""
 
 ESTIMATES: tuple[Estimate, ...] = typing.get_args(Estimate)
+
+NetworkEstimate = Literal["diagonal", "trace", "paper"]
+"""What `drgs.fisher.network` estimates of H, a network's information; the first is the default everywhere."""
+
+NETWORK_ESTIMATES: tuple[NetworkEstimate, ...] = typing.get_args(NetworkEstimate)
+
+Network = Literal["ratio", "trace", "paper"]
+"""How the block `deformation` scores: as the diagonal does against that of the known views, by the trace of the
+candidate's own information, or by the trace of its square; the first is the default everywhere."""
+
+NETWORKS: tuple[Network, ...] = typing.get_args(Network)
+
+Combine = Literal["sum", "zscore"]
+"""How the scores of several blocks become one."""
+
+COMBINES: tuple[Combine, ...] = typing.get_args(Combine)

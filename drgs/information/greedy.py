@@ -19,8 +19,10 @@ from collections.abc import Callable, Hashable
 import torch
 
 from drgs.cameras import Camera
-from drgs.gain import Gain, Information, Prior, check, scorer
+from drgs.gain import Gain, Information, Prior, check
 from drgs.information.cache import camera_key
+from drgs.information.combine import Combination
+from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.pool import Pool, Selection
 
 __all__ = ["ViewInformation", "greedy"]
@@ -33,6 +35,7 @@ class ViewInformation:
 
     Attributes:
         computed: Views that were not in the cache.
+        told: Group of a network -> whether any view so far says something about it.
     """
 
     def __init__(self, pool: Pool, compute: Callable[[Camera], Information], key: Hashable):
@@ -44,6 +47,7 @@ class ViewInformation:
         """
         self.pool, self.compute, self.key = pool, compute, key
         self.computed = self.done = 0
+        self.told: dict[str, bool] = {}
 
     def __call__(self, what: str, camera: Camera) -> Information:
         """Of one view; `what` it is, for messages."""
@@ -52,6 +56,9 @@ class ViewInformation:
             found = self._new(what, camera)
         else:
             found = pool.cache.get(pool.scene, (self.key, camera_key(camera)), lambda: self._new(what, camera))
+        for name, x in found.items():
+            if name.rpartition(".")[2] in NETWORK_GROUPS:
+                self.told[name] = self.told.get(name, False) or bool(x.any())
         self.done += 1
         if pool.progress:
             pool.progress(self.done, len(pool.train) + len(pool.candidates))
@@ -64,16 +71,19 @@ class ViewInformation:
         return found
 
 
-def greedy(pool: Pool, information: ViewInformation) -> Selection:
+def greedy(pool: Pool, information: ViewInformation, combination: Combination | None = None) -> Selection:
     """The best candidate, then the best once that one is known, `pool.k` times.
 
     Args:
         pool: Whose `scoring` says how much what `information` returns counts.
         information: Of single views.
+        combination: How a score is made of it; default by that scoring, all groups together.
     """
-    prior = pool.scoring.prior
-    _check_prior(pool, prior)
-    H, gains, kept = _first_round(pool, information)
+    combination, prior = combination or Combination(pool.scoring), pool.scoring.prior
+    if not combination.traced or combination.apart:  # a trace alone has no lambda
+        _check_prior(pool, prior)
+    H, scores, kept = _first_round(pool, information, combination)
+    gains = combination.compared(scores)
     selection = Selection(
         picks=[],
         scores=[gain.total for gain in gains],
@@ -82,10 +92,10 @@ def greedy(pool: Pool, information: ViewInformation) -> Selection:
         left_out=gains[0].left_out,
         evaluations=len(gains),
         computed=information.computed,
-        notes=_notes(gains),
+        notes=[*_notes(gains), *_silent(information.told)],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
-    falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0
+    falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0 and combination.falls
     left, fresh = list(range(len(gains))), set(range(len(gains)))
     while True:
         order = sorted((i for i in left if i in fresh), key=lambda i: -gains[i].total)  # stable: ties by index
@@ -97,15 +107,13 @@ def greedy(pool: Pool, information: ViewInformation) -> Selection:
         left.remove(best)
         _add(H, kept.pop(best))
         fresh = set()  # the other scores are bounds now
-        selection.evaluations += _refresh(gains, left, fresh, falling, _scorer(pool, H), kept)
-
-
-def _scorer(pool: Pool, H: Information) -> Callable[[Information], Gain]:
-    return scorer(H, pool.scoring.criterion, pool.scoring.prior, pool.scoring.weights)
+        selection.evaluations += _refresh(gains, left, fresh, falling, combination.scorer(H), kept)
+        for i, gain in zip(left, combination.compared([gains[i] for i in left]), strict=True):
+            gains[i] = gain
 
 
 def _first_round(
-    pool: Pool, information: ViewInformation
+    pool: Pool, information: ViewInformation, combination: Combination
 ) -> tuple[dict[str, torch.Tensor], list[Gain], dict[int, Information]]:
     """H of the training views, every candidate's gain and, where more than one is picked, its information by index."""
     H: dict[str, torch.Tensor] = {}
@@ -119,7 +127,7 @@ def _first_round(
         part = information(f"candidate {i} ({camera.name})", camera)
         if i == 0:
             H = H or _nothing(part)
-            score = _scorer(pool, H)
+            score = combination.scorer(H)
         gains.append(score(part))
         if pool.k > 1:
             kept[i] = part
@@ -144,6 +152,16 @@ def _notes(gains: list[Gain]) -> list[str]:
     if counts:
         notes.append(f"lambda = 0: parameters without information in the training views are left out: {counts}")
     return notes
+
+
+def _silent(told: dict[str, bool]) -> list[str]:
+    """What is worth saying about a network that views tell nothing about."""
+    return [
+        f"deformation: no view has information about {name}, which decides nothing (heads of the network that are 0, "
+        "as at its start, or no Gaussian in sight moves)"
+        for name, any_view in told.items()
+        if not any_view
+    ]
 
 
 def _refresh(

@@ -12,7 +12,8 @@ from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
 from drgs.information.cache import Cache
-from drgs.information.choices import BLOCK_NAMES, Block, checked_blocks
+from drgs.information.choices import COMBINES, NETWORKS, Block, Combine, Network, checked_blocks
+from drgs.information.network_groups import network_groups
 from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
 
@@ -31,12 +32,21 @@ class Scoring:
         weights: Group -> factor, 1 where none is given; of `fisher` and `fisherrf` only.
         groups: Of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that Gaussians have. Of
             `fisher` only, not of `block_logdet`. Those of a scene's network need method `columns` or `probes`.
-        blocks: What of an image tells: `geometry`, its colors, about all but the features, `semantic`, its decoded
-            features, about the features and, coupled, about the geometry, or both. None: all that the scene has
-            (method `fisherrf` knows colors only). Of `fisher` only.
+        blocks: What of an image tells about what: `geometry`, its colors, about all but the features; `semantic`, its
+            decoded features, about the features and, coupled, about the geometry; `deformation`, both as far as the
+            other two blocks are named, else its colors, about the network that moves the Gaussians, groups `grid` and
+            `mlp`. None: all that the scene has (method `fisherrf` knows colors only). Of `fisher` only.
         semantics: The metric of the block `semantic`; None: that of features as they are stored, all channels alike.
+        network: How the block `deformation` scores: `ratio`, its diagonal by `criterion` against that of the known
+            views, like all other groups; `trace` and `paper`, by what a candidate says itself, whatever is known.
+        combine: How scores of several blocks become one: `sum`, of all groups' parts; `zscore`, each block alone is
+            scored by its own information, less the mean and divided by the standard deviation of the candidates (one
+            that is the same for all counts 0), and these are added up. None: `sum`, but `zscore` where a trace stands
+            beside another block, for their units differ.
+        probes: Random images, or tangents, of each view that the block `deformation` is estimated from.
     Raises:
-        ValueError: If a criterion, method or block is unknown, or something else is of the wrong kind.
+        ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
+            the wrong kind.
     """
 
     criterion: str = CRITERIA[0]
@@ -47,10 +57,15 @@ class Scoring:
     groups: tuple[str, ...] | None = None
     blocks: tuple[Block, ...] | None = None
     semantics: SemanticMetric | None = None
+    network: Network = NETWORKS[0]
+    combine: Combine | None = None
+    probes: int = 16
 
     def __post_init__(self) -> None:
-        for name, known in (("criterion", CRITERIA), ("method", METHODS)):
+        choices = {"criterion": CRITERIA, "method": METHODS, "network": NETWORKS, "combine": (None, *COMBINES)}
+        for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
+                known = [x for x in known if x is not None]
                 raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
         must_be("select", "settings", self.settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')
         must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
@@ -60,24 +75,62 @@ class Scoring:
             object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
         if self.blocks is not None:
             object.__setattr__(self, "blocks", checked_blocks("select", self.blocks, self.method))
+            if self.criterion == "block_logdet" and "deformation" in self.blocks:
+                raise ValueError(
+                    "select: blocks must be geometry or semantic with criterion block_logdet, got deformation; a "
+                    "network has no blocks of single Gaussians, use eig"
+                )
+            self.combined_of(self.blocks)
+        if not (isinstance(self.probes, int) and self.probes >= 1):
+            raise ValueError(f"select: probes must be a whole number >= 1, got {self.probes!r}; try 16")
         if self.semantics is not None:
             must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
 
-    def blocks_of(self, gaussians: Gaussians, where: str = "select") -> tuple[Block, ...]:
-        """The blocks that are scored of a scene, `gaussians` at some time of it.
+    def blocks_of(self, gaussians: Gaussians, where: str = "select", scene: Scene | None = None) -> tuple[Block, ...]:
+        """The blocks that are scored of a scene.
 
+        Args:
+            gaussians: As they are at some time of it.
+            where: For messages.
+            scene: Itself; None: it is these Gaussians, which do not move.
         Raises:
             ValueError: If one is wanted that the scene does not have.
         """
-        there: tuple[Block, ...] = ("geometry",) if gaussians.features is None else BLOCK_NAMES
+        missing = {
+            "semantic": "for Gaussians without features; fit them to a data set with teacher maps"
+            if gaussians.features is None
+            else "",
+            "deformation": "" if scene and network_groups(scene) else "for a scene that no network moves",
+        }
         if self.blocks is None:
-            return there[:1] if self.method == "fisherrf" else there
-        if "semantic" in self.blocks and "semantic" not in there:
-            raise ValueError(
-                f"{where}: blocks must be of what the scene has, got semantic for Gaussians without features; fit "
-                "them to a data set with teacher maps, or use geometry"
-            )
+            if self.method == "fisherrf":
+                return ("geometry",)
+            if self.criterion == "block_logdet":  # which a network has none of
+                del missing["deformation"]
+            there: tuple[Block, ...] = ("semantic", "deformation")
+            return ("geometry", *(block for block in there if missing.get(block) == ""))
+        for block in self.blocks:
+            if missing.get(block):
+                raise ValueError(
+                    f"{where}: blocks must be of what the scene has, got {block} {missing[block]}, or use geometry"
+                )
         return self.blocks
+
+    def combined_of(self, blocks: tuple[Block, ...], where: str = "select") -> Combine:
+        """How the scores of these blocks become one.
+
+        Raises:
+            ValueError: If they cannot be added up as they are asked to be.
+        """
+        traced = "deformation" in blocks and self.network != "ratio"
+        if len(blocks) < 2:
+            return "sum"
+        if traced and self.combine == "sum":
+            raise ValueError(
+                f"{where}: combine must be zscore with network {self.network} beside other blocks, got sum; a trace "
+                "has another unit than their ratios"
+            )
+        return self.combine or ("zscore" if traced else "sum")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +170,9 @@ class Selection:
         notes: What a reader of the result should know, one sentence each.
         blocks: Of which blocks of the image the information is; empty for policies without.
         semantics: What is coupled, if anything is: the metric's estimate, gamma and width.
+        network: How the block `deformation` scored, and from how many probes, if it did.
+        combine: `sum` of the groups' parts, or of blocks' z-scores over the candidates that were left: then scores
+            and parts, `block.group`, are in standard deviations (`unseen` not less the mean).
         seconds: Wall time.
     """
 
@@ -130,6 +186,8 @@ class Selection:
     notes: list[str] = dataclasses.field(default_factory=list)
     blocks: list[str] = dataclasses.field(default_factory=list)
     semantics: dict | None = None
+    network: dict | None = None
+    combine: Combine = "sum"
     seconds: float = 0.0
 
 

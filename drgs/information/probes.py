@@ -1,4 +1,4 @@
-"""The diagonal of J^T J from random images: mean of (J^T v)^2, one reverse pass a probe."""
+"""J^T of a view, and the diagonal of J^T J from it: mean of (J^T v)^2 over random images v, one reverse pass each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
-__all__ = ["by_probes"]
+__all__ = ["Pullback", "by_probes"]
 
 
 @own_errors()
@@ -49,37 +49,65 @@ def by_probes(
     # Without a graph of torch, as in `Replay`.
     seen = gaussians.detach() if semantics else gaussians.detach().replace(features=None)
     call = Call(seen, camera, settings, frozenset(), scene=scene)
-    lib, generator = call.lib, torch.Generator().manual_seed(seed)
-    inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
-    dr.enable_grad([inputs[group.input] for group in groups.values()])
-    compositor, arguments = call.prepare(inputs)
-    # The compositor's adjoint is called by hand: of the graph only what leads to its arguments is recorded.
-    with dr.suspend_grad():
-        record, sh, features, carried = dr.detach(list(arguments))
-        compositor.forward(record, sh, features, carried, keep=True)
-    # Features move where a scene computes them; those of Gaussians are nobody's input here (`groups`).
-    attached = {"record": arguments.record, "sh": arguments.sh, "features": arguments.features if scene else None}
+    generator = torch.Generator().manual_seed(seed)
+    pull = Pullback(call, [group.input for group in groups.values()])
     root = torch.tensor(weights).sqrt()
     for _ in range(probes if groups else 0):
         sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1
-        cotangent = {"rgb": (sign * root).reshape(-1), "alpha": torch.zeros(call.pixels)}
-        if semantics:
-            cotangent["features"] = semantics.cotangent(call.pixels, generator).reshape(-1)
-        g = {name: to_drjit(lib, x.to(call.home)).array for name, x in cotangent.items()}
-        grads = compositor.adjoint(g)
-        found = [(attached[name], grads[name]) for name in attached if attached[name] is not None]
-        for x, slope in found:
-            dr.set_grad(x, slope)
-        dr.enqueue(dr.ADMode.Backward, [x for x, _ in found])
-        # The graph is used again by the next probe.
-        dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+        features = semantics.cotangent(call.pixels, generator) if semantics else None
+        slopes = pull(sign * root, features)
         for name, group in groups.items():
-            slope = dr.grad(inputs[group.input]).torch().double().cpu()
-            total[name] += group.pull(slope, call.inputs[group.input].double().cpu()).square()
-        for group in groups.values():
-            dr.set_grad(inputs[group.input], 0)
+            total[name] += group.pull(slopes[group.input], call.inputs[group.input].double().cpu()).square()
     result = {name: x / probes for name, x in total.items()}
     if other:
         replay = Replay(gaussians, camera, settings, geometry=False, semantics=semantics)
         result |= replay.diagonal(other, weights, False)
     return result
+
+
+class Pullback:
+    """J^T of one view: slopes of inputs along cotangents of its images, any number of times after one traversal."""
+
+    def __init__(self, call: Call, names: Sequence[str]) -> None:
+        """
+        Args:
+            call: Of the view; its scene, if it has one, is where the Gaussians come from.
+            names: Of the call's inputs, those that slopes are wanted of.
+        """
+        self.call, self.names, lib = call, list(names), call.lib
+        self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
+        dr.enable_grad([self.inputs[name] for name in self.names])
+        self.compositor, arguments = call.prepare(self.inputs)
+        # The compositor's adjoint is called by hand: of the graph only what leads to its arguments is recorded.
+        with dr.suspend_grad():
+            record, sh, features, carried = dr.detach(list(arguments))
+            self.compositor.forward(record, sh, features, carried, keep=True)
+        # Features move where a scene computes them; those of Gaussians are nobody's input here (`groups`).
+        moving = arguments.features if call.field else None
+        self.attached = {"record": arguments.record, "sh": arguments.sh, "features": moving}
+
+    def __call__(self, rgb: torch.Tensor, features: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Float64 slopes on the CPU, by name.
+
+        Args:
+            rgb: (pixels, 3) float32 cotangent.
+            features: (pixels, D) likewise; None where it is 0, or there are none.
+        """
+        call = self.call
+        cotangent = {"rgb": rgb.reshape(-1), "alpha": torch.zeros(call.pixels)}
+        if features is not None:
+            cotangent["features"] = features.reshape(-1)
+        elif call.width:
+            cotangent["features"] = torch.zeros(call.pixels * call.width)
+        grads = self.compositor.adjoint({n: to_drjit(call.lib, x.to(call.home)).array for n, x in cotangent.items()})
+        found = [(x, grads[name]) for name, x in self.attached.items() if x is not None]
+        for x, slope in found:
+            dr.set_grad(x, slope)
+        dr.enqueue(dr.ADMode.Backward, [x for x, _ in found])
+        # The graph is used again by the next cotangent.
+        dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+        # Copies: what Dr.Jit and torch share is reset for the next cotangent.
+        slopes = {name: dr.grad(self.inputs[name]).torch().double().cpu().clone() for name in self.names}
+        for name in self.names:
+            dr.set_grad(self.inputs[name], 0)
+        return slopes

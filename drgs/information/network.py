@@ -1,0 +1,345 @@
+"""Fisher information of a view about the network that moves a scene's Gaussians, by random probes.
+
+phi, the network's parameters, is the scene's tensors named `phi.grid.*` and `phi.mlp.*`. The image's rows are its
+colors and, with semantics, its decoded features, each divided by its noise; J is their Jacobian by phi, through the
+Gaussians at the time of the view, and H = J^T J. A parameter of phi moves many Gaussians, so nothing is exact that is
+cheap:
+
+    diagonal   mean of (J^T u)^2, u random signs in every row: the diagonal of H [1]; relative error of an entry
+               sqrt(2 / probes)
+    trace      mean of |J^T u|^2 (reverse mode: the diagonal's sum) or of |J v|^2 (forward mode), v random signs in
+               every parameter: tr H
+    paper      mean of |H v|^2, the estimator that [2] states: tr(H^2), not tr H
+
+Each by group: `grid` and `mlp`. Of `paper`, a group's part is the sum over its rows of H, whose columns are all of
+phi, so that the parts add up to tr(H^2).
+
+The random signs are the same in each view. Then equal views say the same, a candidate that repeats a known view has a
+ratio of at most 1 as it should, and a cache may keep what was estimated. 1 / H is too large on average by a factor of
+about K / (K - 2) where one view of K probes is all that is known of a parameter: take 8 or more.
+
+References:
+    [1] Bekas, Kokiopoulou, Saad: An estimator for the diagonal of a matrix, 2007; Hutchinson 1990 for the trace.
+    [2] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771, section 3.3.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from drgs.cameras import Camera
+from drgs.guards.arguments import must_be
+from drgs.guards.doors import camera_list, check_any_scene, check_view, gaussians_at
+from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
+from drgs.information.network_groups import NETWORK_GROUPS, network_groups
+from drgs.information.probes import Pullback
+from drgs.runtime import alone
+from drgs.settings import RenderSettings
+from drgs.tracing.bridge import own_errors
+from drgs.tracing.call import Call
+from drgs.tracing.tangents import push_forward
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import DeformableScene, Gaussians, Scene
+    from drgs.gain import Information
+    from drgs.information.semantics import SemanticMetric
+
+__all__ = ["network", "network_variance_map"]
+
+_FLOATS = 1 << 24  # of the tangents that one traversal carries, or of their images
+_BATCH = 16  # tangents of one traversal
+
+
+@alone
+def network(
+    scene: Scene,
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    *,
+    estimate: NetworkEstimate = "diagonal",
+    mode: str = "reverse",
+    probes: int = 16,
+    seed: int = 0,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
+) -> Information:
+    """What views say about a scene's deformation network, summed over views; an estimate.
+
+    Args:
+        scene: A `drgs.ellipsoids.DeformableScene` with parameters named `phi.grid.*` or `phi.mlp.*`.
+        cameras: One or several; each has a time.
+        settings: Default `RenderSettings.preset("exact")`.
+        estimate: `diagonal`, `trace` or `paper`, see the module's text.
+        mode: Of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one traversal.
+            `diagonal` has reverse mode only, `paper` needs both.
+        probes: K, of each view; the error falls as 1 / sqrt(K).
+        seed: Of the random signs, the same in all views.
+        channel_weights: Inverse noise variances of R, G and B.
+        semantics: The metric in which decoded features tell, too; its `estimate` says how many channels they take.
+    Returns:
+        Group (`grid`, `mlp`; those that there are) -> float64 on the CPU: (P,) of its P parameters in the order of
+        `scene.parameters()`, of `trace` and `paper` a number ().
+    Raises:
+        ValueError: If the scene has no such parameters, a name is unknown or a number out of range.
+    """
+    where = "fisher.network"
+    groups = _checked(where, scene, estimate, mode, probes)
+    total = {name: torch.zeros(_size(own) if estimate == "diagonal" else (), dtype=torch.float64)
+             for name, own in groups.items()}  # fmt: skip
+    for camera in _cameras(where, cameras):
+        view = _View.of(where, scene, camera, settings, channel_weights, semantics)
+        if view is None:
+            continue
+        with own_errors():
+            for part in _ESTIMATORS[estimate, mode](view, groups, probes, torch.Generator().manual_seed(seed)):
+                for name, x in part.items():
+                    total[name] += x
+    return {name: x / probes for name, x in total.items()}
+
+
+@alone
+def network_variance_map(
+    scene: Scene,
+    camera: Camera,
+    weights: Information,
+    settings: RenderSettings | None = None,
+    *,
+    probes: int = 16,
+    seed: int = 0,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
+) -> torch.Tensor:
+    """(H, W) float32: an estimate of the sum over rows of a pixel and parameters k of phi of J_pk^2 weights_k.
+
+    With weights 1 / (H_k + lambda) this is the predictive variance of a pixel because of the deformation. It is the
+    mean of (J v)^2 over v = z sqrt(weights), z random signs: forward mode.
+
+    Args:
+        scene, camera, settings, probes, seed, channel_weights, semantics: As for `network`; a pixel of n rows has a
+            relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
+        weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
+    """
+    where = "fisher.network_variance_map"
+    groups = _checked(where, scene, "diagonal", "reverse", probes)
+    must_be(where, "weights", weights, Mapping, "group -> tensor, as fisher.network returns")
+    for name, x in weights.items():
+        if name not in groups:
+            raise ValueError(f"{where}: weights must be of {', '.join(groups)}, got {name!r}; drop it")
+        size = _size(groups[name])
+        if tuple(x.shape) != (size,):
+            raise ValueError(f"{where}: weights of {name} must have shape ({size},), got {tuple(x.shape)}")
+        if not bool((torch.isfinite(x) & (x >= 0)).all()):
+            raise ValueError(f"{where}: weights of {name} must be finite and >= 0, got others; raise lambda above 0")
+    view = _View.of(where, scene, camera, settings, channel_weights, semantics)
+    total = torch.zeros(camera.height * camera.width, dtype=torch.float64)
+    if view is None or not weights:
+        return total.float().reshape(camera.height, camera.width)
+    roots = {name: x.double().cpu().sqrt() for name, x in weights.items()}
+    generator = torch.Generator().manual_seed(seed)
+    with own_errors():
+        for count in view.batches(groups, probes):
+            tangents: dict[str, torch.Tensor] = {}
+            for name, root in roots.items():
+                tangents |= _unflat(groups[name], _signs(generator, count, len(root)) * root)
+            total += view.push(tangents).square().sum((0, 2))
+    return (total / probes).float().reshape(camera.height, camera.width)
+
+
+Groups = Mapping[str, Mapping[str, torch.Tensor]]  # group -> name -> parameter
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _View:
+    """The rows of a view's image, each divided by its noise, as a function of phi.
+
+    Attributes:
+        call: Of the view.
+        scales: (C,) what the call's channels are multiplied by: colors, then semantic channels.
+    """
+
+    call: Call
+    scales: torch.Tensor
+
+    @classmethod
+    def of(
+        cls,
+        where: str,
+        scene: Scene,
+        camera: Camera,
+        settings: RenderSettings | None,
+        channel_weights: Sequence[float],
+        semantics: SemanticMetric | None,
+    ) -> _View | None:
+        """Of a scene at the time of a camera; None if there is nothing to see."""
+        with torch.no_grad():  # derivatives are taken from Dr.Jit's side
+            seen = gaussians_at(where, scene, camera)
+        check_view(where, seen, camera, settings)
+        if not len(seen) or not camera.width * camera.height:
+            return None
+        scales = _channel_scales(where, channel_weights)
+        deformed: DeformableScene = scene
+        if semantics is None:
+            seen = seen.replace(features=None)
+        else:
+            semantics.check(where, seen)
+            assert seen.features is not None  # `check` has refused it
+            # Squares of few channels add up to those of all decoded ones, in one traversal.
+            directions = semantics.directions(seen.features)
+            deformed = _Reduced(scene, directions)
+            seen = deformed.reduced(seen)
+            scales = torch.cat([scales, torch.full((directions.shape[1],), semantics.weight**0.5)])
+        settings = settings or RenderSettings.preset("exact")
+        return cls(Call(seen.detach(), camera, settings, frozenset(), scene=deformed), scales)
+
+    @property
+    def rows(self) -> int:
+        """C, rows of a pixel."""
+        return len(self.scales)
+
+    def pullback(self, groups: Groups) -> Pullback:
+        """J^T of it; see `pulled`."""
+        return Pullback(self.call, [name for own in groups.values() for name in own])
+
+    def pulled(self, pull: Pullback, groups: Groups, rows: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Group -> (P,) slopes along (pixels, C) rows."""
+        scaled = (rows * self.scales).float()
+        slopes = pull(scaled[:, :3], scaled[:, 3:] if self.rows > 3 else None)
+        return {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
+
+    def push(self, tangents: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """(K, pixels, C) float64 tangents of the rows, along (K, ...) tangents of phi by name."""
+        out = push_forward(self.call, dict(tangents))
+        rows = out.rgb if out.features is None else torch.cat([out.rgb, out.features], -1)
+        return rows.double().cpu().flatten(1, 2) * self.scales
+
+    def batches(self, groups: Groups, count: int) -> Iterator[int]:
+        """How many of `count` tangents are carried through each traversal."""
+        largest = max(self.call.pixels * self.rows, sum(_size(own) for own in groups.values()))
+        step = max(1, min(_BATCH, _FLOATS // largest))
+        return iter([min(step, count - start) for start in range(0, count, step)])
+
+
+class _Reduced:
+    """A scene whose features are replaced by a few channels of them."""
+
+    def __init__(self, scene: DeformableScene, directions: torch.Tensor) -> None:
+        self.scene, self.directions = scene, directions
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """Those of the scene."""
+        return self.scene.parameters()
+
+    def at(self, time: float | None) -> Gaussians:
+        """As the scene, reduced."""
+        return self.reduced(self.scene.at(time))
+
+    def deform(self, parameters: dict[str, torch.Tensor], time: float | None) -> Gaussians:
+        """As the scene, reduced."""
+        return self.reduced(self.scene.deform(parameters, time))
+
+    def reduced(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians with (N, K) channels for features."""
+        assert gaussians.features is not None  # those of the views have some
+        features = gaussians.features
+        return gaussians.replace(features=features @ self.directions.to(features.device, features.dtype))
+
+
+# -------------------------------------------------- estimators: what each probe adds, by group
+
+
+def _diagonal(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
+    pull = view.pullback(groups)
+    for _ in range(probes):
+        slopes = view.pulled(pull, groups, _signs(generator, view.call.pixels, view.rows))
+        yield {name: x.square() for name, x in slopes.items()}
+
+
+def _trace_reverse(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
+    for part in _diagonal(view, groups, probes, generator):
+        yield {name: x.sum() for name, x in part.items()}
+
+
+def _trace_forward(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
+    for name, own in groups.items():
+        for count in view.batches(groups, probes):
+            yield {name: view.push(_unflat(own, _signs(generator, count, _size(own)))).square().sum()}
+
+
+def _paper(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
+    pull = view.pullback(groups)
+    for count in view.batches(groups, probes):
+        tangents: dict[str, torch.Tensor] = {}
+        for own in groups.values():
+            tangents |= _unflat(own, _signs(generator, count, _size(own)))
+        for rows in view.push(tangents):
+            yield {name: x.square().sum() for name, x in view.pulled(pull, groups, rows).items()}
+
+
+_ESTIMATORS = {
+    ("diagonal", "reverse"): _diagonal,
+    ("trace", "reverse"): _trace_reverse,
+    ("trace", "forward"): _trace_forward,
+    ("paper", "reverse"): _paper,
+}
+
+
+def _signs(generator: torch.Generator, *shape: int) -> torch.Tensor:
+    """-1 or 1, float64."""
+    return torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
+
+
+def _size(own: Mapping[str, torch.Tensor]) -> int:
+    return sum(x.numel() for x in own.values())
+
+
+def _unflat(own: Mapping[str, torch.Tensor], rows: torch.Tensor) -> dict[str, torch.Tensor]:
+    """(K, P) rows as tensors (K, ...) by name."""
+    parts = rows.split([x.numel() for x in own.values()], 1)
+    return {name: part.reshape(len(rows), *x.shape) for (name, x), part in zip(own.items(), parts, strict=True)}
+
+
+# -------------------------------------------------- arguments
+
+
+def _checked(where: str, scene: Scene, estimate: str, mode: str, probes: int) -> Groups:
+    """The scene's groups, if all else is right, too."""
+    check_any_scene(where, scene)
+    if estimate not in NETWORK_ESTIMATES:
+        known = ", ".join(NETWORK_ESTIMATES)
+        raise ValueError(f"{where}: estimate must be one of {known}, got {estimate!r}; choose one")
+    modes = [known for name, known in _ESTIMATORS if name == estimate]
+    if mode not in modes:
+        raise ValueError(f"{where}: mode of estimate {estimate!r} must be {' or '.join(modes)}, got {mode!r}; use that")
+    if not (isinstance(probes, int) and probes >= 1):
+        raise ValueError(f"{where}: probes must be a whole number >= 1, got {probes!r}; try 16")
+    groups = network_groups(scene)
+    if not groups:
+        beginnings = " or ".join(f"{prefix}*" for prefix in NETWORK_GROUPS.values())
+        raise ValueError(
+            f"{where}: scene must have float parameters named {beginnings}, has none; use fisher.diagonal for those of "
+            "Gaussians and of other networks"
+        )
+    return groups
+
+
+def _cameras(where: str, cameras: object) -> list[Camera]:
+    found = camera_list(where, "cameras", cameras)
+    if not found:
+        raise ValueError(f"{where}: there must be at least one camera, got none; pass one or more")
+    return found
+
+
+def _channel_scales(where: str, weights: Sequence[float]) -> torch.Tensor:
+    """(3,) float64 square roots of the weights."""
+    try:
+        values = [float(x) for x in weights]
+    except (TypeError, ValueError):
+        values = []
+    if len(values) != 3 or not all(math.isfinite(x) and x >= 0 for x in values):
+        raise ValueError(f"{where}: channel_weights must be 3 finite numbers >= 0, got {weights}; e.g. (1, 1, 1)")
+    return torch.tensor(values, dtype=torch.float64).sqrt()

@@ -1,0 +1,34 @@
+"""Groups of a deformation network's parameters: by the beginnings of their names, whatever the network is made of.
+
+The sibling of groups.py, whose groups are entries of Gaussians. A scene that moves names the parameters of its network
+`phi.grid.*` and `phi.mlp.*`; all that a group holds is one flat vector of information, in the order of
+`Scene.parameters()`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from drgs.ellipsoids import DeformableScene
+
+if TYPE_CHECKING:
+    import torch
+
+    from drgs.ellipsoids import Scene
+
+__all__ = ["NETWORK_GROUPS", "network_groups"]
+
+NETWORK_GROUPS = {"grid": "phi.grid.", "mlp": "phi.mlp."}
+"""Group -> what the names of its parameters begin with."""
+
+
+def network_groups(scene: Scene) -> dict[str, dict[str, torch.Tensor]]:
+    """Group -> the scene's float tensors by name; groups without any are left out, so that most scenes have none."""
+    if not isinstance(scene, DeformableScene):
+        return {}
+    floats = {name: x for name, x in scene.parameters().items() if x.is_floating_point()}
+    found = {
+        group: {name: x for name, x in floats.items() if name.startswith(prefix)}
+        for group, prefix in NETWORK_GROUPS.items()
+    }
+    return {group: own for group, own in found.items() if own}
