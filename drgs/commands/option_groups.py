@@ -11,7 +11,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from drgs.commands.overrides import parsed
 from drgs.fitting.config import ActiveConfig, Dynamics, FeatureSize, FieldPreset, FitConfig, SemanticUse
-from drgs.information.choices import Block, Criterion, Method, Policy
+from drgs.information.choices import Block, Combine, Criterion, Method, Network, Policy
 from drgs.settings import Preset, RenderSettings
 
 __all__ = ["Around", "Choosing", "Common", "Data", "Informed", "Moving", "OutputPath", "Settings", "Split", "Taught"]
@@ -118,7 +118,9 @@ class Informed(Settings):
     info_pixels: int | None = ActiveConfig.info_pixels
     """Information is computed on views of at most this many pixels; default as in the fit."""
     blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
-    """What of an image tells: geometry (its colors), semantic (its features), or geometry,semantic; default all."""
+    """What of an image tells: geometry (its colors), semantic (its features), deformation (about what moves); all."""
+    probes: int = ActiveConfig.probes
+    """Random probes of each view for what it tells about a deformation field."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,6 +131,10 @@ class Choosing(Informed):
     """How the next view is chosen (docs/information.md)."""
     criterion: Criterion = ActiveConfig.criterion
     """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
+    network: Network = ActiveConfig.network
+    """How the block deformation scores: against what known views say of the field (ratio), or by a trace without it."""
+    combine: Combine | None = ActiveConfig.combine
+    """Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace."""
     seed: int = 0
     """Seed of everything random."""
 

@@ -7,7 +7,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from drgs.guards.arguments import check_fields, must_be
-from drgs.information.choices import Block, Criterion, Method, Policy, checked_blocks
+from drgs.information.choices import Block, Combine, Criterion, Method, Network, Policy, checked_blocks
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -238,7 +238,8 @@ class ActiveConfig:
             Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
             evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
             initial points of the whole data set, else `uncovered`.
-        blocks: What of an image counts in policy `fisher`, as in `drgs.select.Scoring`; None: all that the fit has.
+        blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
+            None: all that the fit has.
     """
 
     policy: Policy = "fisher"
@@ -253,6 +254,9 @@ class ActiveConfig:
     relative_prior: bool = False
     pick_points: PickPoints = "auto"
     blocks: tuple[Block, ...] | None = None
+    network: Network = "ratio"
+    combine: Combine | None = None
+    probes: int = 16
 
     def __post_init__(self) -> None:
         from drgs.gain import Prior
@@ -262,7 +266,7 @@ class ActiveConfig:
         if self.blocks is not None:
             object.__setattr__(self, "blocks", checked_blocks("active", self.blocks, self.method))
         count = (1, 10**9)
-        ranges = {"initial": count, "add": count, "every": count, "info_pixels": count}
+        ranges = dict.fromkeys(("initial", "add", "every", "info_pixels", "probes"), count)
         check_fields("active", self, ranges)
         Prior(value=self.prior)
 
@@ -278,6 +282,9 @@ class ActiveConfig:
             prior=Prior(value=self.prior, relative=self.relative_prior),
             blocks=self.blocks,
             semantics=semantics,
+            network=self.network,
+            combine=self.combine,
+            probes=self.probes,
         )
 
     def to_json(self) -> dict:
