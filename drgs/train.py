@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from drgs import metrics, runtime
-from drgs.data.views import check_parallax
+from drgs.data.view_checks import check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
@@ -111,7 +111,7 @@ def _fit(
     resume: bool,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
-    train, test = dataset.split(config.test_every, config.test_offset)
+    train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
     if train:
         check_parallax(train)
     plan = ActiveViews(active, train, config) if active else None

@@ -14,7 +14,8 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
-from drgs.data.views import View, check_parallax
+from drgs.data.view_checks import check_parallax
+from drgs.data.views import View
 from drgs.display import pictures
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig

@@ -14,7 +14,8 @@ from test_data import write_transforms
 from drgs.cameras import Camera, orbit
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
-from drgs.data.views import View, check_parallax
+from drgs.data.view_checks import check_parallax
+from drgs.data.views import View
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.frames import load_frames
 from drgs.guards.arguments import ArgumentError

@@ -39,6 +39,8 @@ def run(args: Eval) -> None:
         recorded.data,
         test_every=config.test_every,
         test_offset=config.test_offset,
+        times=config.times,
+        test_cameras=config.test_cameras,
         background=config.settings.background,
         lazy=recorded.is_active,
         points=False,

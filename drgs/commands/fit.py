@@ -29,6 +29,8 @@ def run(args: Fit) -> None:
         args.data,
         test_every=config.test_every,
         test_offset=config.test_offset,
+        times=config.times,
+        test_cameras=config.test_cameras,
         background=config.settings.background,
         lazy=active is not None,
         points=active is None or config.init_points == "all",

@@ -14,7 +14,19 @@ from drgs.fitting.config import ActiveConfig, Dynamics, FeatureSize, FieldPreset
 from drgs.information.choices import Block, Combine, Criterion, Method, Network, Policy
 from drgs.settings import Preset, RenderSettings
 
-__all__ = ["Around", "Choosing", "Common", "Data", "Informed", "Moving", "OutputPath", "Settings", "Split", "Taught"]
+__all__ = [
+    "Around",
+    "Choosing",
+    "Common",
+    "Data",
+    "Informed",
+    "Moving",
+    "OutputPath",
+    "Settings",
+    "Split",
+    "Taught",
+    "Views",
+]
 
 OutputPath = Annotated[Path, arg(aliases=["-o"])]
 Split = Literal["all", "train", "test"]
@@ -27,12 +39,13 @@ _BLOCKS: Any = PrimitiveConstructorSpec(
     is_instance=lambda x: x is None or isinstance(x, tuple),
     str_from_instance=lambda x: ["all there is" if x is None else ",".join(x)],
 )
+# One text, `cam00,cam05`; `none` is the empty tuple.
 _CAMERAS: Any = PrimitiveConstructorSpec(
     nargs=1,
-    metavar="CAMERA,CAMERA",
-    instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
+    metavar="CAMERA,CAMERA|none",
+    instance_from_str=lambda texts: () if texts[0] == "none" else tuple(name.strip() for name in texts[0].split(",")),
     is_instance=lambda x: x is None or isinstance(x, tuple),
-    str_from_instance=lambda x: ["the first" if x is None else ",".join(x)],
+    str_from_instance=lambda x: ["the first" if x is None else ",".join(x) or "none"],
 )
 
 
@@ -85,6 +98,16 @@ class Data:
 
     strict: bool = False
     """Refuse a data set that lists images which are not there; else at least 3 must be, and the others are left out."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Views(Data):
+    """Options of commands that load data sets to take some of their views."""
+
+    times: int | None = None
+    """Of videos, how many synchronous frames of each are used, evenly over their length; default as a run, else 40."""
+    test_cameras: Annotated[tuple[str, ...] | None, _CAMERAS] = None
+    """Cameras of videos that are held out at all times (cam00,cam05), or none; default as a run, else the first."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

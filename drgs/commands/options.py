@@ -23,6 +23,7 @@ from drgs.commands.option_groups import (
     Settings,
     Split,
     Taught,
+    Views,
 )
 from drgs.commands.overrides import check_color
 from drgs.fitting.config import (
@@ -63,7 +64,7 @@ class Info(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(Settings, Around, Data):
+class Render(Settings, Around, Views):
     """Render a Gaussian PLY, or a finished run, to pictures or a video."""
 
     scene: Positional[Path]
@@ -169,7 +170,7 @@ class Fit(Choosing, Data, Taught, Moving):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Views(Informed, Around, Data):
+class _Views(Informed, Around, Views):
     """Options of commands that compare views with known ones."""
 
     scene: Positional[Path]
@@ -211,7 +212,7 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seen(Settings, Around, Data):
+class _Seen(Settings, Around, Views):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Positional[Path]
@@ -263,7 +264,7 @@ class Tradeoff(_Seen):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Settings, Around, Data):
+class Query(Settings, Around, Views):
     """Find what a text means: masks of views, and a PLY of the Gaussians that are it, or of all others."""
 
     scene: Positional[Path]

@@ -22,11 +22,13 @@ from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_di
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.data.sizes import at_most, resized_alike
 from drgs.files import Run
+from drgs.fitting.config import FitConfig
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.given import Given
+    from drgs.commands.option_groups import Views
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
     from drgs.data import Dataset, View
 
@@ -90,8 +92,9 @@ class Source:
         """The cameras of a cameras.json."""
         return load_cameras_json(Path(self.text))
 
-    def dataset(self, strict: bool, lazy: bool = True) -> Dataset:
-        """The data set, or that of a run, without points, maps and labels.
+    def dataset(self, args: Views, given: Given, lazy: bool = True) -> Dataset:
+        """The data set, or that of a run, without points, maps and labels; of videos, the frames and test cameras that
+        `args` names, else those of the run that is named, else of the run that is looked at.
 
         Raises:
             FileNotFoundError, ValueError: If there is none, or a run's is no longer where it was.
@@ -100,7 +103,16 @@ class Source:
         if self.record is not None:
             self.record.check_data(place, f"name cameras with {self.option}")
             place = self.record.data
-        return data.load(place, lazy=lazy, points=False, strict=strict, semantics=False)
+        config = record.config if (record := self.record or given.record) else FitConfig()
+        return data.load(
+            place,
+            lazy=lazy,
+            points=False,
+            strict=args.strict,
+            semantics=False,
+            times=config.times if args.times is None else args.times,
+            test_cameras=config.test_cameras if args.test_cameras is None else args.test_cameras,
+        )
 
     def split(self, dataset: Dataset, part: str, given: Given) -> list[View]:
         """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of
@@ -149,7 +161,7 @@ def drawn_views(
         return _drawn_orbit(args, given, frames, size, returns)
     if source.kind == "list":
         return source.listed(), str(Path(text))
-    views = source.split(source.dataset(args.strict, lazy=False), args.split, given)
+    views = source.split(source.dataset(args, given, lazy=False), args.split, given)
     return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{Path(text)} ({args.split})"
 
 
@@ -192,7 +204,9 @@ def _captured(given: Given) -> list[Camera]:
         return []
     try:
         names = set(fitted_views(given.run))
-        views = data.load(given.record.data, lazy=True, points=False, semantics=False).views
+        views = data.load(
+            given.record.data, lazy=True, points=False, semantics=False, times=given.record.config.times
+        ).views
     except (ValueError, OSError, KeyError):
         return []
     return [view.camera.undistorted() for view in views if view.name in names]
@@ -245,7 +259,7 @@ def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
     where = str(Path(source.text))
     if source.kind == "list":
         return Known([at_most(camera, pixels) for camera in source.listed()], where, pixels)
-    views = source.dataset(args.strict).views
+    views = source.dataset(args, given).views
     if source.kind == "data":
         cameras = [_camera(view, {}, pixels) for view in views]
         return Known(cameras, where, pixels, Path(source.text).resolve())
@@ -289,7 +303,7 @@ def other_views(
         return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
     if source.kind == "list":
         return [at_most(camera, known.pixels) for camera in source.listed()], text
-    views = source.split(source.dataset(args.strict), args.split, given)
+    views = source.split(source.dataset(args, given), args.split, given)
     same = (source.record.data if source.kind == "run" else Path(text)).resolve() == known.data
     used = {camera.name for camera in known.cameras} if same and fresh else set()
     left = [view for view in views if view.name not in used]

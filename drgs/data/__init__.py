@@ -30,6 +30,8 @@ def load(
     points: bool = True,
     strict: bool = False,
     semantics: bool = True,
+    times: int = 40,
+    test_cameras: tuple[str, ...] | None = None,
 ) -> Dataset:
     """Load a data set; its format is found out from its files. No image is decoded.
 
@@ -51,6 +53,10 @@ def load(
         strict: refuse a data set that lists images which are not there. By default at least 3 must be left; the
             missing ones are named in the log and held in `Dataset.absent`.
         semantics: look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
+        times: how many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
+            if there are no more.
+        test_cameras: names of synchronous cameras that `Dataset.split` holds out at all times, which wins over
+            `test_every`; None: those that the format holds out; empty: none.
 
     Raises:
         FileNotFoundError: nothing there, photos without poses, or too few of the photos.
@@ -74,9 +80,17 @@ def load(
         loader = load_replica
     else:
         raise _nothing_found(path)
-    held_out = {"test_every": test_every, "test_offset": test_offset}
+    if isinstance(times, bool) or not isinstance(times, int) or times < 1:
+        raise ValueError(f"load: times must be a whole number >= 1, got {times!r}; correct it")
+    if isinstance(test_cameras, str):
+        raise ValueError(
+            f"load: test_cameras must be a tuple of names, got {test_cameras!r}; write ({test_cameras!r},)"
+        )
+    held_out = {"test_every": test_every, "test_offset": test_offset, "times": times}
     dataset = loader(path, background=background, lazy=lazy, points=points, strict=strict, **held_out)
     dataset.test_every, dataset.test_offset = test_every, test_offset
+    if test_cameras is not None:
+        dataset.test_cameras = tuple(test_cameras)
     dataset.split()  # refuses numbers that cannot be
     if semantics:
         attach(dataset, lazy)

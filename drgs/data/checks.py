@@ -25,6 +25,7 @@ __all__ = [
     "image_size",
     "inverse_pose",
     "list_images",
+    "native_stderr",
     "read_image",
     "read_npy",
     "read_text",
@@ -36,9 +37,10 @@ _MAX_NPY_HEADER = 65536
 _MAX_PIXELS = 2**31
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
 _ROUNDING = 1e-2
-# What OpenCV, libpng, libjpeg and libtiff begin their lines with; OpenCV ends some with an empty one.
+# What OpenCV, libpng, libjpeg, libtiff and FFmpeg begin their lines with; OpenCV ends some with an empty one.
 _DECODER = re.compile(
-    rb"^\[ *(WARN|ERROR|INFO)|^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$", re.IGNORECASE
+    rb"^\[ *(WARN|ERROR|INFO)|^\[[\w, ]+ @ 0x|^OpenCV|^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$",
+    re.IGNORECASE,
 )
 
 _log = logging.getLogger(__name__)
@@ -154,7 +156,7 @@ def read_image(path: Path) -> np.ndarray:
         width, height = image_size(path)
         what = f"its {width}x{height} pixels"  # 8 bits and 3 channels, decoded and in the order of RGB
         memory.require(f"{path}", 6 * width * height, what, "reduce the image, and w, h, fl_x, ... with it")
-    with _native_stderr() as complaints:
+    with native_stderr() as complaints:
         try:
             data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         except cv2.error:
@@ -181,7 +183,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _native_stderr() -> Iterator[list[str]]:
+def native_stderr() -> Iterator[list[str]]:
     """Collect the lines that decoders print on stderr, for one message of ours in their place.
 
     What others print meanwhile, such as a progress line of another thread, is passed on.

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
+from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
+from drgs.data.views import Dataset, View
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 

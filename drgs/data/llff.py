@@ -10,7 +10,8 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import inverse_pose, list_images, read_npy
-from drgs.data.views import Dataset, View, fit_to_image, make_unique
+from drgs.data.view_checks import fit_to_image, make_unique
+from drgs.data.views import Dataset, View
 
 __all__ = ["load_llff"]
 

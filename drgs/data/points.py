@@ -93,7 +93,7 @@ def initial_points(
             used = sum(view.depth_path is not None for view in views)
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
-    if len(views) >= 2 and all(view.image_path is not None for view in views):
+    if len(views) >= 2 and all(view.has_image for view in views):
         points, colors, _ = _triangulated(views, Matches(), progress)
         if len(points) >= _MIN_TRIANGULATED:
             keep = _subset(len(points), max_points, rng)
@@ -224,7 +224,7 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
         step = max(1.0, len(pixels) / share)
         chosen = pixels[np.arange(rng.uniform(0, min(step, len(pixels))), len(pixels), step).astype(np.int64)]
         points.append(_back_project(view.camera, chosen, depth.reshape(-1)[chosen]))
-        if view.image_path is None:
+        if not view.has_image:
             colors.append(np.full((len(chosen), 3), 0.5, dtype=np.float32))
         else:
             colors.append(view.image().reshape(-1, 3)[chosen])
@@ -308,7 +308,7 @@ def _random(views: list[View], count: int, rng: np.random.Generator) -> tuple[np
         points.append(_back_project(camera, pixels, depth))
         view = views[index]
         gray = np.full((number, 3), 0.5, dtype=np.float32)
-        colors.append(gray if view.image_path is None else view.image().reshape(-1, 3)[pixels])
+        colors.append(view.image().reshape(-1, 3)[pixels] if view.has_image else gray)
     if not points:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
     points, colors = np.concatenate(points), np.concatenate(colors)

@@ -13,7 +13,8 @@ import numpy as np
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, repaired_pose
 from drgs.data.points import read_point_ply
-from drgs.data.views import Dataset, View, fit_to_image, go_on_without, make_unique
+from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
+from drgs.data.views import Dataset, View
 from drgs.guards.json_files import check_json, read_json
 
 __all__ = ["find_transforms", "load_transforms"]
@@ -48,6 +49,7 @@ def load_transforms(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
+    **_,
 ) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 

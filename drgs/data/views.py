@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,21 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.checks import image_size, read_image, read_npy
+from drgs.data.checks import read_image, read_npy
 from drgs.data.semantics import Semantics, plain_labels
 from drgs.data.splits import SplitRule
 from drgs.data.undistortion import lens_maps, undistorted_map
+from drgs.data.videos import VideoFrame
+from drgs.data.view_checks import ASPECT_TOLERANCE, fit_to_image
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Dataset", "View", "check_parallax", "fit_to_image", "go_on_without", "make_unique"]
-
-_ASPECT_TOLERANCE = 0.01
-_FEWEST = 3  # images that a data set must have where others are missing
-_SHOWN = 5  # of those are named at once
-
-_log = logging.getLogger(__name__)
+__all__ = ["Dataset", "View"]
 
 
 @dataclass
@@ -43,6 +38,9 @@ class View:
         label_path: image of the class of each pixel, or None.
         teacher_path: feature map of a teacher, or None.
         semantics: what their numbers mean, as in the data set; None without.
+        camera_name: of the camera that took it, where a data set has several synchronous cameras, as ``cam03``; else
+            empty.
+        frame: the frame of a video, where the photograph is one; `image_path` is None then.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
@@ -58,6 +56,13 @@ class View:
     label_path: Path | None = None
     teacher_path: Path | None = None
     semantics: Semantics | None = dataclasses.field(default=None, repr=False)
+    camera_name: str = ""
+    frame: VideoFrame | None = None
+
+    @property
+    def has_image(self) -> bool:
+        """Whether there is a photograph to be read, be it a file or a frame of a video."""
+        return self.image_path is not None or self.frame is not None
 
     def checked(self) -> View:
         """The view with its camera at the size of its image file, whose header is read now if it has not been.
@@ -85,10 +90,14 @@ class View:
         """
         import cv2
 
-        if self.image_path is None:
+        if self.frame is not None:
+            data, path = self.frame.read(), self.frame.path
+        elif self.image_path is not None:
+            data, path = read_image(self.image_path), self.image_path
+        else:
             raise ValueError(f"view {self.name!r}: must have an image, has none; drop this view")
-        data = _unit_range(read_image(self.image_path), self.image_path)
-        self._check_size(data, self.image_path)
+        data = _unit_range(data, path)
+        self._check_size(data, path)
         if data.ndim == 2:
             data = np.repeat(data[..., None], 3, axis=2)
         if data.shape[2] == 4:
@@ -201,7 +210,7 @@ class View:
         import cv2
 
         height, width = data.shape
-        if abs(width * self.camera.height / (height * self.camera.width) - 1) > _ASPECT_TOLERANCE:
+        if abs(width * self.camera.height / (height * self.camera.width) - 1) > ASPECT_TOLERANCE:
             raise ValueError(
                 f"{path}: must have the shape of its image "
                 f"({self.camera.width}x{self.camera.height}), "
@@ -222,7 +231,7 @@ class Dataset:
 
     Attributes:
         path: what was loaded.
-        format: ``colmap``, ``transforms`` or ``llff``.
+        format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras`` or ``train_meta``.
         views: in the order of the data set.
         points: (P,3) float64 world points, or None.
         colors: (P,3) float32 in [0,1], or None.
@@ -232,6 +241,10 @@ class Dataset:
         absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
             alone, which therefore stays the same whatever is missing.
         semantics: a teacher's maps, labels and classes, or None where there are none.
+        test_cameras: names of the cameras that are held out at all times, which wins over the other rules; None or
+            empty: the other rules hold.
+        frames: numbers of the frames that were used, the same of each video or camera, one for each of `times`; empty
+            where there are no synchronous cameras.
     """
 
     path: Path
@@ -244,128 +257,66 @@ class Dataset:
     absent: list[View] = dataclasses.field(default_factory=list)
     test_offset: int = 0
     semantics: Semantics | None = None
+    test_cameras: tuple[str, ...] | None = None
+    frames: tuple[int, ...] = ()
 
-    def split(self, test_every: int | None = None, test_offset: int | None = None) -> tuple[list[View], list[View]]:
+    @property
+    def times(self) -> tuple[float, ...]:
+        """The distinct times of the views, ascending; empty if none has one."""
+        return _times(self.views)
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether the training views were taken at two times or more."""
+        return len(_times(self.split()[0])) >= 2
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The names of synchronous cameras, sorted; empty where views are photographs of their own."""
+        return tuple(sorted({view.camera_name for view in (*self.views, *self.absent)} - {""}))
+
+    def split(
+        self,
+        test_every: int | None = None,
+        test_offset: int | None = None,
+        test_cameras: tuple[str, ...] | None = None,
+    ) -> tuple[list[View], list[View]]:
         """(train, test) views, both sorted by name, by the rule that `split_rule` names.
 
-        A split that the data set's own files state (`View.split`) wins over both numbers.
+        Cameras that are held out by name win over a split that the data set's own files state (`View.split`), and this
+        wins over both numbers.
 
         Args:
             test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
             test_offset: 2 holds out the 3rd view first; the data set's own number if left out, 0 if `test_every` is
                 given alone.
+            test_cameras: names of the cameras that are held out at all times; the data set's own if left out.
         Raises:
-            ValueError: If a number is out of range, or the offset lies beyond the last view.
+            ValueError: If a number is out of range, the offset lies beyond the last view, or there is no such camera.
         """
-        train, test = self._rule(test_every, test_offset).parts([*self.views, *self.absent])
+        train, test = self._rule(test_every, test_offset, test_cameras).parts([*self.views, *self.absent])
         there = {id(view) for view in self.views}
         return [view for view in train if id(view) in there], [view for view in test if id(view) in there]
 
-    def split_rule(self, test_every: int | None = None, test_offset: int | None = None) -> str:
+    def split_rule(
+        self,
+        test_every: int | None = None,
+        test_offset: int | None = None,
+        test_cameras: tuple[str, ...] | None = None,
+    ) -> str:
         """The rule of `split` in words, to be recorded with results."""
-        return self._rule(test_every, test_offset).words()
+        return self._rule(test_every, test_offset, test_cameras).words()
 
-    def _rule(self, test_every: int | None, test_offset: int | None) -> SplitRule:
+    def _rule(self, test_every: int | None, test_offset: int | None, test_cameras: tuple[str, ...] | None) -> SplitRule:
         if test_offset is None:
             test_offset = self.test_offset if test_every is None else 0
         every = self.test_every if test_every is None else test_every
-        return SplitRule.of([*self.views, *self.absent], len(self.views), every, test_offset)
+        cameras = self.test_cameras if test_cameras is None else test_cameras
+        return SplitRule.of([*self.views, *self.absent], len(self.views), every, test_offset, cameras or ())
 
 
-def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> None:
-    """Say which images of a data set are not there, or refuse the data set.
-
-    Args:
-        where: The file that lists them.
-        missing: The images that are not there; nothing is done if there are none.
-        left: How many are there.
-        strict: Refuse whatever is left.
-
-    Raises:
-        FileNotFoundError: `strict`, or fewer than 3 are left.
-    """
-    if not missing:
-        return
-    names, count = [str(path) for path in missing], len(missing) + left
-    shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
-    told = f"{where}: {len(names)} of the {count} images that it lists are not there ({shown})"
-    if strict or left < _FEWEST:
-        rule = "all must be there" if strict else f"at least {_FEWEST} must be there"
-        hint = ", or drop --strict (strict=True) to go on without them" if strict and left >= _FEWEST else ""
-        raise FileNotFoundError(f"{told}; {rule}: restore them{hint}")
-    _log.warning("%s; going on with the other %d (--strict refuses that)", told, left)
-    if len(names) > _SHOWN:
-        _log.info("also not there: %s", ", ".join(names[_SHOWN:]))
-
-
-def check_parallax(views: list[View]) -> None:
-    """Warn about views that stand in one place, from which no depth can be told; refuse views that are all the same.
-
-    Views of one pose at several times are one place: a camera that stands still before something that moves.
-
-    Raises:
-        ValueError: two views or more, all of one pose and of one time (or of none).
-    """
-    poses = np.stack([view.camera.c2w for view in views])
-    spread = np.abs(poses - poses[0]).max(axis=(1, 2))
-    # Equal poses that a file states in several ways differ by rounding.
-    tiny = 1e-9 * max(1.0, float(np.abs(poses).max()))
-    if len(views) < 2:
-        return
-    times = [[view.camera.time or 0.0] for view in views]  # from one place at two times, things may have moved
-    if spread.max() <= tiny and times.count(times[0]) == len(times):
-        raise ValueError(
-            f"the {len(views)} training views must have poses of their own, all have the same one (as view "
-            f"{views[0].name!r}); check the camera file"
-        )
-    if np.abs(poses[:, :3, 3] - poses[0, :3, 3]).max() <= tiny:
-        _log.warning(
-            "all %d training views stand in one place: the photographs tell no depths, other places will look wrong",
-            len(views),
-        )
-        return
-    if same := len(poses) - len(np.unique(np.c_[np.round(poses / tiny).reshape(len(poses), -1), times], axis=0)):
-        _log.warning(
-            "%d of the %d training views have the pose of another one; check the camera file", same, len(poses)
-        )
-
-
-def make_unique(views: list[View]) -> None:
-    """Views are told apart by their names, in splits, picks and file names: a repeated one gets a number."""
-    taken = {view.name for view in views}
-    seen: set[str] = set()
-    for view in views:
-        name, number = view.name, 1
-        while view.name in seen or (number > 1 and view.name in taken):
-            number += 1
-            view.name = f"{name}_{number}"
-        seen.add(view.name)
-
-
-def fit_to_image(camera: Camera, path: Path, where: str, lazy: bool = False) -> Camera:
-    """The camera at the size of its image file, from the file's header.
-
-    Data sets are often downscaled after calibration, so K is scaled when the shapes agree to 1 %. With `lazy` the file
-    must exist, but is not opened, and the camera stays as it is.
-
-    Raises:
-        FileNotFoundError: no such image.
-        ValueError: not an image, or another shape.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{where}: the image {path} must exist, found none; restore it or drop the view")
-    if lazy:
-        return camera
-    width, height = image_size(path)
-    if (width, height) == (camera.width, camera.height):
-        return camera
-    if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
-        raise ValueError(
-            f"{where}: the image {path} must have the shape of its camera "
-            f"({camera.width}x{camera.height}), "
-            f"got {width}x{height}; give this view its own intrinsics"
-        )
-    return camera.resized(width, height)
+def _times(views: list[View]) -> tuple[float, ...]:
+    return tuple(sorted({view.camera.time for view in views if view.camera and view.camera.time is not None}))
 
 
 def _unit_range(data: np.ndarray, path: Path) -> np.ndarray:

@@ -40,7 +40,7 @@ FieldPreset = Literal["neu3d", "dnerf"]
 
 _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
-    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
+    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every", "times"), _COUNT),
     "test_every": (0, 10**9),
     "test_offset": (0, 10**9),
     "seed": (0, 2**31 - 1),  # what COLMAP takes
@@ -77,9 +77,9 @@ class FitConfig:
         test_every: Every n-th view by name is held out; 0 holds out none.
         test_offset: Index of the first view that is held out, below `test_every`. A split that the data set's own files
             state wins over both.
-        test_cameras: Names of the cameras that are held out, with all their times, of videos and of captures by several
-            cameras; None: the first by name.
-        times: How many synchronous frames are taken of videos, evenly spaced.
+        test_cameras: Names of the cameras that are held out at all times, of videos and of captures by several cameras,
+            which wins over what is above; None: as the data set has it, where there are videos the first; empty: none.
+        times: How many synchronous frames of every camera are taken, evenly over the whole length.
         seed: Of everything random.
         sh_degree: Highest degree of the view-dependent color.
         deterministic: One Dr.Jit thread, hence the same bits for the same seed.

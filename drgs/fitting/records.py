@@ -196,7 +196,7 @@ def config_record(
         "command": "fit",
         "data": str(Path(dataset.path).resolve()),
         "format": dataset.format,
-        "split_rule": dataset.split_rule(config.test_every, config.test_offset),
+        "split_rule": dataset.split_rule(config.test_every, config.test_offset, config.test_cameras),
         "train": [frame.name for frame in frames],
         "test": [frame.name for frame in held_out],
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),

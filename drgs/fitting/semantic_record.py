@@ -75,7 +75,7 @@ class SemanticRecord:
         known = dataset.semantics if config.semantics == "auto" else None
         if known is None or not known.maps:
             return None
-        train, _ = dataset.split(config.test_every, config.test_offset)
+        train, _ = dataset.split(config.test_every, config.test_offset, config.test_cameras)
         path = next((view.teacher_path for view in (*views, *train) if view.teacher_path is not None), None)
         if path is None:  # maps of held-out views alone teach nothing
             return None

@@ -1,0 +1,230 @@
+"""Videos of synchronous cameras, read a frame at a time with OpenCV (FFmpeg).
+
+What a header says about the number of frames is not believed: the packets of the file are walked, undecoded, which also
+tells when each frame is shown. That time stamp says afterwards whether a seek has arrived where it should; where it has
+not, frames are decoded one after the other from the start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+import threading
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.data.checks import native_stderr
+from drgs.guards import memory
+from drgs.guards.foreign import refuse_foreign
+
+__all__ = ["VIDEO_SUFFIXES", "VideoFile", "VideoFrame", "list_videos", "read_video"]
+
+VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi")
+_MAX_PIXELS = 2**31
+_MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
+_MISSING = 0.02  # share of the frames that a header may claim too many: some containers state a duration alone
+_NEAR = 16  # frames ahead that are decoded rather than sought
+_SAME = 0.01  # milliseconds between time stamps of one frame
+_OPEN = 4  # videos held open at once
+_COPY = "it is truncated or damaged, copy it again"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoFrame:
+    """One frame of a video, decoded when it is asked for.
+
+    Attributes:
+        path: The video.
+        index: Of the frame as it is shown, from 0.
+    """
+
+    path: Path
+    index: int
+
+    def read(self) -> np.ndarray:
+        """(H, W, 3) uint8, RGB.
+
+        Raises:
+            FileNotFoundError, ValueError: No video, too short, or one whose frame cannot be decoded.
+        """
+        video = read_video(self.path)
+        if not 0 <= self.index < video.count:
+            raise ValueError(
+                f"{self.path}: frame {self.index} must be there, the video has {video.count}; load the data set again"
+            )
+        with _lock:
+            return _reader(video).frame(self.index)
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoFile:
+    """What the packets of a video file say; no frame has been decoded.
+
+    Attributes:
+        path: The file.
+        width, height: In pixels.
+        stamps: Milliseconds at which each frame is shown, ascending; empty where the packets do not say, and all
+            frames had to be decoded to be counted.
+        count: Frames that are there.
+        version: Size and time of change of the file.
+    """
+
+    path: Path
+    width: int
+    height: int
+    stamps: tuple[float, ...] = dataclasses.field(repr=False)
+    count: int
+    version: tuple[int, int]
+
+
+def list_videos(folder: Path) -> list[Path]:
+    """Videos directly in a folder, by name; hidden files are left out."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
+
+
+def read_video(path: Path) -> VideoFile:
+    """Size and number of frames of a video, from its packets.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: No video, one that OpenCV cannot open, or one that ends before its header says.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a video, found none; check the path")
+    status = path.stat()
+    return _walked(path, (status.st_size, status.st_mtime_ns))
+
+
+@functools.lru_cache(maxsize=1024)
+def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
+    """`read_video` of a file that has not changed since."""
+    import cv2
+
+    _check_kind(path)
+    raw = _opened(path, [cv2.CAP_PROP_FORMAT, -1])  # packets, undecoded
+    width, height = int(raw.get(cv2.CAP_PROP_FRAME_WIDTH)), int(raw.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    claimed = raw.get(cv2.CAP_PROP_FRAME_COUNT)
+    if not 1 <= width * height <= _MAX_PIXELS:
+        raise ValueError(f"{path}: a video must have 1 to 2^31 pixels, its header says {width}x{height}; {_COPY}")
+    stamps = []
+    with native_stderr():
+        while raw.grab():
+            stamps.append(raw.get(cv2.CAP_PROP_POS_MSEC))
+            if len(stamps) > _MAX_FRAMES:
+                raise ValueError(f"{path}: must have at most {_MAX_FRAMES} frames, has more; cut it")
+    count = len(stamps)
+    stamps.sort()  # packets come in the order of decoding
+    if count > 1 and min(np.diff(stamps)) < _SAME:
+        stamps, count = [], _decoded(path)
+    if count == 0:
+        raise ValueError(f"{path}: must hold at least one frame, none can be read; {_COPY}")
+    if count < claimed * (1 - _MISSING):
+        raise ValueError(f"{path}: must hold the {claimed:.0f} frames that its header claims, holds {count}; {_COPY}")
+    return VideoFile(path, width, height, tuple(stamps), count, version)
+
+
+def _check_kind(path: Path) -> None:
+    """Raise ValueError unless a file begins as a video; a playlist, which names other files, does not."""
+    with path.open("rb") as file:
+        head = file.read(16)
+    if head[4:8] == b"ftyp" or head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI "):
+        return
+    refuse_foreign(path, "a video")
+    raise ValueError(f"{path}: must be a video (mp4, webm, mkv, avi), begins as none of them; convert it with ffmpeg")
+
+
+def _opened(path: Path, options: list[int]) -> Any:
+    """An open `cv2.VideoCapture`."""
+    import cv2
+
+    with native_stderr():
+        # An absolute path is no protocol of FFmpeg's, and this backend knows no patterns of names.
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG, options)
+    if not capture.isOpened():
+        raise ValueError(f"{path}: must be a video, could not be opened; {_COPY}, or convert it with ffmpeg")
+    return capture
+
+
+def _decoded(path: Path) -> int:
+    """Number of frames, by decoding all of them."""
+    capture, count = _opened(path, []), 0
+    with native_stderr():
+        while count <= _MAX_FRAMES and capture.grab():
+            count += 1
+    return count
+
+
+class _Reader:
+    """An open video and the place where it is."""
+
+    def __init__(self, video: VideoFile) -> None:
+        self.video, self._next, self._told = video, 0, False
+        self._capture = _opened(video.path, [])
+        memory.require(
+            f"{video.path}", 6 * video.width * video.height, f"a frame of {video.width}x{video.height}", "reduce it"
+        )
+
+    def frame(self, index: int) -> np.ndarray:
+        """(H, W, 3) uint8, RGB, of the frame that is shown as number `index`; ValueError if it cannot be decoded."""
+        with native_stderr() as complaints:
+            data = self._at(index)
+        if data is None:
+            raise ValueError(
+                f"{self.video.path}: frame {index} of {self.video.count} must be decoded, could not be; {_COPY}"
+            )
+        if complaints and not self._told:
+            self._told = True
+            text = complaints[0].strip()
+            _log.warning("%s: is damaged, frames may be wrong (%s); copy it again", self.video.path, text)
+        return np.ascontiguousarray(data[..., ::-1])
+
+    def _at(self, index: int) -> np.ndarray | None:
+        """The pixels of a frame (BGR), or None: going on from where the video is, by seeking, or from the start."""
+        import cv2
+
+        if 0 <= index - self._next <= _NEAR:
+            if self._forward(index):
+                return self._pixels()
+        elif self.video.stamps and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
+            self._next = index
+            if self._forward(index):
+                return self._pixels()
+        self._capture.release()
+        self._capture, self._next = _opened(self.video.path, []), 0
+        return self._pixels() if self._forward(index) else None
+
+    def _forward(self, index: int) -> bool:
+        """Decode up to a frame; whether it is the one that its time stamp says."""
+        import cv2
+
+        while self._next <= index:
+            if not self._capture.grab():
+                return False
+            self._next += 1
+        stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        return not self.video.stamps or abs(stamp - self.video.stamps[index]) < _SAME
+
+    def _pixels(self) -> np.ndarray | None:
+        read, data = self._capture.retrieve()
+        return data if read and data is not None and data.ndim == 3 and data.shape[2] == 3 else None
+
+
+_lock = threading.Lock()
+_readers: OrderedDict[tuple[Path, tuple[int, int]], _Reader] = OrderedDict()
+
+
+def _reader(video: VideoFile) -> _Reader:
+    """An open reader; of the videos read last, `_OPEN` stay open."""
+    key = (video.path, video.version)
+    if key not in _readers:
+        while len(_readers) >= _OPEN:
+            _readers.popitem(last=False)
+        _readers[key] = _Reader(video)
+    _readers.move_to_end(key)
+    return _readers[key]
