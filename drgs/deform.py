@@ -165,7 +165,7 @@ class DeformationField(torch.nn.Module):
     def _moment(self, time: float | torch.Tensor) -> torch.Tensor:
         """The time as a part of the span."""
         first, last = (float(x) for x in self.grid.span)
-        value = float(time)
+        value = float(time.detach() if isinstance(time, torch.Tensor) else time)  # a check
         slack = _BEYOND * (last - first)
         if not first - slack <= value <= last + slack:
             raise ArgumentError(
@@ -256,20 +256,11 @@ class DynamicGaussians:
         """
         parameters = self.parameters()
         seen = self.deform(parameters, time)
+        moved = seen.means, seen.quats, seen.log_scales
         with torch.no_grad():  # a check, which leaves no graph
-            if not all(_is_finite(x) for x in (seen.means, seen.quats, seen.log_scales, *self._gate())):
-                for name, x in parameters.items():
-                    if not _is_finite(x):
-                        bad = ~torch.isfinite(x)
-                        at = tuple(bad.nonzero()[0].tolist())
-                        raise ArgumentError(
-                            f"DynamicGaussians.at: {name} must be finite, got {float(x[at]):g} at index {list(at)} "
-                            f"({int(bad.sum())} of {x.numel()}); go back to the last weights that were"
-                        )
+            if not all(is_finite(x) for x in (*moved, *(() if self.motion is None else (self.motion,)))):
+                _name_what_is_not_finite(parameters, dict(zip(Deltas._fields, moved, strict=True)))
         return seen
-
-    def _gate(self) -> list[torch.Tensor]:
-        return [] if self.motion is None else [self.motion]
 
     def deform(self, parameters: dict[str, torch.Tensor], time: float | torch.Tensor | None) -> Gaussians:
         """`at(time)` of a scene with these parameters, for `torch.func`; nothing is checked but the time."""
@@ -292,9 +283,22 @@ class DynamicGaussians:
         return self.gaussians.replace(**fields)
 
 
-def _is_finite(x: torch.Tensor) -> bool:
-    """NaN passes through the reduction."""
+def is_finite(x: torch.Tensor) -> bool:
+    """Whether all entries are: NaN passes through the reduction."""
     return x.numel() == 0 or all(math.isfinite(float(end)) for end in torch.aminmax(x))
+
+
+def _name_what_is_not_finite(parameters: dict[str, torch.Tensor], moved: dict[str, torch.Tensor]) -> None:
+    """Raise ValueError about the first parameter that is not finite; else about what finite ones came to."""
+    named = parameters | {f"deltas of {name}": x for name, x in moved.items()}
+    for name, x in named.items():
+        if not is_finite(x):
+            bad = ~torch.isfinite(x)
+            at = tuple(bad.nonzero()[0].tolist())
+            raise ArgumentError(
+                f"DynamicGaussians.at: {name} must be finite, got {float(x[at]):g} at index {list(at)} "
+                f"({int(bad.sum())} of {x.numel()}); go back to weights that were"
+            )
 
 
 def _checked_bounds(bounds: ArrayLike | torch.Tensor) -> torch.Tensor:

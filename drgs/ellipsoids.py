@@ -76,11 +76,14 @@ class Scene(Protocol):
 class DeformableScene(Scene, Protocol):
     """A scene whose Gaussians are a pure function of its parameters: these, too, have tangents and information.
 
-    `render_jvp` takes tangents named after `parameters()`, `fisher.diagonal` groups.
+    `render_jvp` takes tangents named after `parameters()`, and of the time; `fisher.diagonal` groups.
     """
 
-    def deform(self, parameters: dict[str, torch.Tensor], time: float | None) -> Gaussians:
-        """`at(time)` of a scene with these parameters, by operations that `torch.func` differentiates in both modes."""
+    def deform(self, parameters: dict[str, torch.Tensor], time: float | torch.Tensor | None) -> Gaussians:
+        """`at(time)` of a scene with these parameters, by operations that `torch.func` differentiates in both modes.
+
+        The time is a number, or a float64 scalar where derivatives by it are wanted.
+        """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ def _batch(views: list[Output]) -> Output:
 def render_jvp(
     gaussians: Scene,
     camera: Camera,
-    tangents: Mapping[str, torch.Tensor],
+    tangents: Mapping[str, torch.Tensor | Mapping[str, torch.Tensor]],
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] | str = ("depth",),
     couple_features: bool = True,
@@ -103,8 +103,10 @@ def render_jvp(
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
             the pose, rotation first: c2w <- exp(xi) c2w. Of a `drgs.ellipsoids.DeformableScene` the names are those
-            of its `parameters()` that are floats, `camera`, and `rotations` where it has `quats`; so none of its own
-            may be called `camera`, `rotations`, `w2c`, `ray_origins` or `ray_directions`.
+            of its `parameters()` that are floats, `camera`, and `rotations` where it has `quats`; `time`, a number: how
+            fast the time of the view passes; and `phi`, a mapping of x to the tangent of `phi.x`. So none of its own
+            may be called `camera`, `rotations`, `time`, `phi`, `w2c`, `ray_origins` or `ray_directions`. By the time
+            the derivative is the scene's own, one-sided where that has a kink (`drgs.DeformationField`).
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried
         through one traversal.
@@ -115,11 +117,16 @@ def render_jvp(
     seen = gaussians_at("render_jvp", gaussians, camera)
     check_view("render_jvp", seen, camera, settings)
     must_be("render_jvp", "tangents", tangents, Mapping, 'e.g. {"camera": torch.eye(6)}')
+    tangents = dict(tangents)
+    if isinstance(phi := tangents.get("phi"), Mapping):
+        del tangents["phi"]
+        tangents |= {f"phi.{name}": x for name, x in phi.items()}
     settings = settings or RenderSettings.preset("exact")
     # The tangents are given: a graph of torch would lead nowhere.
-    call = Call(seen.detach(), camera, settings, _wanted(outputs) & {"depth"}, scene=scene, couple=couple_features)
+    want, timed = _wanted(outputs) & {"depth"}, "time" in tangents and camera.time is not None
+    call = Call(seen.detach(), camera, settings, want, scene=scene, couple=couple_features, timed=timed)
     with own_errors():
-        return push_forward(call, dict(tangents))
+        return push_forward(call, tangents)
 
 
 @runtime.alone

@@ -138,6 +138,20 @@ def test_no_cycles_at_import():
         done += ready
 
 
+def test_what_moves_is_imported_where_something_does():
+    """Neither a field nor its bridge comes with what users import: a scene that is still runs nothing of them."""
+    graph = {}
+    for module, tree in modules().items():
+        body = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom | ast.Try)]
+        graph[module] = {x for node in body for x in imported(node)}
+    seen, rest = set(), {"cli", "commands.fit", "commands.render", "fisher", "integrator", "plugin", "select", "train"}
+    while rest:
+        seen |= rest
+        rest = {x for module in rest for x in graph[module]} - seen
+    assert "tracing.call" in seen
+    assert {x for x in seen if x == "deform" or x.startswith("dynamics") or x == "tracing.field"} == set()
+
+
 def public_names(tree: ast.Module) -> Iterator[str]:
     """Functions, classes and constants that a module defines at its top level and that do not start with _."""
     for node in tree.body:

@@ -38,7 +38,7 @@ class Swarm:
     def deform(self, parameters, time):
         p = dict(parameters)
         weights = {name: p.pop(name) for name in self.weights}
-        x = torch.cat([p["means"], torch.full_like(p["means"][:, :1], time)], 1)
+        x = torch.cat([p["means"], torch.zeros_like(p["means"][:, :1]) + time], 1)
         hidden = torch.tanh(x @ weights["in.weight"].T + weights["in.bias"])
         return self.start.replace(**{**p, "means": p["means"] + 0.1 * hidden @ weights["out.weight"].T})
 

@@ -17,7 +17,6 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.composite import Compositor
-from drgs.tracing.field import Field
 from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.operation import Composite
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
@@ -72,10 +71,11 @@ class Call:
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.
         rays: Origins and directions, (..., 3) each, instead of the camera's.
         scene: Where the Gaussians come from, if derivatives by its parameters are wanted instead of by theirs.
+        timed: Whether by its time, too.
         couple: As `couple_features` of `render`.
     Attributes:
-        inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, `w2c`
-            (12 floats), rays where they are traced.
+        inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
+            `time`, `w2c` (12 floats), rays where they are traced.
         field: From the scene's parameters to the Gaussians'; None for those of the Gaussians themselves.
         shape: Of the images: (H, W), or that of the rays.
         extra, certificate: Of the last `trace`: outputs without a derivative, and `Output.certificate`.
@@ -90,6 +90,7 @@ class Call:
         rays=None,
         scene: DeformableScene | None = None,
         couple: bool = True,
+        timed: bool = False,
     ):
         self.lib, self.settings, self.camera, self.want = runtime.dr_types(), settings, camera, want
         must_be("render", "couple_features", couple, bool, "True or False")
@@ -115,6 +116,10 @@ class Call:
             _check_names(given)
             fixed = {name: x for name, x in given.items() if not x.is_floating_point()}
             given = {name: x for name, x in given.items() if name not in fixed}
+            if timed:
+                given["time"] = torch.tensor(float(camera.time), dtype=torch.float64)
+            from drgs.tracing.field import Field  # only scenes that move need it
+
             self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
         self.count, self.coefficients = len(gaussians), gaussians.sh.shape[1]
@@ -249,9 +254,9 @@ class Call:
 def _check_names(parameters: dict) -> None:
     """Refuse a scene's parameter that has the name of what belongs to the view: their tangents would be mixed."""
     for name in parameters:
-        if name in (*OF_VIEW, "camera", "rotations"):
+        if name in (*OF_VIEW, "camera", "rotations", "time", "phi"):
             raise ArgumentError(
-                f"scene.parameters(): names must not be those of the view's pose or of rotations, got {name!r}; rename "
+                f"scene.parameters(): names must not be those of the view or of rotations, got {name!r}; rename "
                 f"it, e.g. {name + '_of_scene'!r}"
             )
 

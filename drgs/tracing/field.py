@@ -49,8 +49,9 @@ class Field:
         return dr.custom(_Deform, self, lib, parameters)
 
     def values(self, parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """The same in torch."""
-        fields = self.scene.deform({**self.fixed, **parameters}, self.time).parameters()
+        """The same in torch; `time` among the parameters is that of the view, as a scalar."""
+        given = {**self.fixed, **parameters}
+        fields = self.scene.deform(given, given.pop("time", self.time)).parameters()
         if self.shift is not None:
             fields["means"] = fields["means"] - self.shift
         return {name: fields[name] for name in self.names}
