@@ -21,10 +21,10 @@ from where import ran  # noqa: E402
 
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
-from drgs.fitting.active import initial_views  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
+from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 
 __all__ = [

@@ -8,8 +8,8 @@ Policies whose scores depend on what has been picked are greedy: take the best, 
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
     moments     variance of the features along the rays (Magic Moments), averaged over pixels
     coverage    sum_i Wc_i / (W_i + lambda), W = sum over pixels of w^2: how much is seen that was seen little
-    farthest    the camera center farthest from those there are
-    uniform     evenly spaced among the views sorted by name
+    farthest    the camera center farthest from those there are; of several times, the center and the time
+    uniform     evenly spaced among the views sorted by name; of several times, among the times and the cameras
     random      drawn without replacement, from one generator for the whole process or run
 """
 
@@ -18,7 +18,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -36,6 +35,7 @@ from drgs.information.combine import Asked, Combination, asked_of
 from drgs.information.greedy import ViewInformation, greedy
 from drgs.information.pool import Pick, Pool, Scoring, Selection
 from drgs.information.semantics import SemanticMetric
+from drgs.information.spacetime import by_number, farthest_in_time, has_times, uniform_in_time
 
 __all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
 
@@ -228,7 +228,12 @@ def moments(pool: Pool) -> Selection:
 
 
 def farthest(pool: Pool) -> Selection:
-    """Farthest point sampling on camera centers, in world units; without any view to start from, index 0 first."""
+    """Farthest point sampling on camera centers, in world units; without any view to start from, index 0 first.
+
+    Of cameras at several times: on (center, time), see `drgs.information.spacetime`.
+    """
+    if has_times(pool):
+        return farthest_in_time(pool)
     centers = np.array([camera.center for camera in pool.candidates])
     distance = np.full(len(centers), np.inf)
     for camera in pool.train:
@@ -253,10 +258,13 @@ def uniform(pool: Pool) -> Selection:
 
     The k picks split the gaps that training views leave in that order, the largest ones most, each into equal steps:
     one pick is the middle of the largest gap, k picks without training views are evenly spaced. The score is the
-    distance to the nearest training view or end of the order, in places.
+    distance to the nearest training view or end of the order, in places. Of cameras at several times: every time and
+    every camera as often as the others, see `drgs.information.spacetime`.
     """
+    if has_times(pool):
+        return uniform_in_time(pool)
     views = [*pool.train, *pool.candidates]
-    order = sorted(range(len(views)), key=lambda i: _by_number(views[i].name))
+    order = sorted(range(len(views)), key=lambda i: by_number(views[i].name))
     at = {view: place for place, view in enumerate(order)}
     walls = sorted([-1, len(views), *(at[i] for i in range(len(pool.train)))])
     gaps = [(a, b) for a, b in itertools.pairwise(walls) if b - a > 1]
@@ -279,11 +287,6 @@ def random(pool: Pool) -> Selection:
     drawn = torch.rand(len(pool.candidates), dtype=torch.float64, generator=pool.rng).tolist()
     order = sorted(range(len(drawn)), key=lambda i: -drawn[i])
     return Selection([pool.pick(i, drawn[i]) for i in order[: pool.k]], drawn, evaluations=len(drawn))
-
-
-def _by_number(name: str) -> list:
-    """Sort key: `cam10` after `cam9`."""
-    return [(1, int(x), "") if x.isdecimal() else (0, 0, x) for x in re.split(r"(\d+)", name)]
 
 
 POLICIES: dict[str, Callable[[Pool], Selection]] = {

@@ -336,8 +336,8 @@ class _Loop:
         self.run_folder.log("pick", **{key: record[key] for key in shown}, candidates=len(record["candidates"]))
         self.save()
         bar.note(
-            f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.active.add}, chosen by "
-            f"{plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
+            f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.timetable.add}, chosen "
+            f"by {plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
         )
 
     def _log(self, step: StepResult) -> None:

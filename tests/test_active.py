@@ -17,9 +17,10 @@ from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
-from drgs.fitting.active import ActiveViews, initial_views
+from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig
 from drgs.fitting.records import fitted_views
+from drgs.fitting.timetable import initial_views
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 24
@@ -493,7 +494,7 @@ def test_command(still, tmp_path, capsys):
     [
         ("--views active --add 0", "add must be >= 1, got 0; without --views active all views are used"),
         ("--views active --initial 0", "initial must be a whole number in [1, 1000000000], got 0"),
-        ("--views active --every 0", "every must be a whole number in [1, 1000000000], got 0"),
+        ("--views active --every 0", "every must be a whole number in [1, 1000000000], or None, got 0"),
         ("--views active --initial 7 --add 1", "--initial 7 and --add 1 must be at most the 6 views of the training"),
         ("--views active --initial 2 --add 5 --every 1", "--initial 2 and --add 5 must be at most the 6 views"),
         ("--views active --add 4 --every 5", "must be there before step 20, the last one would come at 20"),

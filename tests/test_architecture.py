@@ -32,7 +32,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"gain"}, "how information becomes a score, whatever computed it"),
     ({"information"}, "what a view's pixels say about each parameter: groups, Jacobian, replay"),
     ({"fisher"}, "information of views, for users"),
-    ({"information.cache", "information.pool", "information.greedy"}, "choosing views by it"),
+    ({f"information.{x}" for x in ("cache", "pool", "greedy", "combine", "spacetime")}, "choosing views by it"),
     ({"select"}, "policies, for users"),
     ({"data"}, "photographs and their cameras, from disk"),
     ({"fitting"}, "the parts of a fit"),

@@ -33,6 +33,7 @@ from drgs.fitting.config import (
     InitPoints,
     MaskUse,
     PickPoints,
+    Schedule,
     Start,
 )
 from drgs.settings import Preset, RenderSettings
@@ -135,14 +136,16 @@ class Fit(Choosing, Data, Taught, Moving):
     """RGB in [0, 1] behind everything."""
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
+    schedule: Schedule = ActiveConfig.schedule
+    """Pick view by view (views), one camera at each later time (times), or any camera at any (pairs); auto: by data."""
     initial: int = ActiveConfig.initial
     """Views at the start: that of --start, then those farthest away."""
     start: Start = ActiveConfig.start
     """The first of these: the first training view by name, or one that the seed draws."""
-    add: int = ActiveConfig.add
-    """Views to be chosen on the way, one at a time; others are not read."""
-    every: int = ActiveConfig.every
-    """Steps before the first of them, and between two."""
+    add: int | None = ActiveConfig.add
+    """Views to be chosen on the way, others are not read; default 10, or one for every time after the first."""
+    every: int | None = ActiveConfig.every
+    """Steps before the first of them, and between two; default 200, or at times the same part of 17,000."""
     pick_points: PickPoints = ActiveConfig.pick_points
     """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
 

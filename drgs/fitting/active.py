@@ -1,6 +1,7 @@
 """Active views: fit to a few photographs, and choose one more every so often by what it would tell.
 
-The static loop of [1]: two views, then one more every 200 steps; the optimization goes on with the Gaussians there are.
+The loops of [1]: two views, then one more every 200 steps, or, where things move, all cameras at the first time, then
+one camera at each later time (timetable.py). The optimization goes on with the Gaussians there are.
 The camera file gives the poses and image sizes of all candidates. Nothing else of a view is read before it is picked:
 not its pixels, mask, depth or size on disk, no points or observations that it took part in; the extent of the scene
 and the initial points come from the initial views. (`--init-points all`, the rule of [1], breaks this and says so.)
@@ -25,6 +26,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.timetable import Timetable
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -33,17 +35,12 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.fitting.config import ActiveConfig, FitConfig
 
-__all__ = [
-    "SELECTION",
-    "ActiveViews",
-    "initial_views",
-]
+__all__ = ["SELECTION", "ActiveViews"]
 
 SELECTION = "selection.json"
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
-_START = 0x57A7  # the stream of the view that a fit starts with, apart from all others of the same seed
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 
 
@@ -53,31 +50,32 @@ class ActiveViews:
     Attributes:
         active: The `ActiveConfig`.
         views: The training split, in its order; what has not been picked has not been opened.
+        timetable: When one is picked, and among which.
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
         pool_leak: Whether initial points have seen views that were not picked.
     """
 
-    def __init__(self, active: ActiveConfig, views: list[View], config: FitConfig) -> None:
+    def __init__(self, active: ActiveConfig, views: list[View], config: FitConfig, moves: bool = False) -> None:
+        """
+        Args:
+            active, config: Of the fit.
+            views: Its training split.
+            moves: Whether a deformation is fitted.
+        Raises:
+            ValueError: As `Timetable.of`, and if there are no views.
+        """
         if not views:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
-        if active.initial + active.add > len(views):
-            raise ValueError(
-                f"active: --initial {active.initial} and --add {active.add} must be at most the {len(views)} views of "
-                "the training split; lower one, or hold out fewer (--test-every)"
-            )
-        if active.add * active.every >= config.max_steps:
-            raise ValueError(
-                f"active: --add {active.add} views, one --every {active.every} steps, must be there before step "
-                f"{config.max_steps}, the last one would come at {active.add * active.every}; raise --max-steps"
-            )
         self.active, self.views, self._config = active, list(views), config
-        first = _drawn(len(views), config.seed) if active.start == "seed" else 0
-        self.chosen = initial_views([view.camera for view in views], active.initial, first)
+        self.timetable = Timetable.of(active, self.views, config, moves)
+        self.chosen = list(self.timetable.start)
         self.picks: list[dict] = []
         self.pool_leak = config.init_points == "all"
-        grows = {"auto": not self.pool_leak, "uncovered": True, "none": False}[active.pick_points]
-        self._share = config.max_gaussians // (active.initial + active.add) if grows else 0
+        # Photographs of another time do not say where things are at this one.
+        wanted = not self.pool_leak and self.timetable.schedule == "views"
+        grows = {"auto": wanted, "uncovered": True, "none": False}[active.pick_points]
+        self._share = config.max_gaussians // (len(self.chosen) + self.timetable.add) if grows else 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._matches = Matches()
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
@@ -89,13 +87,13 @@ class ActiveViews:
 
     def start_views(self) -> list[View]:
         """The views that initial points may be made from, checked against their images."""
-        views = self.views if self.pool_leak else [self.views[i] for i in self.chosen[: self.active.initial]]
+        views = self.views if self.pool_leak else [self.views[i] for i in self.chosen[: len(self.timetable.start)]]
         return [view.checked() for view in views]
 
     @property
     def reserved(self) -> int:
         """How many Gaussians density control leaves room for: the shares of the views that are still to be picked."""
-        return self._share * (self.active.add - len(self.picks))
+        return self._share * (self.timetable.add - len(self.picks))
 
     def points(self, frame: Frame, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, bool]:
         """Points for new Gaussians from the view that was picked last.
@@ -113,6 +111,8 @@ class ActiveViews:
         from drgs.integrator import render
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
+        if not self._share:
+            return nothing
         with torch.no_grad():  # the Gaussians are fitted elsewhere
             plain = colors_only(scene, frame.camera.time)
             alpha = render(plain, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
@@ -122,7 +122,7 @@ class ActiveViews:
         worth = is_open.mean() >= _WORTH
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None
-        if not self._share or (dense and not worth):
+        if dense and not worth:
             return nothing
         seed = self._config.seed + len(self.picks)
         with Bar("points of the new view") as bar:
@@ -151,7 +151,7 @@ class ActiveViews:
 
     def is_due(self, step: int) -> bool:
         """Whether a view is to be added before step `step` (from 0)."""
-        return len(self.picks) < min(self.active.add, step // self.active.every)
+        return len(self.picks) < self.timetable.due(step)
 
     def pick(self, scene: Scene, frames: list[Frame], step: int, decoder: Decoder | None = None) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
@@ -168,7 +168,7 @@ class ActiveViews:
         from drgs.select import select
 
         active = self.active
-        left = [i for i in range(len(self.views)) if i not in self.chosen]
+        left = self.timetable.left(len(self.picks), self.chosen)
         pixels = active.info_pixels or self._config.max_pixels
         semantics = None if decoder is None else SemanticMetric(decoder.metric())
         with Bar("choosing a view", len(left) + len(frames)) as bar:
@@ -191,6 +191,7 @@ class ActiveViews:
             "step": step,
             "index": index,
             "name": best.name,
+            **self._where(index),
             "score": best.score,
             "parts": best.parts,
             "margin": best.margin,
@@ -204,7 +205,14 @@ class ActiveViews:
             "left_out": selection.left_out,
             "notes": selection.notes,
             "candidates": [
-                {"index": i, "name": self.views[i].name, "score": score, "parts": parts, "unseen": share}
+                {
+                    "index": i,
+                    "name": self.views[i].name,
+                    **self._where(i),
+                    "score": score,
+                    "parts": parts,
+                    "unseen": share,
+                }
                 for i, score, parts, share in scored
             ],
         }
@@ -214,17 +222,17 @@ class ActiveViews:
 
     def to_json(self) -> dict:
         """What selection.json holds."""
-        initial = self.chosen[: self.active.initial]
+        initial = self.chosen[: len(self.timetable.start)]
         return {
             "schema": SCHEMA,
             "command": "fit",
-            **self.active.to_json(),
+            **self._resolved(self.active.to_json()),
             "start_rule": self.active.start,  # `start` are the views
             "seed": self._config.seed,
             "init_points": "all" if self.pool_leak else "views",
             "pool_leak": self.pool_leak,
             "pool": [view.name for view in self.views],
-            "start": [{"index": i, "name": self.views[i].name} for i in initial],
+            "start": [{"index": i, "name": self.views[i].name, **self._where(i)} for i in initial],
             "picks": self.picks,
         }
 
@@ -243,8 +251,9 @@ class ActiveViews:
         Raises:
             ValueError: If the checkpoint chose by another rule, or from other views.
         """
-        old, new = header["active"], self.active.to_json()
-        was = {**type(self.active)().to_json(), **old["config"]}  # of an earlier version: as the default does
+        old, new = header["active"], self._resolved(self.active.to_json())
+        # Of an earlier version: as the default does.
+        was = self._resolved({**type(self.active)().to_json(), **old["config"]})
         for key in new:
             if new[key] != was[key]:
                 raise ValueError(
@@ -257,8 +266,22 @@ class ActiveViews:
                 "changed; repeat the options or choose another folder"
             )
         self.picks = old["picks"]
-        self.chosen = self.chosen[: self.active.initial] + [pick["index"] for pick in self.picks]
+        self.chosen = self.chosen[: len(self.timetable.start)] + [pick["index"] for pick in self.picks]
         self._generator.set_state(tensors["policy_rng"])
+
+    def _resolved(self, config: dict) -> dict:
+        """A config whose schedule and numbers are those of this fit where it leaves them to the data set."""
+        timetable = self.timetable
+        filled = {"add": timetable.add, "every": timetable.every}
+        schedule = timetable.schedule if config["schedule"] == "auto" else config["schedule"]
+        return {**config, "schedule": schedule, **{k: x for k, x in filled.items() if config[k] is None}}
+
+    def _where(self, index: int) -> dict:
+        """Camera and time of a view, where these are what is picked."""
+        if self.timetable.schedule == "views":
+            return {}
+        view = self.views[index]
+        return {"camera": view.camera_name, "time": view.camera.time}
 
     def _read(self, index: int) -> Frame:
         """Open a view's files, for the first time if it has just been picked."""
@@ -274,25 +297,3 @@ class ActiveViews:
         if not view.is_checked:
             camera = resized_alike(camera, self._sizes)
         return at_most(camera, self._config.max_pixels)
-
-
-def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int]:
-    """One camera, then always the one whose center is farthest from all chosen ones; ties to the lower index.
-
-    Args:
-        cameras: At least `count`.
-        count: At least 1.
-        first: Index of the one to begin with.
-    """
-    centers = np.stack([camera.center for camera in cameras])
-    chosen, distance = [first], np.linalg.norm(centers - centers[first], axis=1)
-    while len(chosen) < count:
-        distance[chosen] = -1.0  # where all centers coincide, too, no view is chosen twice
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(centers - centers[chosen[-1]], axis=1))
-    return chosen
-
-
-def _drawn(count: int, seed: int) -> int:
-    """Index in range(count), drawn by a seed; the generators of policies and of points begin with the seed alone."""
-    return int(np.random.default_rng([seed, _START]).integers(count))

@@ -24,6 +24,7 @@ __all__ = [
     "InitPoints",
     "MaskUse",
     "PickPoints",
+    "Schedule",
     "SemanticUse",
     "Start",
 ]
@@ -31,6 +32,7 @@ __all__ = [
 InitPoints = Literal["auto", "views", "all"]
 MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
+Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
@@ -226,18 +228,22 @@ class ActiveConfig:
         policy: A name in `drgs.select.POLICIES`.
         criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
         method: Of the diagonal, see `drgs.fisher.diagonal`.
-        initial: Views at the start: one by `start`, then those farthest from all before.
+        schedule: `views`: `initial` views, then one after the other. `times`: the static stage on all cameras at the
+            first time, then one camera at each later time, in order. `pairs`: the same start, then any (camera, time).
+            `auto`: `times` where a deformation is fitted, else `views`. More in `drgs.fitting.timetable`.
+        initial: Of `views`: views at the start: one by `start`, then those farthest from all before.
         start: The first of them: `first` of the training split by name, or one of it drawn by the fit's `seed`, from a
             generator of its own, so that no policy's draws depend on it.
-        add: Views to be added, one at a time.
-        every: Steps between two of them, and before the first.
+        add: Views to be added, one at a time; None: 10, and of `times` and `pairs` as many as there are later times.
+        every: Steps between two of them, and before the first, in the dynamic stage; None: 200, and of `times` and
+            `pairs` that part of 17,000 of `max_steps`, as in arXiv 2512.22771.
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
         prior: lambda, the prior precision of every parameter.
         relative_prior: lambda is `prior` times the median of the group's positive information.
         pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
             Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
             evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
-            initial points of the whole data set, else `uncovered`.
+            initial points of the whole data set and at later times, else `uncovered`.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
             None: all that the fit has.
     """
@@ -245,10 +251,11 @@ class ActiveConfig:
     policy: Policy = "fisher"
     criterion: Criterion = "eig"
     method: Method = "exact"
+    schedule: Schedule = "auto"
     initial: int = 2
     start: Start = "first"
-    add: int = 10
-    every: int = 200
+    add: int | None = None
+    every: int | None = None
     info_pixels: int | None = None
     prior: float = 1e-6
     relative_prior: bool = False

@@ -1,0 +1,290 @@
+"""Active fits over (camera, time): which images are read and when, what is recorded, resuming, and bad options."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_active import Killed, opened, without_times  # noqa: F401  (a fixture)
+from test_data import save, write_image
+
+import drgs
+from drgs import cli
+from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
+from drgs.data import load
+from drgs.files import Run, load_state
+from drgs.fitting.active import ActiveViews
+from drgs.fitting.config import ActiveConfig
+from drgs.fitting.records import fitted_views
+from drgs.fitting.timetable import Timetable
+from drgs.select import select
+from drgs.train import FitConfig, Trainer, fit
+
+SIZE, CAMERAS, TIMES = 20, 5, 4
+
+
+def write_swing(folder: Path) -> None:
+    """A transforms.json data set: five cameras at four times each, of blobs half of which move; the first camera is
+    the test split. Views are named camC/T.
+    """
+    generator = torch.Generator().manual_seed(3)
+    n = 24
+    means = torch.randn(n, 3, generator=generator) * 0.4
+    blobs = drgs.Gaussians.from_arrays(
+        means,
+        torch.randn(n, 4, generator=generator),
+        0.08 + 0.12 * torch.rand(n, 3, generator=generator),
+        torch.full((n,), 0.9),
+        torch.rand(n, 1, 3, generator=generator) * 3 - 1,
+    )
+    cameras = orbit((0, 0, 0), 3.0, CAMERAS, width=SIZE, height=SIZE)
+    K, frames = cameras[0].K, {"train": [], "test": []}
+    lens = {"w": SIZE, "h": SIZE, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    for t in range(TIMES):
+        shift = torch.zeros(n, 3)
+        shift[: n // 2, 1] = 0.3 * t / (TIMES - 1)
+        moved = blobs.replace(means=means + shift)
+        for c, camera in enumerate(cameras):
+            name = f"cam{c}/{t}.png"
+            image = drgs.render(moved, camera, drgs.RenderSettings.preset("fast")).rgb
+            write_image(folder / name, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+            frame = {"transform_matrix": c2w_to_opengl(camera.c2w).tolist(), "time": t / (TIMES - 1)}
+            frames["test" if c == 0 else "train"].append({"file_path": name, **frame})
+    for split, listed in frames.items():
+        save(folder, {**lens, "frames": listed}, f"transforms_{split}.json")
+
+
+@pytest.fixture(scope="module")
+def swing(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("swing")
+    write_swing(folder)
+    return folder
+
+
+def lazily(folder: Path):
+    return load(folder, lazy=True, points=False)
+
+
+def config(**fields) -> FitConfig:
+    """8 steps of the static stage and 16 of the dynamic one."""
+    return FitConfig(
+        **{"max_steps": 24, "static_share": 1 / 3, "max_gaussians": 60, "sh_degree": 1, "save_every": 1000, **fields}
+    )
+
+
+def plan(**fields) -> ActiveConfig:
+    return ActiveConfig(**{"policy": "random", "schedule": "times", "every": 4, **fields})
+
+
+def selection_of(run: Path) -> dict:
+    return json.loads((run / "selection.json").read_text())
+
+
+# ---- when, and among which
+
+
+def test_numbers_are_those_of_the_paper(swing):
+    """At 17,000 steps with 40 times: the static stage has 3,000, a pick comes every 200, the last of 39 at 10,800. A
+    tenth of the steps has a tenth of all numbers.
+    """
+    view = lazily(swing).split()[0][0]
+    views = [
+        dataclasses.replace(view, name=f"{c}/{t}", camera=dataclasses.replace(view.camera, time=t / 39))
+        for c in range(3)
+        for t in range(40)
+    ]
+    for part in (1, 10):
+        whole = FitConfig(max_steps=17_000 // part)
+        table = Timetable.of(ActiveConfig(), views, whole, moves=True)
+        assert (table.schedule, table.add, table.every, table.first) == ("times", 39, 200 // part, 3200 // part)
+        assert [table.due(step // part) for step in (0, 3190, 3200, 3390, 3400, 10_790, 10_800, 17_000)] == [
+            0, 0, 1, 1, 2, 38, 39, 39,
+        ]  # fmt: skip
+    assert [views[i].camera.time for i in table.start] == [0.0] * 3
+    for number in range(39):
+        there = [views[i] for i in table.left(number, table.start)]
+        assert [view.name for view in there] == [f"{c}/{number + 1}" for c in range(3)]
+    frequent = Timetable.of(ActiveConfig(every=3), views, FitConfig(max_steps=1700), moves=True)
+    assert frequent.first == 320, "the first pick waits for 200 of 17,000 steps, however often there is one"
+
+
+def test_a_schedule_follows_from_what_is_fitted(swing):
+    """`auto` is `times` where a deformation is fitted and `views` where none is."""
+    views = lazily(swing).split()[0]
+    assert [Timetable.of(ActiveConfig(add=2), views, FitConfig(), moves).schedule for moves in (True, False)] == [
+        "times",
+        "views",
+    ]
+
+
+def test_one_camera_at_each_later_time(swing, tmp_path, opened):  # noqa: F811
+    """All cameras at the first time, then one at each later time, in order; an image is opened once it is picked, and
+    no other image of a training camera ever.
+    """
+    fit(lazily(swing), tmp_path / "run", config(), active=plan(), progress=False)
+    record = selection_of(tmp_path / "run")
+    assert [view["name"] for view in record["start"]] == [f"cam{c}/0" for c in range(1, CAMERAS)]
+    picks = record["picks"]
+    assert [pick["time"] for pick in picks] == pytest.approx([t / (TIMES - 1) for t in range(1, TIMES)])
+    assert [pick["step"] for pick in picks] == [12, 16, 20]
+    for t, pick in enumerate(picks, 1):
+        assert [other["name"] for other in pick["candidates"]] == [f"cam{c}/{t}" for c in range(1, CAMERAS)]
+        assert pick["name"] == f"cam{pick['index'] // TIMES + 1}/{t}"
+        assert pick["seconds"] > 0
+    assert (record["schedule"], record["add"], record["every"]) == ("times", 3, 4)
+    seen = {str(Path(text).relative_to(swing)) for text in opened if swing in Path(text).parents}
+    images = {name.removesuffix(".png") for name in seen if name.endswith(".png")}
+    assert images == {f"cam0/{t}" for t in range(TIMES)} | set(fitted_views(Run(tmp_path / "run")))
+    for pick in picks:
+        assert opened.index(str(swing / f"{pick['name']}.png")) > opened.index(f"picked {pick['name']}")
+
+
+def test_pairs_are_picked_freely(swing, tmp_path):
+    """Any camera at any later time, as many as the budget says; by default one for each later time."""
+    active = plan(schedule="pairs", add=4, every=2)
+    fit(lazily(swing), tmp_path / "run", config(), active=active, progress=False)
+    record = selection_of(tmp_path / "run")
+    later = {f"cam{c}/{t}" for c in range(1, CAMERAS) for t in range(1, TIMES)}
+    assert {other["name"] for other in record["picks"][0]["candidates"]} == later
+    names = [pick["name"] for pick in record["picks"]]
+    assert len(set(names)) == 4
+    assert set(names) <= later
+    assert {other["name"] for other in record["picks"][3]["candidates"]} == later - set(names[:3])
+    assert Timetable.of(plan(schedule="pairs"), lazily(swing).split()[0], config(), True).add == TIMES - 1
+
+
+# ---- resuming
+
+
+def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
+    """With `deterministic`, a fit killed in the static stage, before the first pick and between two goes on to the same
+    picks and the same bits.
+    """
+    import drjit as dr
+
+    threads, cfg, active, whole = dr.thread_count(), config(deterministic=True, save_every=5), plan(), Trainer.step
+
+    def run(name, resume=False):
+        fit(lazily(swing), tmp_path / name, cfg, active=active, resume=resume, progress=False)
+
+    def killed(self):
+        if self.step_index in deaths:
+            deaths.remove(self.step_index)
+            raise Killed
+        return whole(self)
+
+    deaths = [6, 11, 18]
+    try:
+        run("a")
+        monkeypatch.setattr(Trainer, "step", killed)
+        for number, saved in enumerate((5, 10, 16)):
+            with pytest.raises(Killed):
+                run("b", resume=number > 0)
+            assert load_state(tmp_path / "b/state.safetensors")[1]["step"] == saved
+        run("b", resume=True)
+    finally:
+        dr.set_thread_count(threads)
+    assert without_times(tmp_path / "a/selection.json") == without_times(tmp_path / "b/selection.json")
+    assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
+
+
+def test_numbers_left_to_the_data_set_may_be_stated_on_resuming(swing, tmp_path):
+    """What a fit found out by itself is no other fit; another number is."""
+    cfg, active = config(), plan(every=None)
+    fit(lazily(swing), tmp_path / "run", cfg, active=active, progress=False)
+    stated = plan(add=TIMES - 1, every=1)
+    fit(lazily(swing), tmp_path / "run", cfg, active=stated, resume=True, progress=False)
+    with pytest.raises(ValueError, match="must continue the same fit, add was 3 and is 2"):
+        fit(lazily(swing), tmp_path / "run", cfg, active=plan(add=2, every=1), resume=True, progress=False)
+
+
+# ---- options, and bad input
+
+
+def test_command(swing, tmp_path):
+    """`drgs fit --views active --schedule times` passes its options on."""
+    line = f"fit {swing} -o {tmp_path / 'run'} --views active --schedule times --policy farthest --every 2 --quiet"
+    assert cli.main([*line.split(), *["--max-steps", "60", "--max-gaussians", "60", "--sh-degree", "1"]]) == 0
+    record = selection_of(tmp_path / "run")
+    assert (record["schedule"], record["policy"], len(record["picks"])) == ("times", "farthest", TIMES - 1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"every": 8},
+            "must have its 3 picks, one --every 8 steps after the static stage of 8, before step 24, the la",
+        ),
+        ({"add": 4}, "--schedule times must have --add of at most the 3 later times, got 4"),
+        ({"schedule": "pairs", "add": 13}, "at most the 12 training views at later times, got 13"),
+        ({"initial": 3}, "must begin with all cameras at the first time, got --initial 3; drop it"),
+        ({"start": "seed"}, "must begin with all cameras at the first time, got --start seed; drop it"),
+        ({"pick_points": "uncovered"}, "must have --pick-points auto or none, got uncovered"),
+        ({"schedule": "views", "add": 2}, "--schedule must be times or pairs where a deformation is fitted, got views"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(swing, fields, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ActiveViews(plan(**fields), lazily(swing).split()[0], config(), moves=True)
+    assert "\n" not in str(error.value)
+
+
+def test_a_single_time_has_no_later_ones(swing):
+    views = [view for view in lazily(swing).split()[0] if view.camera.time == 0.0]
+    with pytest.raises(ValueError, match="--schedule times must have training views of two times or more, got one"):
+        ActiveViews(plan(), views, config())
+    timeless = [dataclasses.replace(view, camera=dataclasses.replace(view.camera, time=None)) for view in views]
+    with pytest.raises(ValueError, match="must have a time of every view, 'cam1/0' has none"):
+        ActiveViews(plan(), timeless, config())
+    with pytest.raises(ValueError, match="must fit what moves, got --dynamics ignore"):
+        ActiveViews(plan(), views, config(dynamics="ignore"))
+
+
+# ---- policies over (camera, time)
+
+
+def picks_of(policy: str, cameras: int, times: int, schedule: str, count: int) -> list[tuple[int, int]]:
+    """(camera, time) of so many picks, cameras on a line one unit apart, all known at the first time."""
+    K, known = intrinsics(20, 20, 8, 8), []
+
+    def at(c: int, t: int) -> Camera:
+        w2c = np.eye(4)
+        w2c[0, 3] = -float(c)
+        return Camera(K, w2c, 16, 16, name=f"cam{c}/{t}", time=t / (times - 1))
+
+    scene, found = drgs.Gaussians.from_arrays([[0, 0, 5]], [[1, 0, 0, 0]], [[1] * 3], [0.5], np.zeros((1, 1, 3))), []
+    for number in range(count):
+        later = [number + 1] if schedule == "times" else range(1, times)
+        pool = [(c, t) for t in later for c in range(cameras) if (c, t) not in found]
+        train = [at(c, 0) for c in range(cameras)] + known
+        best = select(scene, [at(c, t) for c, t in pool], train, 1, policy).picks[0]
+        found.append(pool[best.index])
+        known.append(at(*found[-1]))
+    return found
+
+
+def test_uniform_takes_every_camera_and_every_time_alike():
+    """After as many picks as cameras each has been picked once, and the first ones are spread; of pairs, times too."""
+    chosen = [c for c, _ in picks_of("uniform", 7, 15, "times", 14)]
+    assert chosen[:3] == [3, 1, 5]
+    assert sorted(chosen[:7]) == sorted(chosen[7:]) == list(range(7))
+    pairs = picks_of("uniform", 3, 7, "pairs", 6)
+    assert sorted(t for _, t in pairs) == [1, 2, 3, 4, 5, 6]
+    assert pairs[0] == (1, 3)
+    assert sorted(c for c, _ in pairs) == [0, 0, 1, 1, 2, 2]
+
+
+def test_farthest_knows_that_a_camera_is_new_at_another_time():
+    """The ends of the line first, not index 0 again and again; no camera twice in a row; pairs are spread in time."""
+    chosen = [c for c, _ in picks_of("farthest", 7, 15, "times", 14)]
+    assert set(chosen[:2]) == {0, 6}
+    assert all(a != b for a, b in zip(chosen, chosen[1:], strict=False))
+    assert len(set(chosen)) >= 5
+    pairs = picks_of("farthest", 3, 7, "pairs", 6)
+    assert pairs[0][1] == 6, "the last time is farthest from the first one"
+    assert len({t for _, t in pairs}) >= 3
