@@ -10,6 +10,7 @@ from pathlib import Path
 from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
+from drgs.data.neu3d import find_videos, load_neu3d
 from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
@@ -72,6 +73,8 @@ def load(
             raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
     elif find_transforms(path):
         loader = load_transforms
+    elif find_videos(path):
+        loader = load_neu3d
     elif find_model(path):
         loader = load_colmap
     elif (path / "poses_bounds.npy").is_file():

@@ -13,7 +13,7 @@ from drgs.data.checks import inverse_pose, list_images, read_npy
 from drgs.data.view_checks import fit_to_image, make_unique
 from drgs.data.views import Dataset, View
 
-__all__ = ["load_llff"]
+__all__ = ["load_llff", "pose_rows", "row_camera"]
 
 
 def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), lazy: bool = False, **_) -> Dataset:
@@ -30,9 +30,7 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
         ValueError: not an (N,17) array, another number of images, or a pose that is not one.
     """
     file = path if path.is_file() else path / "poses_bounds.npy"
-    rows = read_npy(file)
-    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
-        raise ValueError(f"{file}: must have shape (N, 17), got {rows.shape}; this is no LLFF file")
+    rows = pose_rows(file)
     folder = file.parent / "images"
     if not folder.is_dir():
         raise FileNotFoundError(f"{file}: the photos must lie in {folder}, found no such folder; move them there")
@@ -42,20 +40,10 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
             f"{file}: must have one row an image, in the order of their names, got {len(rows)} rows and {len(images)} "
             "images; rows name no image, so that none may be missing: restore them, or drop the rows of missing ones"
         )
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(bad):
-        raise ValueError(f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image")
     views = []
-    for index, (row, image) in enumerate(zip(rows.astype(np.float64), images, strict=True)):
+    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
         where = f"{file}: row {index} ({image.name})"
-        matrix = row[:15].reshape(3, 5)
-        height, width, focal = matrix[:, 4]
-        w2c = inverse_pose(where, c2w_from_llff(matrix))
-        try:
-            K = intrinsics(focal, focal, width / 2, height / 2)
-            camera = Camera(K=K, w2c=w2c, width=width, height=height, name=image.stem)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
+        camera = row_camera(where, row, image.stem)
         views.append(
             View(
                 fit_to_image(camera, image, where, lazy),
@@ -67,3 +55,26 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
         )
     make_unique(views)
     return Dataset(path, "llff", views)
+
+
+def pose_rows(file: Path) -> np.ndarray:
+    """(N, 17) float64 rows of a ``poses_bounds.npy``; ValueError if it is none."""
+    rows = read_npy(file)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
+        raise ValueError(f"{file}: must have shape (N, 17), got {rows.shape}; this is no LLFF file")
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        raise ValueError(f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image")
+    return rows.astype(np.float64)
+
+
+def row_camera(where: str, row: np.ndarray, name: str) -> Camera:
+    """The camera of a row (17,), of the size that it states; ValueError if it is none."""
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4]
+    w2c = inverse_pose(where, c2w_from_llff(matrix))
+    try:
+        K = intrinsics(focal, focal, width / 2, height / 2)
+        return Camera(K=K, w2c=w2c, width=width, height=height, name=name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data.views import View
 
-__all__ = ["ASPECT_TOLERANCE", "check_parallax", "fit_to_image", "go_on_without", "make_unique"]
+__all__ = ["ASPECT_TOLERANCE", "check_parallax", "fit_to_image", "go_on_without", "make_unique", "resized_to"]
 
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
 _FEWEST = 3  # images that a data set must have where others are missing
@@ -109,7 +109,16 @@ def fit_to_image(camera: Camera, path: Path, where: str, lazy: bool = False) -> 
         raise FileNotFoundError(f"{where}: the image {path} must exist, found none; restore it or drop the view")
     if lazy:
         return camera
-    width, height = image_size(path)
+    return resized_to(camera, image_size(path), path, where)
+
+
+def resized_to(camera: Camera, size: tuple[int, int], path: Path, where: str) -> Camera:
+    """The camera at the size (width, height) that an image or video has.
+
+    Raises:
+        ValueError: another shape, by more than 1 %.
+    """
+    width, height = size
     if (width, height) == (camera.width, camera.height):
         return camera
     if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:

@@ -202,6 +202,7 @@ def config_record(
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
         "masks": sorted({_mask_kind(frame) for frame in frames}),
         "points": source,
+        **({"frames": list(dataset.frames)} if dataset.frames else {}),
         **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
         **({"semantics": taught.to_json()} if taught else {}),
         "fit": config.to_json(),

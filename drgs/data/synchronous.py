@@ -1,0 +1,122 @@
+"""Synchronous cameras: the same frames of all of them, a view each, whatever they are kept as."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.data.checks import image_size
+from drgs.data.videos import VideoFrame
+from drgs.data.view_checks import fit_to_image, go_on_without, resized_to
+from drgs.data.views import Dataset, View
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from drgs.cameras import Camera
+    from drgs.data.videos import VideoFile
+
+__all__ = ["Recording", "evenly_spaced", "synchronous"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What one of several synchronous cameras has taken.
+
+    Attributes:
+        name: Of the camera.
+        cameras: As calibrated, of every frame by its number.
+        source: A video, or the image of every frame by its number; some may not exist.
+        where: What states the calibration, for messages.
+        split: What the data set's own files say that it is for; else empty.
+    """
+
+    name: str
+    cameras: Mapping[int, Camera]
+    source: VideoFile | Mapping[int, Path]
+    where: str
+    split: str = ""
+
+
+def evenly_spaced(numbers: Sequence[int], times: int) -> tuple[int, ...]:
+    """At most `times` of the numbers, evenly over all of them, the first and the last included."""
+    if len(numbers) <= times:
+        return tuple(numbers)
+    return tuple(numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, times))
+
+
+def synchronous(
+    dataset: Dataset,
+    recordings: Sequence[Recording],
+    numbers: Sequence[int],
+    *,
+    where: Path,
+    background: tuple[float, float, float],
+    lazy: bool,
+    strict: bool,
+) -> Dataset:
+    """Fill a data set with a view for every camera and frame.
+
+    Frame k of K is at time k / (K - 1); one alone is at 0.
+
+    Args:
+        dataset: Without views.
+        recordings: One a camera, by name.
+        numbers: Of the frames, ascending.
+        where: What lists the frames, for messages.
+        background, lazy, strict: As for `drgs.data.load`.
+
+    Raises:
+        FileNotFoundError: Too few of the images are there.
+        ValueError: Images of another shape than their camera's, or of several sizes in one camera.
+    """
+    digits = max(4, len(str(numbers[-1])))
+    for recording in recordings:
+        size = None
+        for index, number in enumerate(numbers):
+            view = View(
+                None,
+                f"{recording.name}/{number:0{digits}d}",
+                background=background,
+                split=recording.split,
+                is_checked=not lazy,
+                camera_name=recording.name,
+            )
+            there = _found(view, recording, number, lazy)
+            (dataset.views if there else dataset.absent).append(view)
+            if not there:
+                continue
+            time = index / (len(numbers) - 1) if len(numbers) > 1 else 0.0
+            view.camera = dataclasses.replace(view.camera, name=view.name, time=time)
+            if view.image_path is None or lazy:
+                continue
+            found = image_size(view.image_path)
+            if found != (size := size or found):
+                raise ValueError(
+                    f"{view.image_path}: must be {size[0]}x{size[1]} pixels as the other frames of camera "
+                    f"{recording.name}, got {found[0]}x{found[1]}; export the frames again"
+                )
+    go_on_without(where, [view.image_path for view in dataset.absent], len(dataset.views), strict)
+    dataset.frames = tuple(numbers)
+    return dataset
+
+
+def _found(view: View, recording: Recording, number: int, lazy: bool) -> bool:
+    """Give a view its camera and its image, or say that there is none."""
+    where = f"{recording.where}: camera {recording.name}"
+    if isinstance(recording.source, dict):
+        view.image_path = recording.source[number]
+        if not view.image_path.is_file():
+            return False
+        view.camera = fit_to_image(recording.cameras[number], view.image_path, where, lazy)
+        return True
+    video = recording.source
+    view.frame, view.is_checked = VideoFrame(video.path, number), True
+    view.camera = resized_to(recording.cameras[number], (video.width, video.height), video.path, where)
+    return True

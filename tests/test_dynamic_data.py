@@ -1,0 +1,163 @@
+"""Data sets of what moves, written by the tests themselves: videos of 32x24 pixels and 6 frames."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from drgs.cameras import Camera, intrinsics, look_at
+from drgs.data import load, videos
+from drgs.data.videos import VideoFrame, read_video
+from drgs.fitting.config import FitConfig
+
+WIDTH, HEIGHT, FRAMES = 32, 24, 6
+FOCAL = 30.0
+POINT = np.array([0.1, -0.2, 0.3])  # of the scene, painted where cameras see it
+
+
+def cameras(count=4):
+    """Before the origin, on an arc, of the videos' size."""
+    K = intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    eyes = [(2.5 * np.sin(a), -2.5 * np.cos(a), 0.6) for a in np.linspace(-0.5, 0.5, count)]
+    return [Camera(K, look_at(eye, (0, 0, 0)), WIDTH, HEIGHT) for eye in eyes]
+
+
+def coded(index, camera=0):
+    """An image that says its numbers: 8 stripes, black or white, which no codec mistakes."""
+    bits = [(index + 8 * camera) >> bit & 1 for bit in range(8)]
+    stripes = np.repeat(np.array(bits, np.uint8) * 215 + 20, WIDTH // 8)
+    return np.ascontiguousarray(np.broadcast_to(stripes[None, :, None], (HEIGHT, WIDTH, 3)))
+
+
+def decoded(image):
+    """(camera, index) of an image, of 8 bits or of floats in [0, 1]."""
+    stripes = image.reshape(HEIGHT, 8, WIDTH // 8, 3).mean(axis=(0, 2, 3)) * (1 if image.dtype == np.uint8 else 255)
+    return divmod(int((stripes > 128) @ 2 ** np.arange(8)), 8)
+
+
+def write_video(path, images, code="mp4v"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 30, images[0].shape[1::-1])
+    for image in images:
+        writer.write(image)
+    writer.release()
+    return path
+
+
+def write_poses(path, views, scale=1.0):
+    """LLFF's rows: axes down, right, backward in columns; for images `scale` times as large."""
+    rows = []
+    for view in views:
+        right, down, forward, eye = view.c2w[:3].T
+        size = np.array([HEIGHT, WIDTH, FOCAL]) * scale
+        rows.append([*np.stack([down, right, -forward, eye, size], axis=1).ravel(), 1.0, 9.0])
+    np.save(path / "poses_bounds.npy", np.array(rows))
+
+
+@pytest.fixture(scope="module")
+def neu3d(tmp_path_factory):
+    """Four cameras; treat as read-only."""
+    folder = tmp_path_factory.mktemp("neu3d")
+    for k in range(4):
+        write_video(folder / f"cam{k:02d}.mp4", [coded(i, k) for i in range(FRAMES)])
+    write_poses(folder, cameras())
+    return folder
+
+
+def test_videos_of_synchronous_cameras(neu3d):
+    """A view a camera and frame, named and timed alike, with the frame that its name says; the first camera is held out
+    at all times, whatever `test_every` says, and the words that are recorded say so.
+    """
+    data = load(neu3d, test_every=3)
+    assert data.format == "neu3d"
+    assert [view.name for view in data.views] == [f"cam{k:02d}/{i:04d}" for k in range(4) for i in range(FRAMES)]
+    assert data.times == tuple(i / 5 for i in range(FRAMES))
+    assert data.frames == tuple(range(FRAMES))
+    assert data.is_dynamic
+    assert data.camera_names == ("cam00", "cam01", "cam02", "cam03")
+    train, test = data.split()
+    assert {view.camera_name for view in train} == {"cam01", "cam02", "cam03"}
+    assert [view.name for view in test] == [f"cam00/{i:04d}" for i in range(FRAMES)]
+    assert data.split_rule() == "camera cam00 held out at all times"
+    for index in (23, 0, 13, 8):  # in no order: back, forth, another video
+        view = data.views[index]
+        assert view.frame == VideoFrame(neu3d / f"cam{index // 6:02d}.mp4", index % 6)
+        assert view.camera.time == (index % 6) / 5
+        assert decoded(view.image()) == (index // 6, index % 6)
+
+
+@pytest.mark.parametrize(("times", "numbers"), [(1, (0,)), (2, (0, 5)), (4, (0, 2, 3, 5)), (40, tuple(range(6)))])
+def test_frames_are_spread_over_the_whole_video(neu3d, times, numbers):
+    """As many as asked for, the first and the last among them, all if there are no more; one alone does not move."""
+    data = load(neu3d, times=times)
+    assert data.frames == numbers
+    assert [view.frame.index for view in data.views[: len(numbers)]] == list(numbers)
+    assert data.times == tuple(k / max(len(numbers) - 1, 1) for k in range(len(numbers)))
+    assert data.is_dynamic == (times > 1)
+    assert data.split_rule() == "camera cam00 held out at all times"
+
+
+def test_which_cameras_are_held_out(neu3d):
+    """Cameras that are named are held out instead; none leaves it to `test_every`; a config wins over the data set."""
+    data = load(neu3d, test_cameras=("cam03", "cam01"))
+    assert {view.camera_name for view in data.split()[1]} == {"cam01", "cam03"}
+    assert data.split_rule() == "cameras cam01, cam03 held out at all times"
+    assert {view.camera_name for view in data.split(test_cameras=("cam02",))[1]} == {"cam02"}
+    none = load(neu3d, test_cameras=(), test_every=8)
+    assert [view.name for view in none.split()[1]] == ["cam00/0000", "cam01/0002", "cam02/0004"]
+    config = FitConfig(test_cameras=("cam02",), times=3)
+    assert FitConfig.from_json(config.to_json()) == config
+    for cameras, text in ((("cam9",), "among cam00"), (("cam00", "cam01", "cam02", "cam03"), "must leave a camera")):
+        with pytest.raises(ValueError, match=text):
+            load(neu3d, test_cameras=cameras)
+
+
+def test_poses_of_videos_in_llff_axes(tmp_path):
+    """A point of the scene is where the videos show it, though the poses are stated for images four times as large."""
+    views = cameras()
+    for k, view in enumerate(views):
+        (pixel,), _ = view.project(POINT[None])
+        distance = np.hypot(*np.moveaxis(np.indices((HEIGHT, WIDTH)) + 0.5 - pixel[::-1, None, None], 0, 0))
+        spot = np.repeat((255 * np.exp(-0.5 * (distance / 2) ** 2)).astype(np.uint8)[..., None], 3, axis=2)
+        write_video(tmp_path / f"cam{k:02d}.avi", [spot] * 2, "MJPG")
+    write_poses(tmp_path, views, scale=4)
+    for view in load(tmp_path, lazy=True).views:
+        image = view.image()[..., 0] ** 2  # of the background, a codec's noise remains
+        found = [(image * (grid + 0.5)).sum() / image.sum() for grid in np.indices(image.shape)]
+        (pixel,), depth = view.camera.project(POINT[None])
+        assert depth > 0
+        # Rounding to 8 bits and the codec move the middle of a spot of 2 pixels by some hundredths of a pixel.
+        np.testing.assert_allclose(pixel, found[::-1], atol=0.15)
+
+
+@pytest.mark.parametrize(("suffix", "code"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".webm", "VP80"), (".mkv", "mp4v")])
+def test_frames_of_every_container(tmp_path, suffix, code):
+    """40 frames are counted by their packets, and each that is asked for is the one that is read, wherever the reader
+    was before.
+    """
+    path = write_video(tmp_path / f"v{suffix}", [coded(i) for i in range(40)], code)
+    assert read_video(path).count == len(read_video(path).stamps) == 40
+    for index in (39, 0, 20, 19, 21, 22, 1, 38):
+        assert decoded(VideoFrame(path, index).read()) == divmod(index, 8)
+
+
+def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
+    """A reader that seeks to another frame than asked for is not believed: its frames are decoded from the start."""
+    real = cv2.VideoCapture
+
+    class Careless:
+        def __init__(self, *args):
+            self.real = real(*args)
+
+        def set(self, name, value):
+            return self.real.set(name, max(0, value - 2) if name == cv2.CAP_PROP_POS_FRAMES else value)
+
+        def __getattr__(self, name):
+            return getattr(self.real, name)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Careless)
+    monkeypatch.setattr(videos, "_readers", type(videos._readers)())
+    monkeypatch.setattr(videos, "_NEAR", 0)
+    for index in (4, 2, 5, 0, 3):
+        assert decoded(VideoFrame(neu3d / "cam02.mp4", index).read()) == (2, index)
