@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
-from drgs.cameras import Camera, intrinsics, look_at
-from drgs.data import load, videos
+from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
+from drgs.data import initial_points, load, videos
 from drgs.data.videos import VideoFrame, read_video
 from drgs.fitting.config import FitConfig
 
@@ -161,3 +163,78 @@ def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
     monkeypatch.setattr(videos, "_NEAR", 0)
     for index in (4, 2, 5, 0, 3):
         assert decoded(VideoFrame(neu3d / "cam02.mp4", index).read()) == (2, index)
+
+
+def test_points_come_from_the_first_frame_of_training_cameras(neu3d, monkeypatch):
+    """No other frame is decoded, and none of the camera that is held out."""
+    read, real = set(), VideoFrame.read
+
+    def recorded(frame):
+        read.add((frame.path.stem, frame.index))
+        return real(frame)
+
+    monkeypatch.setattr(VideoFrame, "read", recorded)
+    data = load(neu3d, test_cameras=("cam02",))
+    for source in (data, data.split()[0]):
+        read.clear()
+        points, colors, words = initial_points(source, max_points=100)
+        assert len(points) == len(colors) == 100
+        assert "3 cameras" in words
+        assert read == {("cam00", 0), ("cam01", 0), ("cam03", 0)}
+
+
+def write_dnerf(folder, times):
+    """Blender's layout with times: paths without a suffix, an image with alpha, a camera at a pose of its own each."""
+    for split, values in times.items():
+        frames = []
+        for k, (view, time) in enumerate(zip(cameras(len(values)), values, strict=True)):
+            path = folder / split / f"r_{k:03d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), np.dstack([coded(k), np.full((HEIGHT, WIDTH), 255, np.uint8)]))
+            pose = c2w_to_opengl(view.c2w).tolist()
+            frame = {"file_path": f"./{split}/r_{k:03d}", "rotation": 0.1, "transform_matrix": pose}
+            frames.append(frame if time is None else frame | {"time": time})
+        data = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+
+
+def test_dnerf(tmp_path):
+    """Each photograph has the time that its frame states, in whatever order, and views may share one; the files say
+    which are for testing, and `times` leaves none out.
+    """
+    write_dnerf(tmp_path, {"train": (0.6, 0.0, 1.0, 0.6), "val": (0.3, 0.7), "test": (0.25, 0.75)})
+    data = load(tmp_path, times=2)
+    assert data.format == "transforms"
+    train, test = data.split()
+    assert [(view.name, view.camera.time) for view in train] == [
+        ("train/r_000", 0.6),
+        ("train/r_001", 0.0),
+        ("train/r_002", 1.0),
+        ("train/r_003", 0.6),
+    ]
+    assert [view.camera.time for view in test] == [0.25, 0.75]
+    assert data.times == (0.0, 0.25, 0.3, 0.6, 0.7, 0.75, 1.0)
+    assert data.is_dynamic
+    assert data.camera_names == data.frames == ()
+    for view, expected in zip(train, cameras(4), strict=True):
+        np.testing.assert_allclose(view.camera.w2c, expected.w2c, atol=1e-12)
+        np.testing.assert_allclose(view.camera.K, expected.K)
+    assert decoded(train[2].image()) == (0, 2)
+    # One camera at a time: points come from all of its views.
+    assert "4 cameras" in initial_points(train, max_points=50)[2]
+
+
+def test_times_that_cannot_be(tmp_path, caplog):
+    """A view without a time among others is refused, a test view after all training views told of; views of one time
+    stand still, with no word about those without.
+    """
+    write_dnerf(tmp_path, {"train": (0.0, None, 1.0), "test": (0.5,)})
+    with pytest.raises(ValueError, match=r"1 have none \(as view 'train/r_001'\); state all"):
+        load(tmp_path)
+    write_dnerf(tmp_path, {"train": (0.0, 0.5, 1.0), "test": (0.5, 1.5)})
+    assert load(tmp_path).is_dynamic
+    assert "1 of the 2 test views are before or after all training views (0 to 1), as 'test/r_001'" in caplog.text
+    write_dnerf(tmp_path, {"train": (0.5, 0.5, 0.5), "test": (None,)})
+    assert not load(tmp_path).is_dynamic
+    with pytest.raises(ValueError, match="test_cameras must be left out where views are of no named cameras"):
+        load(tmp_path, test_cameras=("r_000",))

@@ -15,6 +15,7 @@ from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
 from drgs.data.transforms import find_transforms, load_transforms
+from drgs.data.view_checks import check_times
 from drgs.data.views import Dataset, View
 from drgs.guards.foreign import refuse_foreign
 
@@ -95,6 +96,7 @@ def load(
     if test_cameras is not None:
         dataset.test_cameras = tuple(test_cameras)
     dataset.split()  # refuses numbers that cannot be
+    check_times(dataset)
     if semantics:
         attach(dataset, lazy)
     return dataset

@@ -67,7 +67,9 @@ def initial_points(
 
     The data set's own points; back-projected depth maps; SIFT features triangulated with the given
     poses; random points where the cameras look. Given a list of views, nothing but these views is
-    read, as active runs need it.
+    read, as active runs need it. Of synchronous cameras of a data set, those that are held out are not
+    read. What moves has points where it was at first: of views at several times, those at the first one
+    are read, unless they are from one place (a single camera that moves: then all).
 
     Args:
         data: a data set, or views (then there are no given points).
@@ -79,7 +81,7 @@ def initial_points(
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
     rng = np.random.default_rng(seed)
-    views = data.views if isinstance(data, Dataset) else list(data)
+    views = _all_at_first(data) if isinstance(data, Dataset) else _at_first(list(data))
     if not views:
         raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
@@ -109,6 +111,21 @@ def initial_points(
         tried = f" (triangulation gave {len(points)})"
     points, colors = _random(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
+
+
+def _all_at_first(data: Dataset) -> list[View]:
+    """The views of a data set that points may come from: where cameras are held out, the others."""
+    return _at_first(data.split()[0] if data.camera_names else data.views)
+
+
+def _at_first(views: list[View]) -> list[View]:
+    """Those at the first time, if there are several times and these views are from several places; else all."""
+    times = sorted({view.camera.time for view in views if view.camera.time is not None})
+    if len(times) < 2:
+        return views
+    first = [view for view in views if view.camera.time == times[0]]
+    centers = np.array([view.camera.center for view in first])
+    return first if np.ptp(centers, axis=0).max() > 1e-9 * max(1.0, float(np.abs(centers).max())) else views
 
 
 def added_points(

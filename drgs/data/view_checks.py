@@ -14,9 +14,17 @@ from drgs.data.checks import image_size
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.data.views import View
+    from drgs.data.views import Dataset, View
 
-__all__ = ["ASPECT_TOLERANCE", "check_parallax", "fit_to_image", "go_on_without", "make_unique", "resized_to"]
+__all__ = [
+    "ASPECT_TOLERANCE",
+    "check_parallax",
+    "check_times",
+    "fit_to_image",
+    "go_on_without",
+    "make_unique",
+    "resized_to",
+]
 
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
 _FEWEST = 3  # images that a data set must have where others are missing
@@ -80,6 +88,38 @@ def check_parallax(views: list[View]) -> None:
     if same := len(poses) - len(np.unique(np.c_[np.round(poses / tiny).reshape(len(poses), -1), times], axis=0)):
         _log.warning(
             "%d of the %d training views have the pose of another one; check the camera file", same, len(poses)
+        )
+
+
+def check_times(dataset: Dataset) -> None:
+    """Refuse views without a time among those of a scene that moves, and warn where test views are before or after all
+    training views.
+
+    Times may be in any unit and order, and views may share one.
+
+    Raises:
+        ValueError: training views of two times or more, and a view of none.
+    """
+    if not dataset.is_dynamic:
+        return
+    train, test = dataset.split()
+    without = [view.name for view in train + test if view.camera.time is None]
+    if without:
+        raise ValueError(
+            f"{dataset.path}: every view of a scene that moves must have a time, {len(without)} have none (as view "
+            f"{without[0]!r}); state all, or remove all for a scene that stands still"
+        )
+    first, last = min(view.camera.time for view in train), max(view.camera.time for view in train)
+    beyond = [view.name for view in test if not first <= view.camera.time <= last]
+    if beyond:
+        _log.warning(
+            "%d of the %d test views are before or after all training views (%g to %g), as %r: nothing says how things "
+            "move there",
+            len(beyond),
+            len(test),
+            first,
+            last,
+            beyond[0],
         )
 
 
