@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_active import write_still
+from test_dynamic_data import cameras, coded, write_poses, write_video
 
 from drgs import train
 from drgs.files import write_json
@@ -67,15 +68,16 @@ def faked(monkeypatch):
 
 
 def fakes(folder, config, active, train=("a", "b", "c"), test=("t",)):
-    """The files of a finished run."""
+    """The files of a finished run; without `active`, of a fit to all views."""
     schema = {"schema": 1, "command": "fit"}
-    recorded = {"data": "x", "train": train[:2], "test": test, "fit": config.to_json(), "active": active.to_json()}
-    write_json(folder / "config.json", {**schema, **recorded})
+    recorded = {"data": "x", "train": train[:2] if active else train, "test": test, "fit": config.to_json()}
+    write_json(folder / "config.json", {**schema, **recorded, **({"active": active.to_json()} if active else {})})
     write_json(folder / "env.json", {"schema": 1, "commit": "0123456789", "drgs": "9"})
     picks = [{"index": 2, "name": train[2], "seconds": 0.5}]
     start = [{"index": i, "name": name} for i, name in enumerate(train[:2])]
     leak = config.init_points == "all"
-    write_json(folder / "selection.json", {**schema, "start": start, "picks": picks, "pool_leak": leak})
+    if active:
+        write_json(folder / "selection.json", {**schema, "start": start, "picks": picks, "pool_leak": leak})
     mean = {"psnr": 20.0 + config.seed, "flip": None}
     counts = {"count": len(test), "gaussians": 3, "step": config.max_steps, "seconds": 1.5}
     write_json(folder / "metrics.json", {"schema": 1, "split": "test", "mean": mean, **counts})
@@ -169,6 +171,47 @@ def test_seeds_are_of_different_initial_views(still):
     assert [sets.index(chosen) for chosen in dict.fromkeys(sets)] == seeds
     with pytest.raises(ValueError, match="must have 1000 sets of initial views"):
         distinct_seeds(study, "still", SPLIT, 1000)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """Four cameras that film six frames."""
+    folder = tmp_path_factory.mktemp("filmed")
+    for k in range(4):
+        write_video(folder / f"cam{k:02d}.mp4", [coded(i, k) for i in range(6)])
+    write_poses(folder, cameras())
+    return folder
+
+
+def test_units_of_held_out_cameras(filmed, faked, tmp_path):
+    """A unit may be (scene, camera held out): the fit and the data set are told so, the row says so and is read back,
+    and two cameras are two units; a policy that picks nothing has no active config and no seconds a pick.
+    """
+    study = dataclasses.replace(
+        small(filmed, times=3),
+        policies={"farthest": {"policy": "farthest"}, "all": None},
+        active=ActiveConfig(schedule="times", add=2, every=3),
+    )
+    cells = study.cells([("film", camera, "first", "blind", 0) for camera in ("cam01", "cam02")])
+    assert [cell.name for cell in cells[::2]] == [f"film-{name}-first0-blind-farthest" for name in ("cam01", "cam02")]
+    data = study.dataset(cells[2])
+    assert data.times == (0.0, 0.5, 1.0)
+    assert {view.camera_name for view in data.split()[1]} == {"cam02"}
+    with pytest.raises(ValueError, match="cam9"):
+        study.dataset(dataclasses.replace(cells[0], camera="cam9"))
+    rows = tmp_path / "rows.jsonl"
+    assert run_cells(study, cells, tmp_path, rows, str) == ([], [])
+    assert [config.test_cameras for config, _ in faked] == [("cam01",), ("cam01",), ("cam02",), ("cam02",)]
+    assert [active and active.schedule for _, active in faked] == ["times", None, "times", None]
+    found = read_study(rows)
+    assert [cell_of(row)[1] for row in found] == cells
+    assert [(row["picks"], row["pick_seconds"]) for row in found[:2]] == [(["cam00/0005"], 0.5), ([], None)]
+    assert found[0]["initial"] != found[1]["initial"]
+    assert len({unit_of(row) for row in found}) == 2
+    text = " ".join(study_report(dataclasses.replace(study, reference="all"), found).split())
+    assert "Units (scene, camera held out): film 2" in text
+    assert "- film 2: cam02 held out; all other cameras at the first time" in text
+    assert "| all | 20.00 | none | 10 | none | 2 |" in text
 
 
 # ---- files

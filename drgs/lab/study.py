@@ -31,6 +31,7 @@ from drgs.train import fit
 
 __all__ = ["Cell", "Metric", "Study", "append_row", "cell_of", "distinct_seeds", "read_study", "run_cell", "run_cells"]
 
+Unit = tuple[str, tuple[int, int] | str, Start, "Protocol", int]
 Protocol = Literal["blind", "paper"]
 """`blind`: nothing of a view is read before it is picked. `paper`: initial points of the whole data set (pool_leak)."""
 
@@ -49,6 +50,8 @@ class Cell:
         policy: Label of a policy of the study.
         protocol: `blind` or `paper`.
         seed: Of everything random in the fit.
+        camera: Of what several cameras film at once: the one that is held out at all times, in place of `split`, which
+            is (0, 0); what is known at the start is what all others see at the first time, whatever `start` says.
     """
 
     scene: str
@@ -57,17 +60,19 @@ class Cell:
     policy: str
     protocol: Protocol
     seed: int
+    camera: str = ""
 
     @property
     def name(self) -> str:
         """Of its run folder."""
         words = re.sub(r"[^a-z0-9.+]+", "-", self.policy.lower()).strip("-")
-        every, offset = self.split
-        return f"{self.scene}-{every}+{offset}-{self.start}{self.seed}-{self.protocol}-{words}"
+        held_out = self.camera or "{}+{}".format(*self.split)
+        return f"{self.scene}-{held_out}-{self.start}{self.seed}-{self.protocol}-{words}"
 
     def to_json(self) -> dict:
-        """As a row begins."""
-        return {**dataclasses.asdict(self), "split": list(self.split)}
+        """As a row begins; without a camera where none is held out, as in rows of studies that know none."""
+        fields = {**dataclasses.asdict(self), "split": list(self.split)}
+        return fields if self.camera else {name: x for name, x in fields.items() if name != "camera"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +114,7 @@ class Study:
     Attributes:
         name: Of the study and its scale; in every row, and the folder of its runs.
         folder: Scene and split -> folder of the data set, made where it is not there yet.
-        policies: Label -> fields of `ActiveConfig`.
+        policies: Label -> fields of `ActiveConfig`; None: all views are known from the start, and none is picked.
         fit: What every fit does; seed, split and initial points are the cell's.
         active: How views are chosen; start and policy are the cell's.
         metrics: What a row holds.
@@ -119,30 +124,32 @@ class Study:
 
     name: str
     folder: Callable[[str, tuple[int, int]], Path]
-    policies: Mapping[str, Mapping[str, Any]]
+    policies: Mapping[str, Mapping[str, Any] | None]
     fit: FitConfig
     active: ActiveConfig
     metrics: tuple[Metric, ...]
     reference: str
     comparisons: tuple[tuple[str, str], ...] = ()
 
-    def cells(self, units: Iterable[tuple[str, tuple[int, int], Start, Protocol, int]]) -> list[Cell]:
-        """The cells of units (scene, split, start, protocol, seed), units outermost: what is there at any time is a
-        complete study of fewer units, one unit aside for each process.
+    def cells(self, units: Iterable[Unit]) -> list[Cell]:
+        """The cells of units (scene, split or camera held out, start, protocol, seed), units outermost: what is there
+        at any time is a complete study of fewer units, one unit aside for each process.
         """
-        return [
-            Cell(scene, split, start, policy, protocol, seed)
-            for scene, split, start, protocol, seed in units
-            for policy in self.policies
-        ]
+        found = []
+        for scene, held_out, start, protocol, seed in units:
+            split, camera = ((0, 0), held_out) if isinstance(held_out, str) else (held_out, "")
+            found += [Cell(scene, split, start, policy, protocol, seed, camera) for policy in self.policies]
+        return found
 
-    def configs(self, cell: Cell) -> tuple[FitConfig, ActiveConfig]:
+    def configs(self, cell: Cell) -> tuple[FitConfig, ActiveConfig | None]:
         """What the fit of a cell is told."""
         every, offset = cell.split
         points = "all" if cell.protocol == "paper" else "views"
         changed: dict[str, Any] = {"seed": cell.seed, "test_every": every, "test_offset": offset, "init_points": points}
-        active = dataclasses.replace(self.active, start=cell.start, **self.policies[cell.policy])
-        return dataclasses.replace(self.fit, **changed), active
+        if cell.camera:
+            changed["test_cameras"] = (cell.camera,)
+        fields, config = self.policies[cell.policy], dataclasses.replace(self.fit, **changed)
+        return config, None if fields is None else dataclasses.replace(self.active, start=cell.start, **fields)
 
     def _made(self, cell: Cell) -> Path:
         """The folder of a cell's data set, once no other process is making it any more."""
@@ -170,7 +177,11 @@ class Study:
             background=self.fit.settings.background,
             lazy=True,
             points=cell.protocol == "paper",
+            times=self.fit.times,
+            test_cameras=(cell.camera,) if cell.camera else None,
         )
+        if cell.camera:
+            return dataset  # which knows the camera, or has been refused
         names = sorted(view.name for view in (*dataset.views, *dataset.absent))
         held_out = {view.name for view in dataset.split()[1]}
         there = {view.name for view in dataset.views}
@@ -188,11 +199,13 @@ def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int,
     Raises:
         ValueError: If there are not as many sets.
     """
-    cell = Cell(scene, split, "seed", next(iter(study.policies)), "blind", first)
+    policy = next(label for label, fields in study.policies.items() if fields is not None)
+    cell = Cell(scene, split, "seed", policy, "blind", first)
     train = study.dataset(cell).split()[0]
     found: dict[frozenset[int], int] = {}
     for seed in range(first, first + (100 * count if count <= len(train) else 0)):
         config, active = study.configs(dataclasses.replace(cell, seed=seed))
+        assert active is not None  # of such a policy
         found.setdefault(frozenset(ActiveViews(active, train, config).chosen), seed)
         if len(found) == count:
             return list(found.values())
@@ -206,8 +219,8 @@ def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int,
 
 def cell_of(row: Mapping[str, Any]) -> tuple[str, Cell]:
     """The study and the cell of a row."""
-    fields = {field.name: row[field.name] for field in dataclasses.fields(Cell)}
-    return row["study"], Cell(**{**fields, "split": tuple(fields["split"])})
+    fields = {field.name: row[field.name] for field in dataclasses.fields(Cell) if field.name != "camera"}
+    return row["study"], Cell(**{**fields, "split": tuple(fields["split"]), "camera": row.get("camera", "")})
 
 
 def read_study(*paths: Path) -> list[dict]:
@@ -318,10 +331,12 @@ def run_cells(
     return taken, failed
 
 
-def _check_same(run: Run, config: FitConfig, active: ActiveConfig) -> None:
+def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> None:
     """Refuse a run folder that was begun by another fit: by a study that had other numbers under the same name."""
     recorded = run.config()
     for wanted, found in ((config, recorded.get("fit")), (active, recorded.get("active"))):
+        if wanted is None:
+            continue
         now = json.loads(json.dumps(wanted.to_json()))
         was = {**json.loads(json.dumps(type(wanted)().to_json())), **(found or {})}
         for key, value in now.items():
@@ -341,20 +356,23 @@ def _row(study: Study, cell: Cell, run: Run) -> dict:
             f"{run.path / 'metrics.json'}: must be of the test views, is of {metrics.get('split')!r}; "
             f"run `drgs eval {run.path}`"
         )
-    chosen = read_json(run.path / SELECTION, "the record of the chosen views", advice)
     env = read_json(run.path / "env.json", "where a run ran", advice)
-    picks = chosen["picks"]
+    if study.policies[cell.policy] is None:
+        start, picks, leak = run.config()["train"], [], cell.protocol == "paper"
+    else:
+        chosen = read_json(run.path / SELECTION, "the record of the chosen views", advice)
+        start, picks, leak = [view["name"] for view in chosen["start"]], chosen["picks"], chosen["pool_leak"]
     return {
         "study": study.name,
         **cell.to_json(),
-        "initial": [view["name"] for view in chosen["start"]],
+        "initial": start,
         "picks": [pick["name"] for pick in picks],
         "metrics": {metric.key: metric.read(metrics) for metric in study.metrics},
         "views": metrics["count"],
         "gaussians": metrics.get("gaussians"),
         "seconds": metrics.get("seconds"),
-        "pick_seconds": float(np.mean([pick["seconds"] for pick in picks])),
-        "pool_leak": chosen["pool_leak"],
+        "pick_seconds": float(np.mean([pick["seconds"] for pick in picks])) if picks else None,
+        "pool_leak": leak,
         "commit": env["commit"],
         "drgs": env["drgs"],
     }

@@ -98,9 +98,14 @@ def _size(rows: StudyRows) -> str:
     ]
     fits = f"{len(rows)} fit{'s' if len(rows) > 1 else ''}, on commits {', '.join(commits)}"
     return (
-        f"{fits}. Units (scene, split, initial views): {', '.join(each)}. "
+        f"{fits}. {_kind(rows)}: {', '.join(each)}. "
         f"Fits of one unit that differ by the seed alone are averaged.{_mixed(rows)}"
     )
+
+
+def _kind(rows: StudyRows) -> str:
+    """What a unit is here."""
+    return f"Units (scene, {'camera held out' if rows[0].get('camera') else 'split, initial views'})"
 
 
 def _mixed(rows: StudyRows) -> str:
@@ -135,9 +140,9 @@ def _means(study: Study, rows: StudyRows) -> str:
         for metric in study.metrics:
             values = values_of(rows, metric.key, label)
             cells.append(f"{np.mean(list(values.values())):.{metric.digits}f}" if values else "none")
-        seconds = np.mean([row["pick_seconds"] for row in rows if row["policy"] == label])
+        seconds = [x for row in rows if row["policy"] == label and (x := row["pick_seconds"]) is not None]
         count = len({unit_of(row) for row in rows if row["policy"] == label})
-        lines.append([label, *cells, f"{seconds:.2f}", str(count)])
+        lines.append([label, *cells, f"{np.mean(seconds):.2f}" if seconds else "none", str(count)])
     heads = ["policy", *(_title(metric) for metric in study.metrics), "seconds a pick", "units"]
     return _table(heads, lines)
 
@@ -247,6 +252,8 @@ def _points(study: Study, rows: StudyRows) -> str:
     key = [
         f"- {names[unit]}: one view in {unit[1][0]} held out, from index {unit[1][1]} on; initial views "
         f"{', '.join(unit[2])}"
+        if unit[1][0]
+        else f"- {names[unit]}: {', '.join(unit[2])} held out; all other cameras at the first time"
         for unit in units
     ]
     parts = ["\n".join(key)]

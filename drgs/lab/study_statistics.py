@@ -1,6 +1,7 @@
 """What a study says: differences of policies within a unit, and intervals over scenes and units.
 
-A unit is (scene, split, initial views): what a policy is given before it picks. Fits of one unit that differ by the
+A unit is (scene, split, initial views): what a policy is given before it picks; of what several cameras film at once
+it is (scene, camera held out), for all others are known at the first time. Fits of one unit that differ by the
 seed alone are averaged first. Two policies are compared by their differences within units; the mean of the scenes'
 means is the estimate, so that a scene with more units does not count more, and its 95 % interval comes from a bootstrap
 that draws scenes first and then units of each.
@@ -51,7 +52,11 @@ class Effect:
 
 
 def unit_of(row: Mapping[str, Any]) -> Unit:
-    """The unit of a row: initial views count as a set. Where they were not recorded: what drew them."""
+    """The unit of a row: initial views count as a set. Where they were not recorded: what drew them. Where a camera is
+    held out, which says what is known at the start, it stands for them.
+    """
+    if row.get("camera"):
+        return row["scene"], tuple(row["split"]), (row["camera"],)
     drawn = (f"seed {row['seed']}",) if row["start"] == "seed" else ("first",)
     return row["scene"], tuple(row["split"]), tuple(sorted(row.get("initial") or drawn))
 
