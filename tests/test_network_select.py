@@ -1,0 +1,212 @@
+"""Choosing views by what they tell about a deformation: alone, beside other blocks, over cameras and times."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import camera, gaussians
+from test_network_information import swarm
+
+from drgs import fisher
+from drgs.gain import Prior, information_gain
+from drgs.information.combine import asked_of
+from drgs.information.semantics import SemanticMetric
+from drgs.select import Cache, Scoring, select
+from drgs.settings import RenderSettings
+
+FAST = RenderSettings.preset("fast")
+K = 2  # probes
+
+
+@pytest.fixture(scope="module")
+def views():
+    """A scene that moves, and views of three cameras at three times each."""
+    rng = np.random.default_rng(4)
+    scene = swarm(gaussians(rng, 8, 1).detach())
+    found = []
+    for number in range(3):
+        cam = camera(rng, (16, 16))
+        for t in (0.0, 0.5, 1.0):
+            name = f"cam{number:02d}/{round(2 * t):04d}"
+            found.append(dataclasses.replace(cam, time=t, name=name, w2c=cam.w2c.detach()))
+    return scene, found
+
+
+def pick(scene, candidates, train, k=1, cache=None, rng=None, policy="fisher", **fields):
+    return select(scene, candidates, train, k, policy, cache=cache, rng=rng, settings=FAST, probes=K, **fields)
+
+
+@pytest.fixture(scope="module")
+def cache():
+    """One for all tests: the scene stays what it is."""
+    return Cache()
+
+
+def test_ratio_joins_the_groups(views, cache):
+    """By default a field's groups are scored like all others, and their parts are logged beside them."""
+    scene, cams = views
+    train, candidates = cams[:1], cams[2:5]
+    found = pick(scene, candidates, train, cache=cache)
+    assert found.blocks == ["geometry", "deformation"]
+    assert found.network == {"score": "ratio", "probes": K}
+    assert found.combine == "sum"
+    assert any("take 8 or more" in note for note in found.notes)
+    told = [fisher.network(scene, cam, FAST, probes=K) for cam in (*train, *candidates)]
+    still = [fisher.diagonal(scene.at(cam.time), cam, FAST) for cam in (*train, *candidates)]
+    for i, parts in enumerate(found.parts, 1):
+        assert list(parts) == ["means", "rotations", "log_scales", "logit_opacities", "sh", "grid", "mlp"]
+        want = information_gain(told[i], told[0]).parts | information_gain(still[i], still[0]).parts
+        for name, x in parts.items():
+            assert x == pytest.approx(want[name], rel=1e-4), name  # information is kept in float32
+        assert found.scores[i - 1] == pytest.approx(sum(parts.values()))
+    alone = pick(scene, candidates, train, cache=cache, blocks=("deformation",))
+    assert [list(x) for x in alone.parts] == [["grid", "mlp"]] * 3
+    assert [x["mlp"] for x in alone.parts] == [x["mlp"] for x in found.parts]
+    without = pick(scene, candidates, train, cache=cache, blocks=("geometry",))
+    assert without.network is None
+    assert "grid" not in without.parts[0]
+
+
+def test_weights_lambda_and_groups_of_a_field(views, cache):
+    """They go by the groups' names; lambda = 0 leaves out weights that no known view tells about."""
+    scene, cams = views
+    run = lambda **fields: pick(scene, cams[2:5], cams[:1], cache=cache, **fields)  # noqa: E731
+    plain = run(blocks=("deformation",))
+    weighed = run(blocks=("deformation",), weights={"grid": 0.0, "mlp": 2.0})
+    assert [x["mlp"] for x in weighed.parts] == [2 * x["mlp"] for x in plain.parts]
+    assert all(x["grid"] == 0 for x in weighed.parts)
+    firm = run(blocks=("deformation",), prior=Prior(1e-6, groups={"mlp": 1e3}))
+    assert all(a["mlp"] < b["mlp"] and a["grid"] == b["grid"] for a, b in zip(firm.parts, plain.parts, strict=True))
+    none = run(blocks=("deformation",), prior=Prior(0.0))
+    assert none.left_out["grid"] > 0  # cells of other times
+    assert any("lambda = 0" in note for note in none.notes)
+    assert list(run(groups=("means", "mlp")).parts[0]) == ["means", "mlp"]
+    assert list(run(groups=("grid",)).parts[0]) == ["grid"]
+    with pytest.raises(ValueError, match="groups must have one that blocks deformation tell about, got sh"):
+        run(groups=("sh",), blocks=("deformation",))
+
+
+def test_greedy_over_pairs_of_camera_and_time(views, cache):
+    """k picks at once are k calls in a row, lazily or not; two times at one pose are different candidates."""
+    scene, cams = views
+    train, left, picked = cams[:1], cams[1:], []
+    at_once = pick(scene, left, train, 3, cache=cache, blocks=("deformation",))
+    for _ in range(3):
+        one = pick(scene, left, [*train, *picked], cache=cache, blocks=("deformation",)).picks[0]
+        picked.append(left.pop(one.index))
+        assert one.name == at_once.picks[len(picked) - 1].name
+    scores = pick(scene, cams[1:], train, cache=cache, blocks=("deformation",)).scores
+    assert len(set(scores)) == len(scores)
+    assert cache.misses < cache.hits
+
+
+@pytest.mark.parametrize("network", ["trace", "paper"])
+def test_a_trace_needs_nothing_known(views, cache, network):
+    """The paper's scores: of a candidate alone, whatever the known views and lambda are; k picks are the k best."""
+    scene, cams = views
+    options = {"cache": cache, "blocks": ("deformation",), "network": network}
+    found = pick(scene, cams[1:4], cams[:1], 2, **options)
+    for cam, score, parts in zip(cams[1:4], found.scores, found.parts, strict=True):
+        want = fisher.network(scene, cam, FAST, estimate=network, probes=K)
+        assert parts == pytest.approx({name: float(x) for name, x in want.items()}, rel=1e-5)
+        assert score == pytest.approx(sum(parts.values()))
+    again = pick(scene, cams[1:4], [], 2, prior=Prior(0.0), **options)
+    assert again.scores == found.scores
+    assert sorted(found.scores)[-2:] == [x.score for x in reversed(found.picks)]
+
+
+@pytest.mark.parametrize("network", ["ratio", "trace"])
+def test_zscores_over_the_candidates(views, cache, network):
+    """Each block is scored by its own information, less the mean over the standard deviation of the candidates."""
+    scene, cams = views
+    run = lambda **fields: pick(scene, cams[1:5], cams[:1], cache=cache, **fields)  # noqa: E731
+    fields = {} if network == "trace" else {"combine": "zscore"}  # with a trace it is the default
+    found = run(network=network, k=2, **fields)
+    assert found.combine == "zscore"
+    assert any("z-scores of geometry, deformation" in note for note in found.notes)
+    total = np.zeros(4)
+    for block in ("geometry", "deformation"):
+        scores = np.array(run(blocks=(block,), network=network).scores)
+        z = (scores - scores.mean()) / scores.std()
+        own = [sum(x for name, x in parts.items() if name.startswith(f"{block}.")) for parts in found.parts]
+        assert own == pytest.approx(z, rel=1e-6, abs=1e-9)
+        total += z
+    assert found.scores == pytest.approx(total, abs=1e-9)
+    assert found.picks[0].index == int(np.argmax(found.scores))
+    # The second pick is by z-scores of those that are left, against what is known then.
+    left = [i for i in range(4) if i != found.picks[0].index]
+    known = [cams[0], cams[1 + found.picks[0].index]]
+    after = pick(scene, [cams[1 + i] for i in left], known, cache=cache, network=network, **fields)
+    assert found.picks[1].index == left[after.picks[0].index]
+    assert found.picks[1].score == pytest.approx(after.picks[0].score, rel=1e-6)
+
+
+def test_constant_blocks_count_nothing(views, cache):
+    """A block that is the same for all candidates has no z-score, and one candidate alone has none."""
+    scene, cams = views
+    found = pick(scene, [cams[2], cams[2]], cams[:1], cache=cache, combine="zscore")
+    assert found.scores == [0, 0]
+    assert pick(scene, [cams[2]], cams[:1], cache=cache, combine="zscore").scores == [0]
+
+
+def test_a_field_that_is_silent_is_noted(views):
+    """Where no view tells about a group, a note says so; it is no silent 0."""
+    scene, cams = views
+    start = swarm(scene.gaussians, std=0.0)
+    found = pick(start, cams[1:3], cams[:1], blocks=("deformation",))
+    assert any(note.startswith("deformation: no view has information about grid,") for note in found.notes)
+    assert not any("about mlp" in note for note in found.notes)
+    nobody = swarm(scene.gaussians, motion=torch.full((8,), -1.0))
+    found = pick(nobody, cams[1:3], cams[:1], blocks=("deformation",))
+    assert sum(note.startswith("deformation: no view has") for note in found.notes) == 2
+    assert any(note.startswith("every score is 0") for note in found.notes)
+
+
+def test_rows_of_the_image_are_those_of_the_other_blocks():
+    """Features tell about the field where `semantic` is a block, colors where `geometry` is, or neither."""
+    rng = np.random.default_rng(4)
+    g, cam = gaussians(rng, 8, 1).detach(), camera(rng, (16, 16))
+    scene = swarm(g.replace(features=torch.randn(8, 4)))
+    cams = [dataclasses.replace(cam, time=t, w2c=cam.w2c.detach()) for t in (0.0, 1.0)]
+    score = lambda *blocks: Scoring(blocks=blocks, network="trace")  # noqa: E731
+    metric = SemanticMetric.of(None, 4)
+    told = {}
+    for blocks in (("deformation",), ("geometry", "deformation"), ("semantic", "deformation")):
+        asked = asked_of(score(*blocks), blocks, metric)[0][-1]
+        assert asked.function == "network"
+        told[blocks[0]] = sum(float(x) for x in asked(scene, cams[1], FAST).values())
+    both = asked_of(score("geometry", "semantic", "deformation"), ("geometry", "semantic", "deformation"), metric)[0]
+    assert [one.block for one in both] == ["geometry", "semantic", "deformation"]
+    assert told["deformation"] == told["geometry"]
+    assert told["semantic"] != told["geometry"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"blocks": ("deformation",), "method": "fisherrf"}, "blocks must be geometry with method fisherrf, got defor"),
+        ({"blocks": ("deformation",), "criterion": "block_logdet"}, "with criterion block_logdet, got deformation"),
+        (
+            {"blocks": ("geometry", "deformation"), "network": "trace", "combine": "sum"},
+            "combine must be zscore with network trace beside other blocks, got sum",
+        ),
+        ({"network": "hessian"}, "network must be one of ratio, trace, paper, got 'hessian'"),
+        ({"combine": "rank"}, "combine must be one of sum, zscore, got 'rank'"),
+        ({"probes": 0}, "probes must be a whole number >= 1, got 0"),
+    ],
+)
+def test_refusals(fields, message):
+    """In one line."""
+    with pytest.raises(ValueError, match=f"^select: .*{message}"):
+        Scoring(**fields)
+
+
+def test_still_scenes_have_no_such_block(views):
+    """Gaussians alone are not deformed by anything."""
+    scene, cams = views
+    with pytest.raises(
+        ValueError, match="select: blocks must be of what the scene has, got deformation for a scene th"
+    ):
+        pick(scene.gaussians, cams[1:3], cams[:1], blocks=("deformation",))
+    assert pick(scene.gaussians, cams[1:3], cams[:1]).blocks == ["geometry"]
