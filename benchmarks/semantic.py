@@ -20,7 +20,6 @@ only two variants tried: mIoU 0.061 after 320 steps against 0.024 after 402.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
 import sys
@@ -32,8 +31,8 @@ import labelled
 import studies
 from studies import ROOT
 
-from drgs.lab.study import Metric, Study, append_row, distinct_seeds, read_study, run_cells
-from drgs.lab.study_report import fill_between, study_report
+from drgs.lab.study import Metric, Study, distinct_seeds
+from drgs.lab.study_report import study_report
 from drgs.train import ActiveConfig, FitConfig
 from scenes import room
 
@@ -71,7 +70,6 @@ METRICS = (
     of_run("class_accuracy", "class-mean accuracy"),
     of_run("miou", "mIoU"),
 )
-RESULTS = ROOT / "benchmarks" / "semantic.jsonl"
 SPLITS = (("room-1", (3, 0)), ("statue", (3, 0)), ("room-2", (3, 0)), ("statue", (3, 1)))
 
 
@@ -149,29 +147,15 @@ def units_of(study: Study, seeds: int) -> list:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scale", choices=list(SCALES), default="small")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
-    parser.add_argument("--shard", default="0/1", help="K/N: every N-th cell from the K-th on")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
-    parser.add_argument("--merge", type=Path, nargs="+", default=[], help="rows of another checkout, to be added")
-    args = parser.parse_args()
-    for path in args.merge:
-        for row in read_study(path):
-            append_row(RESULTS, row)
-    study = study_of(args.scale, args.runs)
-    if args.page:
-        rows = [row for row in read_study(RESULTS) if row["study"] == study.name]
-        planned = args.seeds * (len(SPLITS) + 1) * len(POLICIES)
-        text = f"`python benchmarks/semantic.py --scale {args.scale}`: {len(rows)} of {planned} cells are finished.\n\n"
-        fill_between(ROOT / "docs" / "semantic.md", "semantic", text + study_report(study, rows))
-        return 0
-    shard, shards = map(int, args.shard.split("/"))
-    cells = study.cells(units_of(study, args.seeds))[shard::shards]
-    taken, failed = run_cells(study, cells, args.runs, RESULTS, say=lambda line: print(line, flush=True))
-    print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {studies.stamp('semantic')}")
-    return 1 if failed else 0
+    return studies.command(
+        "semantic",
+        ROOT / "docs" / "semantic.md",
+        SCALES,
+        study_of,
+        units_of,
+        planned=lambda seeds: seeds * (len(SPLITS) + 1) * len(POLICIES),
+        report=study_report,
+    )
 
 
 if __name__ == "__main__":

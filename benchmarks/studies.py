@@ -8,10 +8,12 @@ Studies of fits are cells of `drgs.lab.study`, their statistics are in `drgs.lab
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import os
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,11 +28,14 @@ from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
+from drgs.lab.study import Study, append_row, read_study, run_cells  # noqa: E402
+from drgs.lab.study_report import fill_between  # noqa: E402
 
 __all__ = [
     "SCALES",
     "SCENES",
     "base",
+    "command",
     "dataset",
     "folder",
     "rank_correlation",
@@ -128,3 +133,57 @@ def write_rows(path: Path, rows) -> None:
 def read_rows(path: Path, default):
     """What `write_rows` wrote, or the default."""
     return json.loads(path.read_text()) if path.exists() else default
+
+
+def command(
+    script: str,
+    page: Path,
+    scales: Iterable[str],
+    study_of: Callable[[str, Path], Study],
+    units_of: Callable[[Study, int], list],
+    planned: Callable[[int], int],
+    report: Callable[[Study, list[dict]], str],
+    seeds: int = 3,
+) -> int:
+    """The command line of a study that fits data sets it makes itself; rows go to benchmarks/SCRIPT.jsonl.
+
+    Args:
+        script: Its name, and that of its part of the page.
+        page: Where the tables go.
+        scales: What --scale may be, the default first.
+        study_of: Scale, folder of runs -> study.
+        units_of: Study, --seeds -> units, as `Study.cells` takes them.
+        planned: --seeds -> cells of the whole study.
+        report: Study, its rows -> tables.
+        seeds: The default of --seeds.
+    Returns:
+        The exit code.
+    """
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scale", choices=list(scales), default=next(iter(scales)))
+    parser.add_argument("--seeds", type=int, default=seeds)
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
+    parser.add_argument("--shard", default="0/1", help="K/N: every N-th cell from the K-th on")
+    parser.add_argument("--policies", nargs="+", help="cells of these policies alone")
+    parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
+    parser.add_argument("--merge", type=Path, nargs="+", default=[], help="rows of another checkout, to be added")
+    args = parser.parse_args()
+    results = ROOT / "benchmarks" / f"{script}.jsonl"
+    for path in args.merge:
+        for row in read_study(path):
+            append_row(results, row)
+    study = study_of(args.scale, args.runs)
+    if args.page:
+        rows = [row for row in read_study(results) if row["study"] == study.name]
+        done = f"{len(rows)} of {planned(args.seeds)} cells are finished."
+        text = f"`python benchmarks/{script}.py --scale {args.scale}`: {done}\n\n"
+        fill_between(page, script, text + report(study, rows))
+        return 0
+    shard, shards = map(int, args.shard.split("/"))
+    cells = [
+        cell for cell in study.cells(units_of(study, args.seeds)) if cell.policy in (args.policies or [cell.policy])
+    ]
+    cells = cells[shard::shards]
+    taken, failed = run_cells(study, cells, args.runs, results, say=lambda line: print(line, flush=True))
+    print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {stamp(script)}")
+    return 1 if failed else 0
