@@ -238,3 +238,140 @@ def test_times_that_cannot_be(tmp_path, caplog):
     assert not load(tmp_path).is_dynamic
     with pytest.raises(ValueError, match="test_cameras must be left out where views are of no named cameras"):
         load(tmp_path, test_cameras=("r_000",))
+
+
+def write_frames(folder, count=4, numbers=range(FRAMES), digits=5):
+    """A folder of frames a camera, and the cameras."""
+    for k in range(count):
+        for i in numbers:
+            path = folder / f"cam{k:02d}" / f"frame_{i:0{digits}d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), coded(i, k))
+    return cameras(count)
+
+
+def write_model(folder, views, names, tracks=()):
+    """A COLMAP model with an image of each view, and points seen by the images of `tracks` (indices)."""
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], camera_id=1
+        )
+    )
+    for index, (view, name) in enumerate(zip(views, names, strict=True), 1):
+        image = pycolmap.Image(name=name, camera_id=1, image_id=index)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.ones(2)) for _ in tracks])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.w2c[:3, :3]), view.w2c[:3, 3])
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    for place, seen in enumerate(tracks):
+        elements = [pycolmap.TrackElement(image_id=index + 1, point2D_idx=place) for index in seen]
+        reconstruction.add_point3D([float(place), 0, 0], pycolmap.Track(elements=elements), [255, 0, 51])
+    folder.mkdir(parents=True)
+    reconstruction.write_binary(folder)
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [("sparse/0", "cam{:02d}.png"), ("sparse", "cam{:02d}/frame_00000.png"), ("sparse_", "image{}.jpg")],
+)
+def test_folders_of_frames(tmp_path, place, name):
+    """Frames by camera, with the pose of the image that COLMAP calls like it; points are those that two cameras show
+    that are not held out.
+    """
+    views = write_frames(tmp_path)
+    tracks = [(0, 1), (1, 2, 3), (0, 3), (2, 3), (0, 1, 3)]
+    # COLMAP's numbers are in another order than the cameras' names.
+    order = [2, 0, 3, 1]
+    tracks = [[order.index(k) for k in seen] for seen in tracks]
+    write_model(tmp_path / place, [views[k] for k in order], [name.format(k) for k in order], tracks)
+    data = load(tmp_path)
+    assert data.format == "cameras"
+    assert [view.name for view in data.views] == [f"cam{k:02d}/{i:04d}" for k in range(4) for i in range(FRAMES)]
+    assert data.split_rule() == "camera cam00 held out at all times"
+    assert data.times == tuple(i / 5 for i in range(FRAMES))
+    for index, view in enumerate(data.views):
+        np.testing.assert_allclose(view.camera.w2c, views[index // 6].w2c, atol=1e-12)
+    assert decoded(data.views[15].image()) == (2, 3)
+    np.testing.assert_allclose(sorted(data.points[:, 0]), [1, 3, 4])
+    np.testing.assert_allclose(data.colors, [[1, 0, 0.2]] * 3, atol=1e-6)
+    assert data.point_source == f"COLMAP model {place.split('/')[-1]}, 3 points of 3 cameras"
+    assert len(load(tmp_path, test_cameras=()).points) == 5
+    assert load(tmp_path, points=False, times=3).frames == (0, 2, 5)
+
+
+def write_train_meta(folder, views, times=FRAMES, name="train_meta.json", first=0, **changed):
+    """Dynamic 3D Gaussians' layout; `first` is the number of the first camera."""
+    rows = [[f"{first + k}/{i:06d}.png" for k in range(len(views))] for i in range(times)]
+    for i in range(times):
+        for k in range(len(views)):
+            path = folder / "ims" / rows[i][k]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), coded(i, first + k))
+    data = {
+        "w": WIDTH,
+        "h": HEIGHT,
+        "k": [[view.K.tolist() for view in views]] * times,
+        "w2c": [[view.w2c.tolist() for view in views]] * times,
+        "fn": rows,
+        "cam_id": [[first + k for k in range(len(views))]] * times,
+        **changed,
+    }
+    (folder / name).write_text(json.dumps(data))
+
+
+def test_train_meta(tmp_path):
+    """A view a camera and time, with the pose of the list, and the points of the archive; the first camera is held out
+    unless another file has cameras for testing.
+    """
+    views = cameras(5)
+    write_train_meta(tmp_path, views[:3])
+    rows = np.c_[np.random.default_rng(0).uniform(-0.2, 0.2, (7, 3)), np.full((7, 3), 0.5), np.ones(7)]
+    np.savez(tmp_path / "init_pt_cld.npz", data=rows)
+    data = load(tmp_path, times=3)
+    assert data.format == "train_meta"
+    assert [view.name for view in data.views] == [f"{k}/{i:04d}" for k in range(3) for i in (0, 2, 5)]
+    assert data.times == (0.0, 0.5, 1.0)
+    assert data.split_rule() == "camera 0 held out at all times"
+    assert decoded(data.views[4].image()) == (1, 2)
+    np.testing.assert_allclose(data.views[4].camera.w2c, views[1].w2c, atol=1e-12)
+    np.testing.assert_allclose(data.points, rows[:, :3])
+    write_train_meta(tmp_path, views[3:], name="test_meta.json", first=3)
+    data = load(tmp_path / "train_meta.json")
+    assert data.split_rule() == "as the data set's files say"
+    assert {view.camera_name for view in data.split()[1]} == {"3", "4"}
+    assert {view.camera_name for view in load(tmp_path, test_cameras=("1",)).split()[1]} == {"1"}
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_w2c_the_wrong_way_round(tmp_path, points):
+    """Matrices from camera to world are refused, because the points are not where cameras look, or without points,
+    because cameras do not look at one place.
+    """
+    views = cameras()
+    if points:
+        np.savez(tmp_path / "init_pt_cld.npz", data=np.c_[np.eye(3) * 0.1, np.ones((3, 4))])
+    write_train_meta(tmp_path, views)
+    load(tmp_path)
+    write_train_meta(tmp_path, views, w2c=[[view.c2w.tolist() for view in views]] * FRAMES)
+    with pytest.raises(ValueError, match=r"w2c must be world to camera: so, \d+% of the .*; invert the matrices"):
+        load(tmp_path)
+
+
+def test_the_fly(data_dir):
+    """w2c of the real data is world to camera: tracked 3D points lie where 2D points of the images are, which are on a
+    grid of 7.5 pixels, so that half of them are more than 2.5 pixels away at best.
+    """
+    folder = data_dir / "fly"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there")
+    data, tracked = load(folder, lazy=True), np.load(folder / "points.npz")
+    assert (len(data.views), len(data.times), data.camera_names) == (105, 15, tuple("0123456"))
+    errors = []
+    for view in data.views:
+        camera, time = map(int, view.name.split("/"))
+        found = tracked["points2d"][camera, time]
+        pixels, _ = view.camera.project(tracked["points3d"][time])
+        seen = (found != 0).all(axis=1)
+        errors.append(np.linalg.norm(pixels - found[:, ::-1] * (960, 480), axis=1)[seen])
+    assert np.median(np.concatenate(errors)) < 4

@@ -10,10 +10,12 @@ from pathlib import Path
 from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
+from drgs.data.multicamera import find_camera_folders, load_cameras
 from drgs.data.neu3d import find_videos, load_neu3d
 from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
+from drgs.data.train_meta import META, load_train_meta
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.view_checks import check_times
 from drgs.data.views import Dataset, View
@@ -69,6 +71,8 @@ def load(
         raise FileNotFoundError(f"{path}: must be a data set, found no such file or folder; check the path")
     if path.is_file():
         loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
+        if path.name == META:
+            loader = load_train_meta
         if loader is None:
             refuse_foreign(path, "a data set")
             raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
@@ -76,6 +80,10 @@ def load(
         loader = load_transforms
     elif find_videos(path):
         loader = load_neu3d
+    elif (path / META).is_file():
+        loader = load_train_meta
+    elif find_camera_folders(path):
+        loader = load_cameras
     elif find_model(path):
         loader = load_colmap
     elif (path / "poses_bounds.npy").is_file():
@@ -90,7 +98,7 @@ def load(
         raise ValueError(
             f"load: test_cameras must be a tuple of names, got {test_cameras!r}; write ({test_cameras!r},)"
         )
-    held_out = {"test_every": test_every, "test_offset": test_offset, "times": times}
+    held_out = {"test_every": test_every, "test_offset": test_offset, "times": times, "test_cameras": test_cameras}
     dataset = loader(path, background=background, lazy=lazy, points=points, strict=strict, **held_out)
     dataset.test_every, dataset.test_offset = test_every, test_offset
     if test_cameras is not None:

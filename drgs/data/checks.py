@@ -8,8 +8,11 @@ import contextlib
 import logging
 import os
 import re
+import shutil
 import struct
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,7 @@ __all__ = [
     "native_stderr",
     "read_image",
     "read_npy",
+    "read_npz",
     "read_text",
     "repaired_pose",
 ]
@@ -112,6 +116,33 @@ def read_npy(path: Path) -> np.ndarray:
         return np.load(path, allow_pickle=False)
     except ValueError as error:
         raise ValueError(f"{path}: must be a .npy file, got {error}; save it with numpy.save") from None
+
+
+def read_npz(path: Path, name: str) -> np.ndarray:
+    """Read one plain numeric array of an ``.npz`` archive.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no such archive or array, or as `read_npy`.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be an .npz file, found none; check the path")
+    refuse_foreign(path, "an .npz file")
+    with tempfile.TemporaryDirectory() as folder:
+        unpacked = Path(folder) / f"{name}.npy"
+        try:
+            with zipfile.ZipFile(path) as archive:
+                size = archive.getinfo(unpacked.name).file_size
+                memory.require(f"{path}", size, f"{size} bytes of {name}", "make it smaller")
+                with archive.open(unpacked.name) as member, unpacked.open("wb") as file:
+                    shutil.copyfileobj(member, file)
+        except (zipfile.BadZipFile, KeyError, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+            text = " ".join(str(error).split())
+            raise ValueError(f"{path}: must hold an array {name!r}, got {text}; save it with numpy.savez") from None
+        try:
+            return read_npy(unpacked)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(unpacked), f"{path}: {name}")) from None
 
 
 def image_size(path: Path) -> tuple[int, int]:

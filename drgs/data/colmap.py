@@ -14,7 +14,7 @@ from drgs.data.views import Dataset, View
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["MODEL_FOLDERS", "find_model", "load_colmap"]
+__all__ = ["MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 # COLMAP's model numbers and parameter counts, for the camera models that drgs renders.
@@ -63,7 +63,7 @@ def load_colmap(
             f"{path}: must hold a COLMAP model, found no cameras.bin or cameras.txt in . or "
             f"{', '.join(MODEL_FOLDERS)}; run `drgs sfm`"
         )
-    reconstruction = _read(model, points)
+    reconstruction = read_model(model, points)
     folder = _image_folder(path, model)
     views, absent, listed = [], [], []
     # By name: COLMAP numbers images in the order in which its threads finish them.
@@ -80,18 +80,14 @@ def load_colmap(
         if not view.image_path.is_file():
             absent.append(view)
             continue
-        w2c = np.eye(4)
-        w2c[:3] = image.cam_from_world().matrix()
-        if not np.isfinite(w2c).all():
-            raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model")
-        camera = _camera(reconstruction.cameras[image.camera_id], w2c, image.name, where)
+        camera = model_camera(reconstruction, image, where)
         view.camera = fit_to_image(camera, view.image_path, where, lazy)
         view.mask_path = _mask(folder, image.name)
         view.background, view.is_checked = background, not lazy
         views.append(view)
     make_unique(listed)
     go_on_without(model, [view.image_path for view in absent], len(views), strict)
-    xyz, colors = _points(reconstruction, model)
+    xyz, colors = model_points(reconstruction, model)
     source = f"COLMAP model {model.name}, {len(xyz)} points" if len(xyz) else ""
     return Dataset(
         path=path,
@@ -127,8 +123,12 @@ def _mask(folder: Path, name: str) -> Path | None:
     return None
 
 
-def _camera(camera: Any, w2c: np.ndarray, name: str, where: str) -> Camera:
-    """A `Camera` of a pycolmap camera; a lens whose coefficients are all 0 is a pinhole."""
+def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:
+    """The `Camera` of a registered image; a lens whose coefficients are all 0 is a pinhole."""
+    w2c, camera = np.eye(4), reconstruction.cameras[image.camera_id]
+    w2c[:3] = image.cam_from_world().matrix()
+    if not np.isfinite(w2c).all():
+        raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model")
     p = [float(v) for v in camera.params]
     kind = camera.model_name
     if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
@@ -141,13 +141,16 @@ def _camera(camera: Any, w2c: np.ndarray, name: str, where: str) -> Camera:
     elif any(rest):
         model, distortion = "opencv", (*rest, *([0.0] * (4 - len(rest))))
     try:
-        return Camera(K, w2c, camera.width, camera.height, model, distortion, name)
+        return Camera(K, w2c, camera.width, camera.height, model, distortion, image.name)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _points(reconstruction: object, model: Path) -> tuple[np.ndarray, np.ndarray]:
+def model_points(reconstruction: Any, model: Path, seen_by: set[int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P,3) float64 and colors (P,3) float32 in [0,1]; given `seen_by`, those that two of these images show."""
     entries = [reconstruction.points3D[key] for key in sorted(reconstruction.point3D_ids())]
+    if seen_by is not None:
+        entries = [x for x in entries if len({e.image_id for e in x.track.elements} & seen_by) >= 2]
     points = np.array([entry.xyz for entry in entries], dtype=np.float64).reshape(-1, 3)
     colors = np.array([entry.color for entry in entries], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
@@ -162,7 +165,7 @@ def _points(reconstruction: object, model: Path) -> tuple[np.ndarray, np.ndarray
 # pycolmap reads
 
 
-def _read(model: Path, points: bool = True) -> object:
+def read_model(model: Path, points: bool = True) -> object:
     """The reconstruction; every file is walked first, so that pycolmap meets no size that the file
     does not hold. Without `points`, points3D is not opened and observations are skipped.
     """

@@ -31,8 +31,8 @@ class Recording:
 
     Attributes:
         name: Of the camera.
-        cameras: As calibrated, of every frame by its number.
-        source: A video, or the image of every frame by its number; some may not exist.
+        cameras: As calibrated, of every frame by its number; those of a moving camera differ.
+        source: A video, or the image of each of these frames by its number; some may not exist.
         where: What states the calibration, for messages.
         split: What the data set's own files say that it is for; else empty.
     """
@@ -80,6 +80,8 @@ def synchronous(
     for recording in recordings:
         size = None
         for index, number in enumerate(numbers):
+            if number not in recording.cameras:
+                continue
             view = View(
                 None,
                 f"{recording.name}/{number:0{digits}d}",

@@ -1,0 +1,145 @@
+"""Synchronous cameras as folders of frames, ``cam00/frame_00000.png``, and a COLMAP model that has one image of each.
+
+That image is named by its camera: ``cam00.png``, ``cam00/frame_00000.png``, or as 4DGaussians makes them, with the
+camera's number, ``image0.jpg`` (its ``multipleview`` layout, with the model in ``sparse_``).
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import defaultdict
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from drgs.cameras import Camera
+from drgs.data.checks import list_images
+from drgs.data.colmap import find_model, model_camera, model_points, read_model
+from drgs.data.synchronous import Recording, evenly_spaced, synchronous
+from drgs.data.views import Dataset
+
+__all__ = ["find_camera_folders", "load_cameras"]
+
+_CAMERA = re.compile(r"cam[a-z_-]*(\d{1,9})", re.IGNORECASE)
+_NUMBER = re.compile(r"(\d{1,9})$")
+_MODEL = "sparse_"  # where 4DGaussians has it
+
+_log = logging.getLogger(__name__)
+
+
+def find_camera_folders(path: Path) -> list[Path]:
+    """The folders of two cameras or more that have frames; empty where there are none, or no COLMAP model with them."""
+    if _model(path) is None:
+        return []
+    folders = [folder for folder in sorted(path.iterdir()) if _CAMERA.fullmatch(folder.name) and folder.is_dir()]
+    folders = [folder for folder in folders if list_images(_frame_folder(folder))]
+    return folders if len(folders) >= 2 else []
+
+
+def load_cameras(
+    path: Path,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    times: int = 40,
+    test_cameras: tuple[str, ...] | None = None,
+    lazy: bool = False,
+    points: bool = True,
+    strict: bool = False,
+    **_,
+) -> Dataset:
+    """Load folders of frames. A frame's number is at the end of its file's name; frames of one number are of one time.
+
+    Points are those of the model that images of at least two cameras show which are not held out.
+
+    Args:
+        path: the folder.
+        background, times, test_cameras, lazy, points, strict: see `drgs.data.load`.
+
+    Raises:
+        FileNotFoundError: too few of the frames are there, or with `strict` a camera without a pose.
+        ValueError: a damaged model, none of whose images is named by a camera, or two frames of one number.
+    """
+    model, folders = _model(path), find_camera_folders(path)
+    reconstruction = read_model(model, points)
+    posed = _posed(reconstruction, model, folders)
+    if without := [folder.name for folder in folders if folder.name not in posed]:
+        told = f"{model}: has no image of {len(without)} of the {len(folders)} cameras ({', '.join(without[:5])})"
+        if strict or len(posed) < 2:
+            raise FileNotFoundError(f"{told}; name its images by their cameras, as cam00.png, or run COLMAP again")
+        _log.warning("%s; going on without them", told)
+    frames = {folder.name: _numbered(_frame_folder(folder)) for folder in folders if folder.name in posed}
+    numbers = evenly_spaced(sorted(set().union(*frames.values())), times)
+    recordings = []
+    for name, found in frames.items():
+        image_id, camera = posed[name]
+        # A frame that one camera lacks would be named there as it is in the camera that has it.
+        expected = {n: next(f[n].name for f in frames.values() if n in f) for n in numbers}
+        images = {n: found.get(n, _frame_folder(path / name) / expected[n]) for n in numbers}
+        where = f"{model}: image {reconstruction.images[image_id].name}"
+        recordings.append(Recording(name, dict.fromkeys(numbers, camera), images, where))
+    held_out = tuple(frames)[:1] if len(frames) > 1 else None
+    dataset = Dataset(path, "cameras", [], test_cameras=held_out)
+    synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
+    if points:
+        left_out = held_out if test_cameras is None else test_cameras
+        kept = {image_id for name, (image_id, _) in posed.items() if name not in (left_out or ())}
+        xyz, colors = model_points(reconstruction, model, kept)
+        if len(xyz):
+            dataset.points, dataset.colors = xyz, colors
+            dataset.point_source = f"COLMAP model {model.name}, {len(xyz)} points of {len(kept)} cameras"
+    return dataset
+
+
+def _model(path: Path) -> Path | None:
+    """The folder of the COLMAP model, or None."""
+    if any((path / _MODEL / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+        return path / _MODEL
+    return find_model(path)
+
+
+def _frame_folder(camera: Path) -> Path:
+    """Where the frames of a camera are: in its folder, or in ``images`` there."""
+    return camera / "images" if (camera / "images").is_dir() else camera
+
+
+def _posed(reconstruction: Any, model: Path, folders: list[Path]) -> dict[str, tuple[int, Camera]]:
+    """Name of a camera -> the first image of it in the model, by name, and the camera of that.
+
+    Raises:
+        ValueError: No image is named by a camera, or one by two.
+    """
+    by_number = defaultdict(list)
+    for folder in folders:
+        by_number[int(_CAMERA.fullmatch(folder.name)[1])].append(folder.name)
+    names, found = {folder.name for folder in folders}, {}
+    images = {image_id: reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids()}
+    for image_id, image in sorted(images.items(), key=lambda item: item[1].name):
+        parts = PurePosixPath(image.name).with_suffix("").parts
+        owner = next((part for part in reversed(parts) if part in names), None)
+        if owner is None and (number := _NUMBER.search(parts[-1])):
+            same = by_number[int(number[1])]
+            owner = same[0] if len(same) == 1 and len(parts) == 1 else None
+        if owner and owner not in found:
+            found[owner] = image_id, model_camera(reconstruction, image, f"{model}: image {image.name}")
+    if not found:
+        shown = next(iter(images.values())).name if images else "none at all"
+        raise ValueError(
+            f"{model}: must have images named by their cameras, as {folders[0].name}.png or {folders[0].name}/..., got "
+            f"{shown}; run COLMAP on one frame of each camera, named so"
+        )
+    return {folder.name: found[folder.name] for folder in folders if folder.name in found}
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Number -> frame; ValueError if two have one number."""
+    frames: dict[int, Path] = {}
+    for file in list_images(folder):
+        if not (found := _NUMBER.search(file.stem)):
+            _log.warning("%s: is no frame, its name ends in no number; left out", file)
+            continue
+        number = int(found[1])
+        if number in frames:
+            raise ValueError(
+                f"{file}: must be the only frame {number} of its camera, {frames[number].name} is too; remove one"
+            )
+        frames[number] = file
+    return frames

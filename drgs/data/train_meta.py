@@ -1,0 +1,171 @@
+"""Dynamic 3D Gaussians' data sets (Luiten et al., 3DV 2024): ``train_meta.json`` and images in ``ims``.
+
+Lists by time and camera: ``fn`` (an image below ``ims``), ``k`` (3x3), ``w2c`` (4x4, world to camera, OpenCV's axes)
+and ``cam_id``; ``w`` and ``h`` of all. Where there is a ``test_meta.json``, its cameras are for testing;
+``init_pt_cld.npz`` has points (x, y, z, r, g, b, whether they move).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.data.capture import Focus
+from drgs.data.checks import read_npz, repaired_pose
+from drgs.data.synchronous import Recording, evenly_spaced, synchronous
+from drgs.data.views import Dataset
+from drgs.guards.camera_checks import check_distance
+from drgs.guards.json_files import check_json, read_json
+
+__all__ = ["META", "load_train_meta"]
+
+META = "train_meta.json"
+_TEST, _POINTS, _IMAGES = "test_meta.json", "init_pt_cld.npz", "ims"
+_KIND = {"w": int, "h": int, "k": [list], "w2c": [list], "fn": [[str]], "cam_id": [[int]]}
+_ADVICE = "write w, h, and a list by time of lists by camera of each of k, w2c, fn and cam_id"
+_CLEARLY = 0.25  # of what is seen, more with matrices read the other way round
+
+_log = logging.getLogger(__name__)
+
+
+def load_train_meta(
+    path: Path,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    times: int = 40,
+    lazy: bool = False,
+    points: bool = True,
+    strict: bool = False,
+    **_,
+) -> Dataset:
+    """Load a data set of synchronous cameras. A camera is named by its ``cam_id``; frame k is the k-th of the lists.
+
+    Args:
+        path: the folder, or the JSON file.
+        background, times, lazy, points, strict: see `drgs.data.load`.
+
+    Raises:
+        FileNotFoundError: no such file, or too few of the images.
+        ValueError: broken JSON, lists of different lengths, a pose that is not one, or camera-to-world matrices.
+    """
+    file = path if path.is_file() else path / META
+    folder = file.parent
+    taken, count = _cameras(file)
+    stated = {}
+    if (folder / _TEST).is_file() and file.name == META:
+        stated, tested = _cameras(folder / _TEST)
+        if tested != count:
+            raise ValueError(f"{folder / _TEST}: must have the {count} times of {META}, has {tested}; cut one")
+        if twice := sorted(set(taken) & set(stated)):
+            raise ValueError(f"{folder / _TEST}: must have other cameras than {META}, {twice[0]} is in both; remove it")
+    xyz = colors = None
+    if (folder / _POINTS).is_file() and points:
+        xyz, colors = _points(folder / _POINTS)
+    _check_direction(file, [frames[min(frames)].camera for frames in taken.values()], xyz)
+    numbers = evenly_spaced(range(count), times)
+    recordings = []
+    for cameras, meta, split in ((taken, file, "train" if stated else ""), (stated, folder / _TEST, "test")):
+        for name, frames in cameras.items():
+            used = {n: frames[n] for n in numbers if n in frames}
+            images = {n: folder / _IMAGES / shot.image for n, shot in used.items()}
+            recordings.append(Recording(str(name), {n: s.camera for n, s in used.items()}, images, f"{meta}", split))
+    held_out = (str(next(iter(taken))),) if len(taken) > 1 and not stated else None
+    dataset = Dataset(path, "train_meta", [], xyz, colors, test_cameras=held_out)
+    if xyz is not None:
+        dataset.point_source = f"{_POINTS}, {len(xyz)} points"
+    return synchronous(dataset, recordings, numbers, where=file, background=background, lazy=lazy, strict=strict)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shot:
+    """What the lists say of one camera at one time: its calibration, and its image below `ims`."""
+
+    camera: Camera
+    image: str
+
+
+def _cameras(file: Path) -> tuple[dict[int, dict[int, _Shot]], int]:
+    """Number of a camera, ascending -> index of a time -> what it has taken; and the number of times."""
+    data = read_json(file)
+    check_json(str(file), data, _KIND, _ADVICE)
+    count = len(data["fn"])
+    if not count or {len(data[key]) for key in ("k", "w2c", "cam_id")} != {count}:
+        lengths = ", ".join(f"{key} {len(data[key])}" for key in ("k", "w2c", "fn", "cam_id"))
+        raise ValueError(f"{file}: k, w2c, fn and cam_id must be lists of one length by time, got {lengths}; {_ADVICE}")
+    found: dict[int, dict[int, _Shot]] = {}
+    for time in range(count):
+        rows = [data[key][time] for key in ("k", "w2c", "fn", "cam_id")]
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError(f"{file}: time {time}: k, w2c, fn and cam_id must name the same cameras; {_ADVICE}")
+        for k, w2c, name, camera in zip(*rows, strict=True):
+            where = f"{file}: time {time}, camera {camera}"
+            if time in found.setdefault(camera, {}):
+                raise ValueError(f"{where}: must be there once, is there twice; remove one")
+            parts = PurePosixPath(name).parts
+            if name.startswith("/") or ".." in parts or not parts:
+                raise ValueError(f"{where}: fn must name an image inside {_IMAGES}, got {name!r}; rename it")
+            found[camera][time] = _Shot(_camera(where, data, k, w2c), name)
+    return dict(sorted(found.items())), count
+
+
+def _camera(where: str, data: dict, k: Any, w2c: Any) -> Camera:
+    """A calibrated camera; ValueError if a matrix is none."""
+    matrices = []
+    for key, value, side in (("k", k, 3), ("w2c", w2c, 4)):
+        try:
+            matrix = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            matrix = np.empty(0)
+        if matrix.shape != (side, side) or not np.isfinite(matrix).all():
+            raise ValueError(f"{where}: {key} must be {side}x{side} finite numbers, is not; correct it")
+        matrices.append(matrix)
+    check_distance(where, matrices[1])
+    try:
+        return Camera(matrices[0], repaired_pose(matrices[1]), data["w"], data["h"])
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P, 3) float64 and colors (P, 3) float32."""
+    rows = read_npz(file, "data")
+    if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind != "f":
+        raise ValueError(
+            f"{file}: data must be rows of x, y, z, r, g, b, got shape {rows.shape} of {rows.dtype}; remove the file"
+        )
+    rows = rows[np.isfinite(rows[:, :6]).all(axis=1)]
+    return rows[:, :3].astype(np.float64), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)
+
+
+def _check_direction(file: Path, cameras: list[Camera], points: np.ndarray | None) -> None:
+    """Raise ValueError if the matrices are clearly from camera to world: read so, cameras see much more of the points,
+    or without points, many more of them look at one place.
+    """
+    turned = [dataclasses.replace(camera, w2c=camera.c2w) for camera in cameras]
+    as_stated, inverted = (_seen(views, points) for views in (cameras, turned))
+    if inverted > as_stated + _CLEARLY:
+        what = "of the points are seen" if points is not None else "of the cameras look at one place"
+        raise ValueError(
+            f"{file}: w2c must be world to camera: so, {as_stated:.0%} {what}, the other way round {inverted:.0%}; "
+            "invert the matrices"
+        )
+
+
+def _seen(cameras: list[Camera], points: np.ndarray | None) -> float:
+    """Share of points that cameras show, on average; without points, of cameras that look at one place before them."""
+    if points is not None and len(points):
+        shares = []
+        for camera in cameras:
+            pixels, _ = camera.project(points)
+            shares.append(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1).mean())
+        return float(np.mean(shares))
+    focus = Focus.of(cameras)
+    if focus is None:
+        return 0.0
+    # Matrices read the wrong way round may put all cameras into the place that they look at.
+    distances = np.linalg.norm(focus.eyes - focus.center, axis=1)
+    return float((distances > 1e-3 * max(1.0, float(np.abs(focus.center).max()))).sum() / len(cameras))
