@@ -205,7 +205,7 @@ class Call:
         if self.field is None:
             return inputs
         view = {name: x for name, x in inputs.items() if name in OF_VIEW}
-        return self.field(self.lib, {name: x for name, x in inputs.items() if name not in OF_VIEW}) | view
+        return self.field({name: x for name, x in inputs.items() if name not in OF_VIEW}) | view
 
     def _carried(self, p: dict, along_ray: bool, world: bool) -> tuple[int, list]:
         """What rays carry: the SH basis where colors are evaluated along them, then o and d of world rays."""

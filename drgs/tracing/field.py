@@ -3,25 +3,28 @@
 A scene that moves may compute its Gaussians in torch, by a network. In reverse mode torch's own graph leads through it,
 from `Scene.at` to the renderer's inputs. Forward mode and the probes of Fisher information are driven from Dr.Jit:
 there `Field` is one more operation in front of the projection (`Call.prepare`), so that tangents and gradients of the
-scene's parameters pass through it as those of Gaussians do. Not `dr.wrap`, whose description of its outputs is one
-global of all threads.
+scene's parameters pass through it as those of Gaussians do.
+
+The bridge is `dr.wrap`, from Dr.Jit to torch. (The other direction keeps the description of its outputs in one global
+of all threads; this one does not.) As it is, it goes backward once: torch frees its graph, and gradients of a second
+time would be added to those of the first. Probes go backward many times, so what is wrapped keeps its graph, from the
+first time on (`_Kept`): K probes evaluate the function twice, K tangents K + 1 times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import torch
 
-from drgs.tracing.bridge import to_drjit
-from drgs.tracing.protocols import Lib
-
 if TYPE_CHECKING:
     from drgs.ellipsoids import DeformableScene
 
-__all__ = ["Field"]
+__all__ = ["Field", "wrapped"]
+
+Tensors = dict[str, torch.Tensor]
 
 
 class Field:
@@ -43,12 +46,16 @@ class Field:
         fixed: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
         self.scene, self.time, self.names, self.shift, self.fixed = scene, time, tuple(names), shift, dict(fixed or {})
+        self.seen: Tensors = {}  # the fields, once they are computed: a call's parameters are constant
 
-    def __call__(self, lib: Lib, parameters: dict) -> dict:
-        """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes."""
-        return dr.custom(_Deform, self, lib, parameters)
+    def __call__(self, parameters: dict) -> dict:
+        """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes, by those that it is enabled of."""
+        moving = {name: x for name, x in parameters.items() if dr.grad_enabled(x)}
+        # Numbers cost no derivative.
+        still = {name: x.torch() for name, x in parameters.items() if name not in moving}
+        return wrapped(lambda some: self.values({**still, **some}), self.seen)(moving)
 
-    def values(self, parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def values(self, parameters: Tensors) -> Tensors:
         """The same in torch; `time` among the parameters is that of the view, as a scalar."""
         given = {**self.fixed, **parameters}
         fields = self.scene.deform(given, given.pop("time", self.time)).parameters()
@@ -57,27 +64,56 @@ class Field:
         return {name: fields[name] for name in self.names}
 
 
-class _Deform(dr.CustomOp):
-    """`dr.custom(_Deform, field, lib, parameters)`; its derivatives evaluate the field once more in torch."""
+def wrapped(function: Callable[[Tensors], Tensors], seen: Tensors | None = None) -> Callable[[dict], dict]:
+    """A torch function of tensors by name as a function of Dr.Jit tensors by name, by `dr.wrap`.
 
-    def eval(self, field: Field, lib: Lib, parameters: dict) -> dict:
-        """Dr.Jit's name for it."""
-        self.field, self.lib = field, lib
-        # Clones, as Dr.Jit and torch would share the memory.
-        self.given = {name: x.torch().clone() for name, x in parameters.items()}
-        with torch.no_grad():  # what torch would record is asked for in `forward` and `backward`
-            return self._back(field.values(self.given))
+    Args:
+        function: By operations that torch differentiates in both modes.
+        seen: What it returns, where that is known already; if empty it is filled.
+    Returns:
+        Differentiated by Dr.Jit in both modes; backward any number of times.
+    """
+    seen = {} if seen is None else seen
 
-    def forward(self) -> None:
-        """Dr.Jit forward mode: torch's, along the parameters' tangents."""
-        tangents = {name: x.torch() for name, x in self.grad_in("parameters").items()}
-        self.set_grad_out(self._back(torch.func.jvp(self.field.values, (self.given,), (tangents,))[1]))
+    def kept(inputs: Tensors) -> Tensors:
+        if any(torch.autograd.forward_ad.unpack_dual(x).tangent is not None for x in inputs.values()):
+            return {name: _dual(x) for name, x in function(inputs).items()}
+        with torch.enable_grad():  # `dr.wrap` calls it as the thread is, and differentiates it later
+            made = _Kept.apply(function, seen, tuple(inputs), *inputs.values())
+        return dict(zip(seen, made, strict=True))
 
-    def backward(self) -> None:
-        """Dr.Jit reverse mode: torch's, from the fields' cotangents."""
-        pull = torch.func.vjp(self.field.values, self.given)[1]
-        slopes = pull({name: x.torch() for name, x in self.grad_out().items()})[0]
-        self.set_grad_in("parameters", self._back(slopes))
+    wrap: Callable = dr.wrap(source="drjit", target="torch")
+    return wrap(kept)
 
-    def _back(self, tensors: dict) -> dict:
-        return {name: to_drjit(self.lib, x) for name, x in tensors.items()}
+
+def _dual(x: torch.Tensor) -> torch.Tensor:
+    """With a tangent, be it 0: `dr.wrap` takes that of every output."""
+    value, tangent = torch.autograd.forward_ad.unpack_dual(x)
+    return x if tangent is not None else torch.autograd.forward_ad.make_dual(value, torch.zeros_like(value))
+
+
+class _Kept(torch.autograd.Function):
+    """A function whose graph stays, so that it can be differentiated again; each time by itself."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable, seen: Tensors, names: tuple, *values: torch.Tensor) -> tuple:
+        if not seen:
+            seen.update(function(dict(zip(names, values, strict=True))))
+        ctx.function, ctx.names, ctx.values, ctx.graph = function, names, values, None
+        return tuple(x.detach() for x in seen.values())  # an output that is an input would be taken for it
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:  # type: ignore[override]
+        """Slopes of `values`; their `grad`, which `dr.wrap` reads, begins anew."""
+        for x in ctx.values:
+            x.grad = None
+        if ctx.graph is None:
+            leaves = [x.detach().requires_grad_() for x in ctx.values]
+            with torch.enable_grad():
+                ctx.graph = leaves, tuple(ctx.function(dict(zip(ctx.names, leaves, strict=True))).values())
+        leaves, made = ctx.graph
+        ends = [(x, g) for x, g in zip(made, cotangents, strict=True) if x.requires_grad]
+        slopes = torch.autograd.grad(
+            [x for x, _ in ends], leaves, [g for _, g in ends], retain_graph=True, materialize_grads=True
+        )
+        return None, None, None, *slopes

@@ -90,7 +90,7 @@ def _pushed(call: Call, columns: list[dict]) -> tuple[dict, list[dict]]:
     for column in columns:
         # A fresh graph each time: the old tangents are gone.
         dr.disable_grad(inputs)
-        dr.enable_grad(inputs)
+        dr.enable_grad(inputs if call.field is None else {name: inputs[name] for name in column})
         compositor, arguments = call.prepare(inputs)
         for name, x in inputs.items():
             if name in column:
