@@ -11,11 +11,13 @@ import pytest
 import torch
 from test_active import Killed, opened, without_times  # noqa: F401  (a fixture)
 from test_data import save, write_image
+from test_dynamic_data import cameras, coded, write_poses, write_video
 
 import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
+from drgs.data.videos import VideoFrame
 from drgs.files import Run, load_state
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig
@@ -41,14 +43,14 @@ def write_swing(folder: Path) -> None:
         torch.full((n,), 0.9),
         torch.rand(n, 1, 3, generator=generator) * 3 - 1,
     )
-    cameras = orbit((0, 0, 0), 3.0, CAMERAS, width=SIZE, height=SIZE)
-    K, frames = cameras[0].K, {"train": [], "test": []}
+    ring = orbit((0, 0, 0), 3.0, CAMERAS, width=SIZE, height=SIZE)
+    K, frames = ring[0].K, {"train": [], "test": []}
     lens = {"w": SIZE, "h": SIZE, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     for t in range(TIMES):
         shift = torch.zeros(n, 3)
         shift[: n // 2, 1] = 0.3 * t / (TIMES - 1)
         moved = blobs.replace(means=means + shift)
-        for c, camera in enumerate(cameras):
+        for c, camera in enumerate(ring):
             name = f"cam{c}/{t}.png"
             image = drgs.render(moved, camera, drgs.RenderSettings.preset("fast")).rgb
             write_image(folder / name, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
@@ -248,7 +250,7 @@ def test_a_single_time_has_no_later_ones(swing):
 # ---- policies over (camera, time)
 
 
-def picks_of(policy: str, cameras: int, times: int, schedule: str, count: int) -> list[tuple[int, int]]:
+def picks_of(policy: str, count_of_cameras: int, times: int, schedule: str, count: int) -> list[tuple[int, int]]:
     """(camera, time) of so many picks, cameras on a line one unit apart, all known at the first time."""
     K, known = intrinsics(20, 20, 8, 8), []
 
@@ -260,8 +262,8 @@ def picks_of(policy: str, cameras: int, times: int, schedule: str, count: int) -
     scene, found = drgs.Gaussians.from_arrays([[0, 0, 5]], [[1, 0, 0, 0]], [[1] * 3], [0.5], np.zeros((1, 1, 3))), []
     for number in range(count):
         later = [number + 1] if schedule == "times" else range(1, times)
-        pool = [(c, t) for t in later for c in range(cameras) if (c, t) not in found]
-        train = [at(c, 0) for c in range(cameras)] + known
+        pool = [(c, t) for t in later for c in range(count_of_cameras) if (c, t) not in found]
+        train = [at(c, 0) for c in range(count_of_cameras)] + known
         best = select(scene, [at(c, t) for c, t in pool], train, 1, policy).picks[0]
         found.append(pool[best.index])
         known.append(at(*found[-1]))
@@ -288,3 +290,29 @@ def test_farthest_knows_that_a_camera_is_new_at_another_time():
     pairs = picks_of("farthest", 3, 7, "pairs", 6)
     assert pairs[0][1] == 6, "the last time is farthest from the first one"
     assert len({t for _, t in pairs}) >= 3
+
+
+# ---- videos
+
+
+def test_no_frame_of_a_video_is_decoded_before_it_is_picked(tmp_path, monkeypatch):
+    """Of Neu3D's layout: the frames that are asked for are those of the test camera, of the first time and of picks."""
+    for k in range(4):
+        write_video(tmp_path / f"data/cam{k:02d}.mp4", [coded(i, k) for i in range(6)])
+    write_poses(tmp_path / "data", cameras())
+    seen, read = [], VideoFrame.read
+
+    def spied(self):
+        seen.append(f"{self.path.stem}/{self.index:04d}")
+        return read(self)
+
+    monkeypatch.setattr(VideoFrame, "read", spied)
+    data = load(tmp_path / "data", lazy=True, points=False, times=3)
+    assert not seen
+    fit(data, tmp_path / "run", config(max_steps=12), active=plan(every=3), progress=False)
+    record = selection_of(tmp_path / "run")
+    assert [(pick["camera"], pick["time"]) for pick in record["picks"]] == [
+        (pick["name"].split("/")[0], time) for pick, time in zip(record["picks"], (0.5, 1.0), strict=True)
+    ]
+    assert [view["camera"] for view in record["start"]] == ["cam01", "cam02", "cam03"]
+    assert set(seen) == {"cam00/0000", "cam00/0002", "cam00/0005", *fitted_views(Run(tmp_path / "run"))}
