@@ -12,6 +12,7 @@ from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
 from drgs.deform import DeformationField, Deltas, DynamicGaussians, FieldConfig
+from drgs.dynamics.regularizers import plane_smoothness, time_l1, time_smoothness
 from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.information.cache import Cache, camera_key
 from drgs.integrator import render, render_jvp
@@ -341,3 +342,36 @@ def test_static_scenes_run_no_deformation_code(view, monkeypatch):
     fisher.diagonal(still, cam, FAST)
     with pytest.raises(ImportError):
         render_jvp(scene, cam, tangent, FAST)
+
+
+def test_regularizers():
+    """Each is what its formula says in plain torch, value and gradient; 0 for planes that are as smooth as it asks."""
+    grid = DeformationField(CONFIG, [[0, 0, 0], [1, 1, 1]]).double().grid
+    draw = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for plane in grid:
+            plane.copy_(torch.randn(plane.shape, generator=draw))
+
+    def bend(x, axis):
+        return torch.diff(x, n=2, dim=axis).square().mean()
+
+    space, times = [x for k, x in enumerate(grid) if k % 6 < 3], [x for k, x in enumerate(grid) if k % 6 >= 3]
+    for found, want in (
+        (time_smoothness, lambda: sum(bend(x, 0) for x in times)),
+        (plane_smoothness, lambda: sum((bend(x, 0) + bend(x, 1)) / 2 for x in space)),
+        (time_l1, lambda: sum((1 - x).abs().mean() for x in times)),
+    ):
+        pairs = [torch.autograd.grad(3 * f, grid, materialize_grads=True) for f in (found(grid), want())]
+        torch.testing.assert_close(*pairs)
+        torch.testing.assert_close(found(grid), want())
+        assert float(want()) > 1
+    with torch.no_grad():
+        for plane in grid:
+            rows, columns = torch.arange(plane.shape[0]), torch.arange(plane.shape[1])
+            plane.copy_((1 + 2.0 * rows[:, None] + 3.0 * columns)[..., None])
+    assert float(time_smoothness(grid)) < 1e-20
+    assert float(plane_smoothness(grid)) < 1e-20
+    short = DeformationField(dataclasses.replace(CONFIG, time_resolution=2, resolution=2), [[0, 0, 0], [1, 1, 1]]).grid
+    assert float(time_smoothness(short)) == 0.0
+    assert float(time_l1(short)) == 0.0
+    time_smoothness(short).backward()
