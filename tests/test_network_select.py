@@ -12,7 +12,7 @@ from drgs import fisher
 from drgs.gain import Prior, information_gain
 from drgs.information.combine import asked_of
 from drgs.information.semantics import SemanticMetric
-from drgs.select import Cache, Scoring, select
+from drgs.select import POLICIES, Cache, Scoring, select
 from drgs.settings import RenderSettings
 
 FAST = RenderSettings.preset("fast")
@@ -210,3 +210,14 @@ def test_still_scenes_have_no_such_block(views):
     ):
         pick(scene.gaussians, cams[1:3], cams[:1], blocks=("deformation",))
     assert pick(scene.gaussians, cams[1:3], cams[:1]).blocks == ["geometry"]
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES))
+def test_policies_know_cameras_and_times(views, cache, policy):
+    """Each can choose among pairs of camera and time; those that look at the scene see it as it is then."""
+    scene, cams = views
+    found = pick(scene, cams[1:], cams[:1], 2, cache=cache, policy=policy, rng=torch.Generator().manual_seed(0))
+    assert len({x.index for x in found.picks}) == 2
+    assert len(found.scores) == 8
+    if policy in ("fisher", "fisherrf", "coverage", "moments"):
+        assert found.scores[0] != found.scores[1]  # one pose at two times

@@ -11,7 +11,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from drgs.commands.overrides import parsed
 from drgs.fitting.config import ActiveConfig, Dynamics, FeatureSize, FieldPreset, FitConfig, SemanticUse
-from drgs.information.choices import Block, Combine, Criterion, Method, Network, Policy
+from drgs.information.choices import Block, Combine, Criterion, Method, NetworkScore, Policy
 from drgs.settings import Preset, RenderSettings
 
 __all__ = [
@@ -154,7 +154,7 @@ class Choosing(Informed):
     """How the next view is chosen (docs/information.md)."""
     criterion: Criterion = ActiveConfig.criterion
     """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
-    network: Network = ActiveConfig.network
+    network: NetworkScore = ActiveConfig.network
     """How the block deformation scores: against what known views say of the field (ratio), or by a trace without it."""
     combine: Combine | None = ActiveConfig.combine
     """Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace."""

@@ -7,7 +7,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from drgs.guards.arguments import check_fields, must_be
-from drgs.information.choices import Block, Combine, Criterion, Method, Network, Policy, checked_blocks
+from drgs.information.choices import Block, Combine, Criterion, Method, NetworkScore, Policy, checked_blocks
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -261,7 +261,7 @@ class ActiveConfig:
     relative_prior: bool = False
     pick_points: PickPoints = "auto"
     blocks: tuple[Block, ...] | None = None
-    network: Network = "ratio"
+    network: NetworkScore = "ratio"
     combine: Combine | None = None
     probes: int = 16
 

@@ -11,14 +11,14 @@ __all__ = [
     "COMBINES",
     "ESTIMATES",
     "METHODS",
-    "NETWORKS",
+    "NETWORK_SCORES",
     "NETWORK_ESTIMATES",
     "Block",
     "Combine",
     "Criterion",
     "Estimate",
     "Method",
-    "Network",
+    "NetworkScore",
     "NetworkEstimate",
     "Policy",
     "checked_blocks",
@@ -71,11 +71,11 @@ NetworkEstimate = Literal["diagonal", "trace", "paper"]
 
 NETWORK_ESTIMATES: tuple[NetworkEstimate, ...] = typing.get_args(NetworkEstimate)
 
-Network = Literal["ratio", "trace", "paper"]
+NetworkScore = Literal["ratio", "trace", "paper"]
 """How the block `deformation` scores: as the diagonal does against that of the known views, by the trace of the
 candidate's own information, or by the trace of its square; the first is the default everywhere."""
 
-NETWORKS: tuple[Network, ...] = typing.get_args(Network)
+NETWORK_SCORES: tuple[NetworkScore, ...] = typing.get_args(NetworkScore)
 
 Combine = Literal["sum", "zscore"]
 """How the scores of several blocks become one."""

@@ -12,7 +12,7 @@ from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
 from drgs.information.cache import Cache
-from drgs.information.choices import COMBINES, NETWORKS, Block, Combine, Network, checked_blocks
+from drgs.information.choices import COMBINES, NETWORK_SCORES, Block, Combine, NetworkScore, checked_blocks
 from drgs.information.network_groups import network_groups
 from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
@@ -57,12 +57,12 @@ class Scoring:
     groups: tuple[str, ...] | None = None
     blocks: tuple[Block, ...] | None = None
     semantics: SemanticMetric | None = None
-    network: Network = NETWORKS[0]
+    network: NetworkScore = NETWORK_SCORES[0]
     combine: Combine | None = None
     probes: int = 16
 
     def __post_init__(self) -> None:
-        choices = {"criterion": CRITERIA, "method": METHODS, "network": NETWORKS, "combine": (None, *COMBINES)}
+        choices = {"criterion": CRITERIA, "method": METHODS, "network": NETWORK_SCORES, "combine": (None, *COMBINES)}
         for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
                 known = [x for x in known if x is not None]
