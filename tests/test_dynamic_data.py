@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.data import initial_points, load, videos
@@ -375,3 +377,74 @@ def test_the_fly(data_dir):
         seen = (found != 0).all(axis=1)
         errors.append(np.linalg.norm(pixels - found[:, ::-1] * (960, 480), axis=1)[seen])
     assert np.median(np.concatenate(errors)) < 4
+
+
+def write_semantics(folder, label="{}/semantic_class_{:04d}.png", feature="cam{:02d}_{:04d}_fmap_CxHxW.pt"):
+    """Labels and maps of every frame of the four videos, both with numbers that say which."""
+    for k in range(4):
+        for i in range(FRAMES):
+            path = folder / "semantic_class" / label.format(f"cam{k:02d}", i)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), np.full((HEIGHT, WIDTH), 1 + (k + i) % 3, np.uint8))
+            path = folder / "rgb_feature_langseg" / feature.format(k, i)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.save(torch.full((2, 3, 4), float(10 * k + i)), path)
+    names = [{"id": 1, "name": "table"}, {"id": 2, "name": "tongs"}, {"id": 3, "name": "ball"}]
+    (folder / "classes.json").write_text(json.dumps({"classes": names}))
+    np.save(folder / "text_embeddings.npy", np.eye(3, 2, dtype=np.float32) + 0.1)
+    (folder / "moving_classes.json").write_text(json.dumps(["ball", "tongs"]))
+
+
+@pytest.mark.parametrize(
+    ("label", "feature"),
+    [
+        ("{}/semantic_class_{:04d}.png", "cam{:02d}_{:04d}_fmap_CxHxW.pt"),
+        ("{}/{:d}.png", "cam{:02d}/{:04d}_fmap_2x3x4.pt"),
+        ("{}_{:04d}.png", "cam{:02d}/frame_{:05d}_fmap_CxHxW.pt"),
+    ],
+)
+def test_labels_and_maps_of_cameras_and_times(neu3d, tmp_path, label, feature):
+    """Each frame has the label image and the map of its camera and its number in the video, also where not all frames
+    are used; a file says which classes move.
+    """
+    shutil.copytree(neu3d, tmp_path, dirs_exist_ok=True)
+    write_semantics(tmp_path, label, feature)
+    write_image = tmp_path / "semantic_class" / "cam00" / "vis_semantic_class_0000.png"  # a picture, no label
+    write_image.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(write_image), coded(1))
+    data = load(tmp_path, times=3)
+    assert data.semantics.moving == ("ball", "tongs")
+    assert len(data.semantics.maps) == len(data.semantics.label_images) == 12
+    for view in data.views:
+        camera, index = int(view.camera_name[3:]), view.frame.index
+        assert float(view.teacher().mean()) == 10 * camera + index
+        assert set(np.unique(view.labels())) == {1 + (camera + index) % 3}
+    (tmp_path / "moving_classes.json").write_text('["ball", "cup"]')
+    with pytest.raises(
+        ValueError, match=r"moving_classes\.json: must name classes of .*classes\.json, got 'cup'; corr"
+    ):
+        load(tmp_path)
+
+
+def test_two_labels_of_one_frame(neu3d, tmp_path):
+    """Which one counts is not guessed."""
+    shutil.copytree(neu3d, tmp_path, dirs_exist_ok=True)
+    write_semantics(tmp_path)
+    cv2.imwrite(str(tmp_path / "semantic_class" / "cam01" / "0003.png"), np.ones((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(ValueError, match="must be the only one of its frame, .*; remove one") as error:
+        load(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_segments_say_what_moves(tmp_path):
+    """Dynamic 3D Gaussians' `seg` becomes labels, whose class 1 moves; nothing of a view is masked."""
+    write_train_meta(tmp_path, cameras(3), times=2)
+    for path in sorted((tmp_path / "ims").rglob("*.png")):
+        target = tmp_path / "seg" / path.relative_to(tmp_path / "ims")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(target), (np.indices((HEIGHT, WIDTH))[1] < 10).astype(np.uint8))
+    data = load(tmp_path)
+    assert data.semantics.moving == ("1",)
+    assert data.views[3].label_path == tmp_path / "seg" / "1" / "000001.png"
+    assert data.views[3].labels().sum() == 10 * HEIGHT
+    assert data.views[3].mask() is None

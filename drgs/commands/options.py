@@ -354,6 +354,8 @@ class Teach(Common, Data):
     """WIDTHxHEIGHT of a map in cells; default 80 along the longer side, of the photograph's shape."""
     scales: str = "0.75,1,1.5"
     """Of the photographs as the model sees them, averaged; 1: the short side is twice the model's image size."""
+    times: int = FitConfig.times
+    """Of videos, how many synchronous frames of each get a map, evenly over their length."""
     flip: bool = True
     """Average with the mirrored photographs, too; --no-flip takes half the time."""
 

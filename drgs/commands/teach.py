@@ -53,7 +53,7 @@ def run(args: Teach) -> None:
     output.sweep(_FOLDER)
     _refuse_others(output)
     names = _names(args, output)
-    files = _files(data.load(args.data, points=False, strict=args.strict, semantics=False).views)
+    files = _files(data.load(args.data, points=False, strict=args.strict, semantics=False, times=args.times).views)
     with Bar("loading the model", show=not args.quiet):
         on_cuda = args.variant != "llvm_ad_rgb" and torch.cuda.is_available()
         encoder = ClipEncoder(args.model, "cuda" if on_cuda else "cpu")
@@ -151,10 +151,10 @@ def _files(views: list[View]) -> dict[str, View]:
     """The file of each view's map, below the data set's folder, as the loader matches them."""
     files: dict[str, View] = {}
     for view in views:
-        if view.image_path is None:
+        if not view.has_image:
             continue
         below = PurePosixPath(_FOLDER) / PurePosixPath(view.name).parent
-        name = str(below / f"{view.image_path.stem}_fmap_CxHxW.pt")
+        name = str(below / f"{view.stem}_fmap_CxHxW.pt")
         if name in files:
             raise ValueError(
                 f"{view.image_path}: must have a name of its own, {files[name].image_path} has the same but for its "

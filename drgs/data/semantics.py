@@ -9,8 +9,12 @@ Found by their names beside the folder of the images, in this order:
 - Numbers in the labels: ``classes.json``, ``classes.txt`` or ``info_semantic.json`` (`drgs.data.class_names`). 0 and
   the largest number, 255 or 65535, are no label unless they are named there.
 - Classes in the teacher's space: ``text_embeddings.npy``, a row a class in the order of that file.
+- Classes of things that move: ``moving_classes.json``, a list of names.
 
-Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ.
+Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ. Those
+of frame 7 of the synchronous camera cam03, be it a file or part of a video, are ``cam03/semantic_class_0007.png``,
+``cam03/0007.png`` or ``cam03_0007.png``, and maps alike (`drgs.data.beside`). Dynamic 3D Gaussians' ``seg/`` are labels
+whose only class, 1, is what moves.
 """
 
 from __future__ import annotations
@@ -18,31 +22,30 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
-import re
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.data import beside
+from drgs.data.beside import LABEL_FOLDERS
 from drgs.data.checks import read_image, read_npy
 from drgs.data.class_names import CLASS_FILES, read_class_names
 from drgs.display.progress import Bar
+from drgs.guards.json_files import check_json, read_json
 
 if TYPE_CHECKING:
     import torch
 
-    from drgs.data.views import Dataset, View
+    from drgs.data.views import Dataset
     from drgs.features.segmentation import Classes
 
 __all__ = ["LABEL_FOLDERS", "TEACHER_FOLDERS", "Semantics", "attach", "plain_labels"]
 
 TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
-LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
+_MOVING = "moving_classes.json"
+_SEGMENTS = "seg"  # of Dynamic 3D Gaussians: 1 is what moves
 _EMBEDDINGS = "text_embeddings.npy"
-_LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
-_IMAGE_FOLDERS = ("images", "rgb")
-_NEAR = 3  # folders above an image among which one may be named so
-_NUMBERED = re.compile(r"rgb_(\d+)")
 _NUMBERS = 1 << 16  # what a pixel of a label image can say
 _SHOWN = 5
 
@@ -58,6 +61,7 @@ class Semantics:
         labels: Name of the folder of the label images, empty without.
         maps, label_images: The files of the views that have one, in the order of the views.
         class_file, embedding_file: Files of names and text embeddings, or None.
+        moving_file: File that names the classes of things that move, or None.
     """
 
     teacher: str = ""
@@ -66,6 +70,7 @@ class Semantics:
     label_images: tuple[Path, ...] = ()
     class_file: Path | None = None
     embedding_file: Path | None = None
+    moving_file: Path | None = None
 
     @functools.cached_property
     def channels(self) -> int | None:
@@ -103,6 +108,25 @@ class Semantics:
             )
         return Classes(names, rows)
 
+    @functools.cached_property
+    def moving(self) -> tuple[str, ...] | None:
+        """Names of the classes of things that move; None where nothing says.
+
+        Raises:
+            FileNotFoundError, ValueError: A file that is no list of names, or names no class.
+        """
+        if self.moving_file is None:
+            return self.classes.names if self.labels == _SEGMENTS and self.classes else None
+        names = read_json(self.moving_file, "a list of class names", 'write ["tongs", ...]')
+        check_json(str(self.moving_file), names, [str], 'write ["tongs", ...]')
+        known = self.classes.names if self.classes else ()
+        if unknown := [name for name in names if name not in known]:
+            raise ValueError(
+                f"{self.moving_file}: must name classes of {self.class_file or self.labels or self.teacher}, got "
+                f"{unknown[0]!r}; correct it"
+            )
+        return tuple(names)
+
     def checked(self) -> Semantics:
         """Itself, with the headers of all maps and the classes compared.
 
@@ -117,6 +141,8 @@ class Semantics:
             _ = self.classes
         elif self.class_file:  # labels alone: without a file, their numbers would be looked for in all of them
             _ = self._numbers
+        if self.moving_file:
+            _ = self.moving
         return self
 
     def check_channels(self, values: torch.Tensor, path: Path) -> None:
@@ -215,22 +241,24 @@ def attach(dataset: Dataset, lazy: bool) -> None:
         FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
     """
     found: dict[str, Path] = {}
-    bases = _bases(dataset)
-    for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", LABEL_FOLDERS)):
+    bases = beside.bases(dataset)
+    labels = (*LABEL_FOLDERS, _SEGMENTS) if dataset.format == "train_meta" else LABEL_FOLDERS
+    for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", labels)):
         folders = [base / name for name in names for base in bases if (base / name).is_dir()]
         for folder in folders:
-            files = _maps(folder) if kind == "teacher" else _label_images(folder)
-            matched = _matched(dataset.views, folder, files)
+            files = beside.maps(folder) if kind == "teacher" else beside.label_images(folder)
+            matched = beside.matched(dataset.views, folder, files)
             if matched:
                 found[kind] = folder
                 for view, path in matched:
                     setattr(view, f"{kind.removesuffix('s')}_path", path)
                 break
-            _explain(kind, folder, files, dataset.views)
+            beside.explain(kind, folder, files, dataset.views)
     if not found:
         return
     classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]
     embeddings = [base / _EMBEDDINGS for base in bases if (base / _EMBEDDINGS).is_file()]
+    moving = [base / _MOVING for base in bases if (base / _MOVING).is_file()]
     semantics = Semantics(
         teacher=found["teacher"].name if "teacher" in found else "",
         labels=found["labels"].name if "labels" in found else "",
@@ -238,6 +266,7 @@ def attach(dataset: Dataset, lazy: bool) -> None:
         label_images=tuple(view.label_path for view in dataset.views if view.label_path),
         class_file=classes[0] if classes else None,
         embedding_file=embeddings[0] if embeddings else None,
+        moving_file=moving[0] if moving else None,
     )
     if "teacher" in found:
         train = dataset.split()[0]
@@ -272,73 +301,6 @@ def plain_labels(path: Path) -> np.ndarray:
     if raw.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: a label image must have 8 or 16 bits a pixel, got {raw.dtype}; convert it")
     return raw
-
-
-def _bases(dataset: Dataset) -> list[Path]:
-    """Where the folders may be: in the data set, and beside its folder of images."""
-    path = dataset.path
-    bases = [path if path.is_dir() else path.parent]
-    image = next((view.image_path for view in dataset.views if view.image_path), None)
-    if image is not None:
-        near = list(image.parents)[:_NEAR]
-        bases += [folder.parent for folder in near if folder.name in _IMAGE_FOLDERS][:1]
-    return list(dict.fromkeys(bases))
-
-
-def _maps(folder: Path) -> dict[str, Path]:
-    """Stem of the image, with its subfolder -> map."""
-    from drgs.features.teacher import map_name
-
-    return {
-        str(PurePosixPath(path.parent.relative_to(folder)) / name): path
-        for path in sorted(folder.rglob("*.pt"))
-        if (name := map_name(path))
-    }
-
-
-def _label_images(folder: Path) -> dict[str, Path]:
-    """Stem, with its subfolder -> label image."""
-    return {
-        str(PurePosixPath(path.relative_to(folder)).with_suffix("")): path
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in _LOSSLESS and not path.name.startswith(".")
-    }
-
-
-def _matched(views: list[View], folder: Path, files: dict[str, Path]) -> list[tuple[View, Path]]:
-    """The views that have a file, and which; ValueError if two have the same."""
-    matched: list[tuple[View, Path]] = []
-    owners: dict[Path, View] = {}
-    for view in views:
-        if view.image_path is None:
-            continue
-        stems = list(dict.fromkeys((view.image_path.stem, view.image_path.name.split(".")[0])))
-        if number := _NUMBERED.fullmatch(stems[0]):
-            stems += [f"{name}_{number[1]}" for name in dict.fromkeys((folder.name, LABEL_FOLDERS[0]))]
-        below = PurePosixPath(view.name).parent
-        path = next((files[key] for key in (*(str(below / stem) for stem in stems), *stems) if key in files), None)
-        if path is None:
-            continue
-        if path in owners:
-            raise ValueError(
-                f"{path}: must belong to one image, {owners[path].image_path} and {view.image_path} are both named so; "
-                "put them into subfolders as the images"
-            )
-        owners[path] = view
-        matched.append((view, path))
-    return matched
-
-
-def _explain(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:
-    """Say that a folder has no file for any view; maps of other images are refused."""
-    image = next((view.image_path.stem for view in views if view.image_path), "NAME")
-    if kind == "teacher" and files:
-        raise ValueError(
-            f"{folder}: must hold maps of this data set's images (as {image}_fmap_CxHxW.pt), found {len(files)} of "
-            f"others ({next(iter(files.values())).name}, ...); make them from these images, or move the folder away"
-        )
-    wanted = f"{image}_fmap_CxHxW.pt" if kind == "teacher" else f"{image}.png"
-    _log.warning("%s: has no file for any image (as %s); going on without", folder, wanted)
 
 
 def _numbers_in(paths: tuple[Path, ...]) -> list[int]:

@@ -64,6 +64,11 @@ class View:
         """Whether there is a photograph to be read, be it a file or a frame of a video."""
         return self.image_path is not None or self.frame is not None
 
+    @property
+    def stem(self) -> str:
+        """What its maps and labels are called like: the image's name without its suffix, or the number of the frame."""
+        return self.name.rpartition("/")[2] if self.image_path is None else self.image_path.stem
+
     def checked(self) -> View:
         """The view with its camera at the size of its image file, whose header is read now if it has not been.
 
