@@ -188,7 +188,8 @@ def asked_of(
     theirs = None if scoring.groups is None else tuple(x for x in scoring.groups if x not in network)
     traced = "deformation" if "deformation" in blocks and scoring.network != "ratio" else ""
     apart = blocks if combined == "zscore" else ()
-    made = [_of_gaussians(scoring, part, metric, theirs, bool(apart)) for part in ([[x] for x in apart] or [blocks])]
+    parts: list[Sequence[str]] = [[block] for block in apart] or [blocks]
+    made = [_of_gaussians(scoring, part, metric, theirs, bool(apart)) for part in parts]
     if "deformation" in blocks and (scoring.groups is None or network):
         rows = _rows(tuple(x for x in blocks if x != "deformation"), metric)
         estimate = "diagonal" if scoring.network == "ratio" else scoring.network

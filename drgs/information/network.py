@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.cameras import Camera
+from drgs.ellipsoids import DeformableScene
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import camera_list, check_any_scene, check_view, gaussians_at
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
@@ -45,7 +46,7 @@ from drgs.tracing.call import Call
 from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:
-    from drgs.ellipsoids import DeformableScene, Gaussians, Scene
+    from drgs.ellipsoids import Gaussians, Scene
     from drgs.gain import Information
     from drgs.information.semantics import SemanticMetric
 
@@ -88,11 +89,11 @@ def network(
         ValueError: If the scene has no such parameters, a name is unknown or a number out of range.
     """
     where = "fisher.network"
-    groups = _checked(where, scene, estimate, mode, probes)
+    moving, groups = _checked(where, scene, estimate, mode, probes)
     total = {name: torch.zeros(_size(own) if estimate == "diagonal" else (), dtype=torch.float64)
              for name, own in groups.items()}  # fmt: skip
     for camera in _cameras(where, cameras):
-        view = _View.of(where, scene, camera, settings, channel_weights, semantics)
+        view = _View.of(where, moving, camera, settings, channel_weights, semantics)
         if view is None:
             continue
         with own_errors():
@@ -125,7 +126,7 @@ def network_variance_map(
         weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
     """
     where = "fisher.network_variance_map"
-    groups = _checked(where, scene, "diagonal", "reverse", probes)
+    moving, groups = _checked(where, scene, "diagonal", "reverse", probes)
     must_be(where, "weights", weights, Mapping, "group -> tensor, as fisher.network returns")
     for name, x in weights.items():
         if name not in groups:
@@ -135,7 +136,7 @@ def network_variance_map(
             raise ValueError(f"{where}: weights of {name} must have shape ({size},), got {tuple(x.shape)}")
         if not bool((torch.isfinite(x) & (x >= 0)).all()):
             raise ValueError(f"{where}: weights of {name} must be finite and >= 0, got others; raise lambda above 0")
-    view = _View.of(where, scene, camera, settings, channel_weights, semantics)
+    view = _View.of(where, moving, camera, settings, channel_weights, semantics)
     total = torch.zeros(camera.height * camera.width, dtype=torch.float64)
     if view is None or not weights:
         return total.float().reshape(camera.height, camera.width)
@@ -169,7 +170,7 @@ class _View:
     def of(
         cls,
         where: str,
-        scene: Scene,
+        scene: DeformableScene,
         camera: Camera,
         settings: RenderSettings | None,
         channel_weights: Sequence[float],
@@ -190,8 +191,8 @@ class _View:
             assert seen.features is not None  # `check` has refused it
             # Squares of few channels add up to those of all decoded ones, in one traversal.
             directions = semantics.directions(seen.features)
-            deformed = _Reduced(scene, directions)
-            seen = deformed.reduced(seen)
+            deformed = reduced = _Reduced(scene, directions)
+            seen = reduced.reduced(seen)
             scales = torch.cat([scales, torch.full((directions.shape[1],), semantics.weight**0.5)])
         settings = settings or RenderSettings.preset("exact")
         return cls(Call(seen.detach(), camera, settings, frozenset(), scene=deformed), scales)
@@ -238,7 +239,7 @@ class _Reduced:
         """As the scene, reduced."""
         return self.reduced(self.scene.at(time))
 
-    def deform(self, parameters: dict[str, torch.Tensor], time: float | None) -> Gaussians:
+    def deform(self, parameters: dict[str, torch.Tensor], time: float | torch.Tensor | None) -> Gaussians:
         """As the scene, reduced."""
         return self.reduced(self.scene.deform(parameters, time))
 
@@ -306,8 +307,10 @@ def _unflat(own: Mapping[str, torch.Tensor], rows: torch.Tensor) -> dict[str, to
 # -------------------------------------------------- arguments
 
 
-def _checked(where: str, scene: Scene, estimate: str, mode: str, probes: int) -> Groups:
-    """The scene's groups, if all else is right, too."""
+def _checked(
+    where: str, scene: Scene, estimate: str, mode: str, probes: int
+) -> tuple[DeformableScene, dict[str, dict[str, torch.Tensor]]]:
+    """The scene and its groups, if all else is right, too."""
     check_any_scene(where, scene)
     if estimate not in NETWORK_ESTIMATES:
         known = ", ".join(NETWORK_ESTIMATES)
@@ -318,13 +321,13 @@ def _checked(where: str, scene: Scene, estimate: str, mode: str, probes: int) ->
     if not (isinstance(probes, int) and probes >= 1):
         raise ValueError(f"{where}: probes must be a whole number >= 1, got {probes!r}; try 16")
     groups = network_groups(scene)
-    if not groups:
+    if not (isinstance(scene, DeformableScene) and groups):
         beginnings = " or ".join(f"{prefix}*" for prefix in NETWORK_GROUPS.values())
         raise ValueError(
             f"{where}: scene must have float parameters named {beginnings}, has none; use fisher.diagonal for those of "
             "Gaussians and of other networks"
         )
-    return groups
+    return scene, groups
 
 
 def _cameras(where: str, cameras: object) -> list[Camera]:

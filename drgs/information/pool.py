@@ -62,10 +62,9 @@ class Scoring:
     probes: int = 16
 
     def __post_init__(self) -> None:
-        choices = {"criterion": CRITERIA, "method": METHODS, "network": NETWORK_SCORES, "combine": (None, *COMBINES)}
-        for name, known in choices.items():
+        choices: dict[str, tuple[str, ...]] = {"criterion": CRITERIA, "method": METHODS, "network": NETWORK_SCORES}
+        for name, known in (choices | ({} if self.combine is None else {"combine": COMBINES})).items():
             if (value := getattr(self, name)) not in known:
-                known = [x for x in known if x is not None]
                 raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
         must_be("select", "settings", self.settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')
         must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
