@@ -297,7 +297,7 @@ def test_folders_of_frames(tmp_path, place, name):
     assert decoded(data.views[15].image()) == (2, 3)
     np.testing.assert_allclose(sorted(data.points[:, 0]), [1, 3, 4])
     np.testing.assert_allclose(data.colors, [[1, 0, 0.2]] * 3, atol=1e-6)
-    assert data.point_source == f"COLMAP model {place.split('/')[-1]}, 3 points of 3 cameras"
+    assert data.point_source == f"COLMAP model {place}, 3 points of 3 cameras"
     assert len(load(tmp_path, test_cameras=()).points) == 5
     assert load(tmp_path, points=False, times=3).frames == (0, 2, 5)
 
@@ -448,3 +448,217 @@ def test_segments_say_what_moves(tmp_path):
     assert data.views[3].label_path == tmp_path / "seg" / "1" / "000001.png"
     assert data.views[3].labels().sum() == 10 * HEIGHT
     assert data.views[3].mask() is None
+
+
+def test_points_of_a_model_of_the_first_frame(neu3d, tmp_path, caplog):
+    """Beside videos, a COLMAP model whose images are named by the cameras gives the points that two training cameras
+    show; one with other poses is told of and left out.
+    """
+    shutil.copytree(neu3d, tmp_path, dirs_exist_ok=True)
+    names, tracks = [f"cam{k:02d}.png" for k in range(4)], [(0, 1), (1, 2, 3), (0, 3), (2, 3)]
+    write_model(tmp_path / "frame0" / "sparse" / "0", cameras(), names, tracks)
+    data = load(tmp_path)
+    assert data.format == "neu3d"
+    np.testing.assert_allclose(sorted(data.points[:, 0]), [1, 3])
+    assert data.point_source == "COLMAP model frame0/sparse/0, 2 points of 3 cameras"
+    np.testing.assert_allclose(sorted(load(tmp_path, test_cameras=("cam03",)).points[:, 0]), [0, 1])
+    assert load(tmp_path, points=False).points is None
+    assert not caplog.text
+    shutil.rmtree(tmp_path / "frame0")
+    write_model(tmp_path / "sparse" / "0", cameras()[::-1], names, tracks)
+    assert load(tmp_path).points is None
+    assert "sparse/0: has another pose of cam00 than the data set; its points are left out" in caplog.text
+
+
+# ------------------------------------------------------------------------------------------------ bad input
+
+
+def refused(folder, kind=ValueError, **options):
+    """The one line in which a data set is refused."""
+    with pytest.raises(kind) as error:
+        load(folder, **options)
+    text = str(error.value)
+    assert "\n" not in text
+    assert ": " in text
+    assert "; " in text
+    return text
+
+
+@pytest.fixture
+def copied(neu3d, tmp_path):
+    """The four videos and their poses, to be changed."""
+    return shutil.copytree(neu3d, tmp_path / "data")
+
+
+def test_poses_for_another_number_of_cameras(copied):
+    """Rows name no video, so that a missing one would give all others wrong poses."""
+    (copied / "cam01.mp4").unlink()
+    assert "got 4 rows and 3 videos" in refused(copied)
+    (copied / "camera.avi").write_bytes(b"")
+    assert "camera.avi: must be a video" in refused(copied)
+
+
+def test_videos_of_different_length(copied, caplog):
+    """What all of them show is used, and told; `strict` refuses."""
+    write_video(copied / "cam02.mp4", [coded(i, 2) for i in range(4)])
+    data = load(copied)
+    assert data.frames == (0, 1, 2, 3)
+    assert data.times[-1] == 1.0
+    assert "different length (cam02.mp4 has 4 frames, cam00.mp4 6); frames from 4 on are left out" in caplog.text
+    assert "videos must be of one length" in refused(copied, strict=True)
+
+
+def test_a_video_of_another_shape(copied):
+    """Its focal length would belong to nothing; one of another size alone is calibrated for that size."""
+    write_video(copied / "cam02.mp4", [np.zeros((HEIGHT, HEIGHT, 3), np.uint8)] * FRAMES)
+    assert "camera cam02" in refused(copied)
+    write_video(copied / "cam02.mp4", [np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8)] * FRAMES)
+    np.testing.assert_allclose(load(copied).views[13].camera.K[0], [2 * FOCAL, 0, WIDTH])
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "begins as none of them"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+        (b"#EXTM3U\n#EXTINF:10,\nfile:///etc/passwd\n", "begins as none of them"),
+        (b"\0\0\0\x18ftypmp42" + bytes(400), "could not be opened"),
+        (b"\x1aE\xdf\xa3" + bytes(400), "could not be opened"),
+    ],
+)
+def test_what_is_no_video(copied, content, told, capfd):
+    """It is named, in one line, and nothing of the decoder's gets through; a playlist is not followed."""
+    (copied / "cam02.mp4").write_bytes(content)
+    text = refused(copied)
+    assert "cam02.mp4: " in text
+    assert told in text
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("suffix", "code"), [(".avi", "MJPG"), (".mkv", "mp4v"), (".webm", "VP80")])
+def test_a_video_that_ends_early(copied, suffix, code, capfd):
+    """One whose index was at the end cannot be opened; one whose frames are missing has fewer than its header claims.
+    Nothing of the decoder's gets through.
+    """
+    data = (copied / "cam02.mp4").read_bytes()
+    (copied / "cam02.mp4").write_bytes(data[: len(data) // 2])
+    assert "cam02.mp4: must be a video, could not be opened" in refused(copied)
+    (copied / "cam02.mp4").unlink()
+    path = write_video(copied / f"cam02{suffix}", [coded(i) for i in range(40)], code)
+    capfd.readouterr()  # what the writer had to say
+    path.write_bytes(path.read_bytes()[: 6 * path.stat().st_size // 10])
+    assert "must hold the 40 frames that its header claims, holds" in refused(copied)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("claim", [2**31 - 1, 2])
+def test_the_number_of_frames_in_a_header_is_not_believed(tmp_path, claim):
+    """Too many are refused before anything is made for them; too few are counted."""
+    path = write_video(tmp_path / "a.avi", [coded(i) for i in range(FRAMES)], "MJPG")
+    data = bytearray(path.read_bytes())
+    for mark, offset in ((b"avih", 8 + 16), (b"strh", 8 + 32)):  # dwTotalFrames and dwLength
+        start = data.index(mark) + offset
+        assert int.from_bytes(data[start : start + 4], "little") == FRAMES
+        data[start : start + 4] = claim.to_bytes(4, "little")
+    path.write_bytes(data)
+    if claim == 2:
+        assert read_video(path).count == FRAMES
+        assert decoded(VideoFrame(path, 5).read()) == (0, 5)
+    else:
+        with pytest.raises(ValueError, match="must hold the 2147483647 frames that its header claims, holds 6"):
+            read_video(path)
+
+
+def test_a_damaged_frame(copied, caplog):
+    """A frame that cannot be decoded is refused by its number when it is read, as is one beyond the end; those before
+    it are what they were.
+    """
+    path = write_video(copied / "cam02.avi", [coded(i, 2) for i in range(FRAMES)], "MJPG")
+    data = bytearray(path.read_bytes())
+    starts = [i for i in range(len(data)) if data[i : i + 4] == b"00dc" and data[i + 8 : i + 10] == b"\xff\xd8"]
+    assert len(starts) == FRAMES
+    data[starts[3] + 8 : starts[4]] = bytes(starts[4] - starts[3] - 8)
+    path.write_bytes(data)
+    assert decoded(VideoFrame(path, 2).read()) == (2, 2)
+    with pytest.raises(ValueError, match=r"cam02\.avi: frame 3 of 6 must be decoded, could not be; it is truncated"):
+        VideoFrame(path, 3).read()
+    with pytest.raises(ValueError, match="frame 6 must be there, the video has 6"):
+        VideoFrame(path, 6).read()
+
+
+@pytest.mark.parametrize("times", [0, -1, 2.5, True, "all", None])
+def test_a_number_of_times_that_cannot_be(neu3d, times):
+    """In one line, before anything is read."""
+    assert "times must be a whole number >= 1" in refused(neu3d, times=times)
+    with pytest.raises(ValueError, match="fit: times must be a whole number"):
+        FitConfig(times=times)
+
+
+def test_frames_that_are_missing(tmp_path, caplog):
+    """A frame that one camera lacks is absent, and times stay those of the others; `strict` refuses. Frames of several
+    sizes in one camera are refused, two of one number, and a camera without a pose.
+    """
+    views = write_frames(tmp_path)
+    names = [f"cam{k:02d}.png" for k in range(4)]
+    write_model(tmp_path / "sparse_", views, names)
+    (tmp_path / "cam02" / "frame_00003.png").unlink()
+    (tmp_path / "cam01" / "notes.txt").write_text("no frame")
+    data = load(tmp_path)
+    assert [view.name for view in data.absent] == ["cam02/0003"]
+    assert len(data.views) == 23
+    assert data.times == tuple(i / 5 for i in range(FRAMES))
+    assert "1 of the 24 images that it lists are not there" in caplog.text
+    assert "cam02/frame_00003.png" in refused(tmp_path, FileNotFoundError, strict=True)
+    cv2.imwrite(str(tmp_path / "cam02" / "frame_00003.png"), np.zeros((HEIGHT * 2, WIDTH * 2, 3), np.uint8))
+    assert "must be 32x24 pixels as the other frames of camera cam02, got 64x48" in refused(tmp_path)
+    (tmp_path / "cam02" / "frame_00003.png").rename(tmp_path / "cam02" / "f_2.png")
+    assert "must be the only frame 2 of its camera" in refused(tmp_path)
+    (tmp_path / "cam02" / "f_2.png").unlink()
+    shutil.rmtree(tmp_path / "sparse_")
+    write_model(tmp_path / "sparse_", views[:3], names[:3])
+    assert load(tmp_path).camera_names == ("cam00", "cam01", "cam02")
+    assert "has no image of 1 of the 4 cameras (cam03); going on without them" in caplog.text
+    assert "name its images by their cameras" in refused(tmp_path, FileNotFoundError, strict=True)
+    shutil.rmtree(tmp_path / "sparse_")
+    write_model(tmp_path / "sparse_", views, ["a.png", "b.png", "c.png", "d.png"])
+    assert "must have images named by their cameras" in refused(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"k": []}, "k, w2c, fn and cam_id must be lists of one length by time, got k 0, w2c 2"),
+        ({"cam_id": [[0, 1]] * 2}, "time 0: k, w2c, fn and cam_id must name the same cameras"),
+        ({"cam_id": [[0, 1, 1]] * 2}, "time 0, camera 1: must be there once"),
+        ({"cam_id": [["a", 1, 2]] * 2}, "cam_id[0][0] must be a whole number"),
+        ({"fn": [["../a.png", "1/0.png", "2/0.png"]] * 2}, "fn must name an image inside ims"),
+        ({"w2c": [[np.eye(3).tolist()] * 3] * 2}, "w2c must be 4x4 finite numbers"),
+        ({"w2c": [[(2 * np.eye(4)).tolist()] * 3] * 2}, "camera 0"),
+        ({"k": [[[[1, 0, "x"]] * 3] * 3] * 2}, "k must be 3x3 finite numbers"),
+        ({"w": 10**9}, "camera 0"),
+        ({"h": -4}, "camera 0"),
+        ({"fn": 3}, "fn must be a list"),
+    ],
+)
+def test_lists_that_cannot_be(tmp_path, changed, told):
+    """What is wrong is named by its place in the file."""
+    write_train_meta(tmp_path, cameras(3), times=2, **changed)
+    text = refused(tmp_path)
+    assert "train_meta.json" in text
+    assert told in text
+
+
+def test_points_that_are_none(tmp_path):
+    """An archive that is none, or has other arrays, or claims more than it holds, is named."""
+    write_train_meta(tmp_path, cameras(3), times=2)
+    path = tmp_path / "init_pt_cld.npz"
+    for write in (
+        lambda: path.write_bytes(b"PK\x03\x04 no archive"),
+        lambda: np.savez(path, other=np.zeros((3, 7))),
+        lambda: np.savez(path, data=np.zeros(7)),
+        lambda: np.savez(path, data=np.array([{}])),
+    ):
+        write()
+        assert "init_pt_cld.npz" in refused(tmp_path)
+    write_train_meta(tmp_path, cameras(3), times=2, name="test_meta.json", first=1)
+    assert "must have other cameras than train_meta.json, 1 is in both" in refused(tmp_path, points=False)

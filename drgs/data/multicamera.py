@@ -9,8 +9,11 @@ from __future__ import annotations
 import logging
 import re
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.checks import list_images
@@ -18,11 +21,12 @@ from drgs.data.colmap import find_model, model_camera, model_points, read_model
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.views import Dataset
 
-__all__ = ["find_camera_folders", "load_cameras"]
+__all__ = ["add_model_points", "find_camera_folders", "load_cameras"]
 
 _CAMERA = re.compile(r"cam[a-z_-]*(\d{1,9})", re.IGNORECASE)
 _NUMBER = re.compile(r"(\d{1,9})$")
 _MODEL = "sparse_"  # where 4DGaussians has it
+_SAME_POSE = 1e-2  # of the cameras' extent, and between the axes
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +64,12 @@ def load_cameras(
     """
     model, folders = _model(path), find_camera_folders(path)
     reconstruction = read_model(model, points)
-    posed = _posed(reconstruction, model, folders)
+    posed = _posed(reconstruction, model, [folder.name for folder in folders])
+    if not posed:
+        raise ValueError(
+            f"{model}: must have images named by their cameras, as {folders[0].name}.png or {folders[0].name}/..., has "
+            "none; run COLMAP on one frame of each camera, named so"
+        )
     if without := [folder.name for folder in folders if folder.name not in posed]:
         told = f"{model}: has no image of {len(without)} of the {len(folders)} cameras ({', '.join(without[:5])})"
         if strict or len(posed) < 2:
@@ -80,13 +89,53 @@ def load_cameras(
     dataset = Dataset(path, "cameras", [], test_cameras=held_out)
     synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
     if points:
-        left_out = held_out if test_cameras is None else test_cameras
-        kept = {image_id for name, (image_id, _) in posed.items() if name not in (left_out or ())}
-        xyz, colors = model_points(reconstruction, model, kept)
-        if len(xyz):
-            dataset.points, dataset.colors = xyz, colors
-            dataset.point_source = f"COLMAP model {model.name}, {len(xyz)} points of {len(kept)} cameras"
+        _add_points(dataset, reconstruction, model, posed, held_out if test_cameras is None else test_cameras)
     return dataset
+
+
+def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras: tuple[str, ...] | None) -> None:
+    """Take the points of a COLMAP model of the first frame, if there is one in ``frame0`` or in the data set's folder.
+
+    Its images are named by the cameras, and it must have their poses: else its world is another one.
+
+    Args:
+        dataset: Without points.
+        cameras: Name -> camera.
+        test_cameras: Names of those that are held out.
+    """
+    path = dataset.path / "frame0"
+    model = (_model(path) if path.is_dir() else None) or _model(dataset.path)
+    if model is None:
+        return
+    reconstruction = read_model(model)
+    posed = _posed(reconstruction, model, list(cameras))
+    if not posed:
+        return
+    extent = np.ptp([camera.center for camera in cameras.values()], axis=0).max()
+    for name, (_, camera) in posed.items():
+        moved = np.linalg.norm(camera.center - cameras[name].center)
+        turned = np.abs(camera.c2w[:3, :3] - cameras[name].c2w[:3, :3]).max()
+        if moved > _SAME_POSE * extent or turned > _SAME_POSE:
+            _log.warning("%s: has another pose of %s than the data set; its points are left out", model, name)
+            return
+    _add_points(dataset, reconstruction, model, posed, test_cameras)
+
+
+def _add_points(
+    dataset: Dataset,
+    reconstruction: Any,
+    model: Path,
+    posed: dict[str, tuple[int, Camera]],
+    left_out: tuple[str, ...] | None,
+) -> None:
+    """Give a data set the points of its model that two cameras show which are not left out."""
+    kept = {image_id for name, (image_id, _) in posed.items() if name not in (left_out or ())}
+    xyz, colors = model_points(reconstruction, model, kept)
+    if len(xyz):
+        dataset.points, dataset.colors = xyz, colors
+        dataset.point_source = (
+            f"COLMAP model {model.relative_to(dataset.path)}, {len(xyz)} points of {len(kept)} cameras"
+        )
 
 
 def _model(path: Path) -> Path | None:
@@ -101,16 +150,12 @@ def _frame_folder(camera: Path) -> Path:
     return camera / "images" if (camera / "images").is_dir() else camera
 
 
-def _posed(reconstruction: Any, model: Path, folders: list[Path]) -> dict[str, tuple[int, Camera]]:
-    """Name of a camera -> the first image of it in the model, by name, and the camera of that.
-
-    Raises:
-        ValueError: No image is named by a camera, or one by two.
-    """
-    by_number = defaultdict(list)
-    for folder in folders:
-        by_number[int(_CAMERA.fullmatch(folder.name)[1])].append(folder.name)
-    names, found = {folder.name for folder in folders}, {}
+def _posed(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[str, tuple[int, Camera]]:
+    """Name of a camera -> the first image of it in the model, by name, and the camera of that."""
+    by_number, found = defaultdict(list), {}
+    for name in names:
+        if number := _NUMBER.search(name):
+            by_number[int(number[1])].append(name)
     images = {image_id: reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids()}
     for image_id, image in sorted(images.items(), key=lambda item: item[1].name):
         parts = PurePosixPath(image.name).with_suffix("").parts
@@ -120,13 +165,7 @@ def _posed(reconstruction: Any, model: Path, folders: list[Path]) -> dict[str, t
             owner = same[0] if len(same) == 1 and len(parts) == 1 else None
         if owner and owner not in found:
             found[owner] = image_id, model_camera(reconstruction, image, f"{model}: image {image.name}")
-    if not found:
-        shown = next(iter(images.values())).name if images else "none at all"
-        raise ValueError(
-            f"{model}: must have images named by their cameras, as {folders[0].name}.png or {folders[0].name}/..., got "
-            f"{shown}; run COLMAP on one frame of each camera, named so"
-        )
-    return {folder.name: found[folder.name] for folder in folders if folder.name in found}
+    return {name: found[name] for name in names if name in found}
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

@@ -8,6 +8,7 @@ import logging
 from pathlib import Path
 
 from drgs.data.llff import pose_rows, row_camera
+from drgs.data.multicamera import add_model_points
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
 from drgs.data.views import Dataset
@@ -31,18 +32,21 @@ def load_neu3d(
     path: Path,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     times: int = 40,
+    test_cameras: tuple[str, ...] | None = None,
     lazy: bool = False,
+    points: bool = True,
     strict: bool = False,
     **_,
 ) -> Dataset:
     """Load the videos of synchronous cameras; no frame is decoded.
 
     The focal length belongs to the size that the poses state, and is scaled to that of the videos. Of videos of
-    different length, as many frames are used as the shortest one has.
+    different length, as many frames are used as the shortest one has. Points are those of a COLMAP model of the first
+    frame, if there is one (`add_model_points`).
 
     Args:
         path: the folder.
-        background, times, lazy, strict: see `drgs.data.load`.
+        background, times, test_cameras, lazy, points, strict: see `drgs.data.load`.
 
     Raises:
         FileNotFoundError: no such file.
@@ -78,5 +82,8 @@ def load_neu3d(
         camera = row_camera(f"{where} ({video.path.name})", row, video.path.stem)
         recordings.append(Recording(video.path.stem, dict.fromkeys(numbers, camera), video, where))
     dataset = Dataset(path, "neu3d", [], test_cameras=tuple(stems[:1]) if len(stems) > 1 else None)
-    how = {"background": background, "lazy": lazy, "strict": strict}
-    return synchronous(dataset, recordings, numbers, where=path, **how)
+    synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
+    if points:
+        seen = {recording.name: recording.cameras[0] for recording in recordings}
+        add_model_points(dataset, seen, dataset.test_cameras if test_cameras is None else test_cameras)
+    return dataset
