@@ -30,8 +30,8 @@ from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import config_record
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
-from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
+from drgs.fitting.start import motion_of, start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.guards import interrupts
@@ -39,7 +39,7 @@ from drgs.guards.outputs import claim
 from drgs.integrator import render
 
 if TYPE_CHECKING:
-    from drgs.data import Dataset, View
+    from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.parts import Parts
 
@@ -116,6 +116,7 @@ def _fit(
         check_parallax(train)
     plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
+    motion = motion_of(config, train, test) if parts is None else None
     # Parts of a caller's own say themselves what is fitted to what.
     begun = [plan.views[i] for i in plan.chosen] if plan else train
     taught = SemanticRecord.of(dataset, config, begun) if parts is None else None
@@ -132,13 +133,13 @@ def _fit(
         check_references(held_out)
     if tensors is not None and header is not None:
         made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
-        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made)
+        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds, source = header["seconds"], header["point_source"]
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source = _start(dataset, views, frames, config, parts, taught, plan is not None, room)
+        trainer, source = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
         seconds = 0.0
-    recorded = config_record(dataset, config, plan, taught, frames, held_out, source)
+    recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -150,6 +151,7 @@ def _fit(
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
+    moved = None if motion is None else motion.report(trainer.rows)
     segmentation = _segmentation(trainer, taught, run, held_out)
     result = metrics.evaluate(
         scene, held_out, config.settings, pictures=run.renders / "test", segmentation=segmentation
@@ -168,8 +170,10 @@ def _fit(
             scene, held_out or trainer.frames, config.settings, "test" if held_out else "train"
         ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
+        **({"motion": moved} if moved else {}),
     )
-    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"])
+    told = {"motion": moved} if moved else {}
+    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **told)
     return FitResult(g, written, run, loop.seconds)
 
 
@@ -190,38 +194,6 @@ def _checkpoint(
         plan.restore(tensors, header, str(run.path))
     check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
     return tensors, header
-
-
-def _start(
-    dataset: Dataset,
-    views: list[View],
-    frames: list[Frame],
-    config: FitConfig,
-    parts: Parts | None,
-    taught: SemanticRecord | None,
-    strict: bool,
-    reserved: int,
-) -> tuple[Trainer, str]:
-    """A trainer at step 0, and where its points come from: by default, if `strict`, only from `views`."""
-    from drgs.data import initial_points, scene_extent
-
-    if not frames:
-        raise ValueError("fit: there must be at least one training view, got none; add photographs")
-    # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
-    given = config.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
-    with Bar("initial points") as bar:
-        points, colors, source = initial_points(
-            dataset if given else views, config.seed, config.max_gaussians - reserved, bar.stage
-        )
-        bar.note(f"initial points: {source}")
-    extent = scene_extent([frame.camera for frame in frames], points)
-    dense = not given and any(view.depth_path is not None for view in views)
-    width, channels = (taught.width, taught.channels) if taught else (0, None)
-    model = GaussianRows.from_points(
-        torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense), features=width
-    )
-    _log.info("%d initial points: %s", len(points), source)
-    return Trainer(config, frames, model, extent, parts or parts_of(config, extent, channels)), source
 
 
 def _segmentation(trainer: Trainer, taught: SemanticRecord | None, run: Run, frames: list[Frame]) -> Any:
@@ -357,9 +329,15 @@ class _Loop:
                 psnr=float(np.mean(psnr)) if psnr else None,
                 **({"features": float(np.mean(features))} if features else {}),
                 gaussians=len(self.trainer.rows),
+                **({} if (moving := self._moving()) is None else {"moving": moving}),
                 seconds=self.seconds,
             )
             self._recent = []
+
+    def _moving(self) -> float | None:
+        """Part of the Gaussians that move, in the dynamic stage of a fit that has one."""
+        trainer = self.trainer
+        return None if trainer.motion is None else trainer.motion.share(trainer.rows)
 
     def _preview(self, bar: Bar, is_interrupted: Callable[[], bool]) -> None:
         """One picture, and the PSNR of all held-out views, unless the fit is interrupted."""

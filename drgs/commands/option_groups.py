@@ -201,7 +201,7 @@ class Moving:
     field_rate: tuple[float, float] = FitConfig.field_rate
     """First and last learning rate of the field's MLP."""
     motion_rate: float = FitConfig.motion_rate
-    """Learning rate of the gates that say which Gaussians move."""
+    """How far a gate that says whether a Gaussian moves can go in the dynamic stage, a logit."""
     motion_weight: float = FitConfig.motion_weight
     """Weight of the mean gate in the loss: the larger, the fewer Gaussians move."""
     smooth_weight: float = FitConfig.smooth_weight

@@ -123,7 +123,8 @@ class FitConfig:
         field_preset: Size of the deformation field, as in [2] for videos of several cameras (`neu3d`) or for one camera
             around an object (`dnerf`).
         grid_rate, field_rate: First and last learning rate of the field's planes and of its MLP, log-linear between.
-        motion_rate: Learning rate of the gates, one a Gaussian, that say what moves.
+        motion_rate: How far the logit of a gate, one a Gaussian, that says what moves can go in the dynamic stage: its
+            learning rate is that divided by the steps.
         motion_weight: Of the mean of all gates: what no photograph shows to move comes to a rest, and is not deformed.
         smooth_weight: Of the second differences along time of the field's planes of space and time, as in [2].
         plane_weight: The same, of its planes of space.
@@ -181,8 +182,8 @@ class FitConfig:
     field_preset: FieldPreset = "neu3d"
     grid_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     field_rate: tuple[float, float] = (1.6e-4, 1.6e-5)
-    motion_rate: float = 0.05
-    motion_weight: float = 0.01
+    motion_rate: float = 60.0
+    motion_weight: float = 0.03
     smooth_weight: float = 1e-3
     plane_weight: float = 2e-4
     l1_time_weight: float = 1e-4

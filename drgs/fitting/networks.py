@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 
@@ -26,17 +26,25 @@ class Network:
         name: Of its entries in a checkpoint: `NAME.parameter.*` (parameters and buffers) and `NAME.adam.*`.
         module: What losses, or the scene, call.
         rate: Its learning rate.
+        factors: Of the learning rate of some parameters, by name, e.g. of those that have a unit of length in them.
         optimizer: Adam, with torch's defaults.
     """
 
-    def __init__(self, name: str, module: torch.nn.Module, rate: Rate) -> None:
+    def __init__(
+        self, name: str, module: torch.nn.Module, rate: Rate, factors: Mapping[str, float] | None = None
+    ) -> None:
         self.name, self.module, self.rate = name, module, rate
-        self.optimizer = torch.optim.Adam(module.parameters(), lr=rate_at(rate, 0.0))
+        groups: dict[float, list] = {}
+        for key, x in module.named_parameters():
+            groups.setdefault((factors or {}).get(key, 1.0), []).append(x)
+        self.optimizer = torch.optim.Adam(
+            [{"params": listed, "factor": factor} for factor, listed in groups.items()], lr=rate_at(rate, 0.0)
+        )
 
     def set_rate(self, part: float) -> None:
         """The learning rate for a step after the fraction `part` of the fit."""
         for group in self.optimizer.param_groups:
-            group["lr"] = rate_at(self.rate, part)
+            group["lr"] = rate_at(self.rate, part) * group["factor"]
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that a checkpoint needs, by name; a tensor that has several names is copied under each of them."""

@@ -22,6 +22,7 @@ from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
+    from drgs.deform import DynamicGaussians
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
@@ -68,6 +69,7 @@ class FitRecord:
         config: How it was fitted.
         is_active: Whether views were chosen during the fit.
         semantics: What its features were fitted to; None where it has none.
+        times: Of the views, sorted, where it was fitted to what moves; else none.
     """
 
     data: Path
@@ -76,6 +78,7 @@ class FitRecord:
     config: FitConfig
     is_active: bool
     semantics: SemanticRecord | None = None
+    times: tuple[float, ...] = ()
 
     def check_data(self, run: Path, otherwise: str = "") -> None:
         """Raise FileNotFoundError if the data set is no longer where it was fitted; `otherwise` is advice, too."""
@@ -89,13 +92,16 @@ class LoadedRun:
     """What a run holds.
 
     Attributes:
-        gaussians: As the last checkpoint has them, or the PLY where there is none that can be read.
+        gaussians: As the last checkpoint has them, or the PLY where there is none that can be read; at rest, where they
+            move.
         record: How they were fitted.
         step: Of the checkpoint; None where only the PLY could be read.
         networks: What was fitted beside them, by name: what `torch.nn.Module.load_state_dict` takes.
         decoder: What makes a teacher's features of the Gaussians'; None where it has none, or only the PLY could be
             read.
         classes: What the data set that was fitted calls things; None where it does not.
+        moving: The Gaussians with the field that moves them; None where they stand still, or only the PLY could be
+            read.
     """
 
     gaussians: Gaussians
@@ -104,11 +110,12 @@ class LoadedRun:
     networks: dict[str, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
     decoder: Decoder | None = None
     classes: Classes | None = None
+    moving: DynamicGaussians | None = None
 
     @property
     def scene(self) -> Scene:
         """What is rendered: the Gaussians, or those that a deformation field moves."""
-        return self.gaussians
+        return self.gaussians if self.moving is None else self.moving
 
 
 def load_run(run: Run) -> LoadedRun:
@@ -122,7 +129,7 @@ def load_run(run: Run) -> LoadedRun:
         ValueError: If config.json or the classes' embeddings are damaged, or everything else.
     """
     record = fit_record(run)
-    known, decoder = record.semantics, None
+    known, decoder, moving = record.semantics, None, None
     classes = None if known is None else known.read_classes(run.path)
     try:
         tensors, header = load_state(run.state)
@@ -132,6 +139,10 @@ def load_run(run: Run) -> LoadedRun:
         networks = saved_networks(tensors, header)
         if known is not None:
             decoder = known.decoder(networks, gaussians, str(run.state))
+        if "field" in header:
+            from drgs.fitting.dynamics import moving_scene
+
+            moving = moving_scene(gaussians, tensors, networks, header, str(run.state))
     except (FileNotFoundError, ValueError) as error:
         if not run.point_cloud.is_file():
             if run.state.exists():
@@ -141,7 +152,8 @@ def load_run(run: Run) -> LoadedRun:
                 "reached its first checkpoint"
             ) from None
         gaussians = load_ply(run.point_cloud)
-        _log.warning("%s; %s is taken instead", str(error).partition(";")[0], run.point_cloud.name)
+        what = f"{run.point_cloud.name}, where nothing moves," if record.times else run.point_cloud.name
+        _log.warning("%s; %s is taken instead", str(error).partition(";")[0], what)
         return LoadedRun(gaussians, record, None, classes=classes)
     if run.point_cloud.is_file() and not _shows(run.point_cloud, gaussians):
         _log.warning(
@@ -150,7 +162,7 @@ def load_run(run: Run) -> LoadedRun:
             run.point_cloud,
             run.state.name,
         )
-    return LoadedRun(gaussians, record, header["step"], networks, decoder, classes)
+    return LoadedRun(gaussians, record, header["step"], networks, decoder, classes, moving)
 
 
 def _shows(path: Path, gaussians: Gaussians) -> bool:
@@ -190,6 +202,7 @@ def config_record(
     frames: list[Frame],
     held_out: list[Frame],
     source: str,
+    times: tuple[float, ...] = (),
 ) -> dict:
     """What config.json is to say of a fit, for `drgs.files.Run.start`; `fit_record` reads it."""
     recorded: dict[str, Any] = {
@@ -205,6 +218,7 @@ def config_record(
         **({"frames": list(dataset.frames)} if dataset.frames else {}),
         **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
         **({"semantics": taught.to_json()} if taught else {}),
+        **({"times": list(times)} if times else {}),
         "fit": config.to_json(),
     }
     if plan:
@@ -225,7 +239,7 @@ def fit_record(run: Run) -> FitRecord:
     """
     config, where = run.config(), f"{run.path / 'config.json'}"
     advice = "restore the file, or fit again in another folder"
-    check_json(where, config, _CONFIG, advice)
+    check_json(where, config, _CONFIG | ({"times": [float]} if "times" in config else {}), advice)
     try:
         fit = FitConfig.from_json(config["fit"])
     except (ValueError, NotImplementedError) as error:
@@ -237,6 +251,7 @@ def fit_record(run: Run) -> FitRecord:
         fit,
         bool(config.get("active")),
         SemanticRecord.from_json(config.get("semantics"), f"{where}: semantics"),
+        tuple(config.get("times", ())),
     )
 
 

@@ -85,6 +85,11 @@ class GaussianRows:
         old = self.tensors["sh_rest"]
         self._extend("sh_rest", old.new_zeros(len(old), 2 * self.sh_degree + 3, 3), 1)
 
+    def add_tensor(self, name: str, values: torch.Tensor) -> None:
+        """One more tensor with a row a Gaussian, with no moments; the others keep theirs."""
+        self.tensors[name] = x = values.detach().clone().requires_grad_()  # a leaf of its own, as in `__init__`
+        self.optimizer.add_param_group({"params": [x], "name": name})
+
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Add Gaussians with zero moments; in tensors that `rows` lacks, their rows are 0."""
         count = len(rows["means"])

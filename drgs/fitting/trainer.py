@@ -1,7 +1,7 @@
 """One fit, a step at a time: the losses and rates of 3DGS and MCMC density control (density.py) with a fixed budget.
 
 All schedules are fractions of `max_steps`, so that a short fit goes through all of them. One view a step, in epochs
-of random order. `drgs.train` adds files, progress and the command.
+of random order. What moves is fitted in two stages (dynamics.py). `drgs.train` adds files, progress and the command.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
 from drgs.fitting.rows import GaussianRows
+from drgs.fitting.stages import Stage
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
+    from drgs.fitting.dynamics import Motion
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
@@ -60,6 +62,7 @@ class Trainer:
         rows: The Gaussians and their optimizer.
         extent: Of the scene, its unit of length.
         parts: Terms of the loss, learning rates, networks, and what is rendered.
+        motion: The stages of a fit to what moves; None of what stands still.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
@@ -72,11 +75,13 @@ class Trainer:
         rows: GaussianRows,
         extent: float,
         parts: Parts | None = None,
+        motion: Motion | None = None,
     ) -> None:
         """A fit at its first step.
 
         Args:
             parts: Default those of `config`.
+            motion: Which stage it is in, and what comes with the next.
         Raises:
             ValueError: If there is no photograph or no Gaussian, a tensor has no rate, or two networks have one name.
         """
@@ -86,6 +91,17 @@ class Trainer:
             raise ValueError("fit: there must be at least one initial point, got none; check the data set")
         self.config, self.frames, self.rows, self.extent = config, frames, rows, extent
         self.parts = parts_of(config, extent) if parts is None else parts
+        self.motion = motion
+        self._check_parts()
+        self.step_index = self.bad_steps = self._bad_in_a_row = 0
+        self._bad: str | None = None  # what was not finite first
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._queue = torch.zeros(0, dtype=torch.int64)
+        self._start_count, self.reserved = len(rows), 0
+
+    def _check_parts(self) -> None:
+        """Raise ValueError if a tensor has no rate, or two networks have one name."""
+        rows = self.rows
         if missing := sorted(set(rows.tensors) - set(self.parts.rates)):
             raise ValueError(f"fit: every tensor must have a learning rate, {missing[0]} has none; add it to the parts")
         names = [network.name for network in self.parts.networks]
@@ -94,15 +110,13 @@ class Trainer:
                 f"fit: networks must have names of their own, none of whose parts is {', '.join(sorted(_RESERVED))}, "
                 f"got {', '.join(names)}; rename one"
             )
-        self.step_index = self.bad_steps = self._bad_in_a_row = 0
-        self._generator = torch.Generator().manual_seed(config.seed)
-        self._queue = torch.zeros(0, dtype=torch.int64)
-        self._start_count, self.reserved = len(rows), 0
 
     def add_points(self, points: torch.Tensor, colors: torch.Tensor, opacity: float, scale: float) -> None:
         """Add Gaussians at points, as `GaussianRows.from_points` makes them; those that are there stay as they are."""
         new = GaussianRows.from_points(points, colors, opacity, scale).take(torch.arange(len(points)))
         del new["sh_rest"]  # 0 up to the degree that the others have
+        if self.motion is not None:
+            new |= self.motion.new_gates(len(points), self.rows)
         self.rows.append(new)
 
     def add_frame(self, frame: Frame) -> None:
@@ -117,9 +131,10 @@ class Trainer:
             ValueError: After 10 steps in a row without a finite loss and gradient.
         """
         config, rows, done = self.config, self.rows, self.step_index
-        events = self._prepare(done)
+        events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
+        events += self._prepare(done)
         frame = self.frames[self._next_view()]
-        gaussians = self.parts.scene(rows).at(frame.camera.time)
+        gaussians = self._fitted_scene().at(frame.camera.time)
         out = self._shown(gaussians, frame)
         loss, terms = self._loss(out, frame, gaussians)
         optimizers = [rows.optimizer, *(network.optimizer for network in self.parts.networks)]
@@ -128,20 +143,22 @@ class Trainer:
         loss.backward()
         with torch.no_grad():  # told, not optimized
             mse = self._mse(frame, out.rgb)
-        if self._is_finite(loss):
-            self._bad_in_a_row = 0
+        if (bad := self._not_finite(loss)) is None:
+            self._bad_in_a_row, self._bad = 0, None
             for optimizer in optimizers:
                 optimizer.step()
-            if config.noise and done < config.refine_stop * config.max_steps:
+            stage = self._stage()
+            if config.noise and done - stage.begin < config.refine_stop * stage.length:
                 explore(rows, means_rate(config, self._part()), self.extent, config.noise, self._generator)
         else:
             self.bad_steps += 1
             self._bad_in_a_row += 1
-            events.append({"event": "skipped", "view": frame.name, "reason": "loss or gradient not finite"})
+            self._bad = self._bad or bad
+            events.append({"event": "skipped", "view": frame.name, "reason": f"{bad} not finite"})
             if self._bad_in_a_row == _MAX_BAD_STEPS:
                 raise ValueError(
                     f"fit: loss and gradients must be finite, were not for {_MAX_BAD_STEPS} steps in a row until step "
-                    f"{done} (view {frame.name}); check the cameras, or lower the learning rates"
+                    f"{done} (view {frame.name}), first the {self._bad}; check the cameras, or lower the learning rates"
                 )
         self.step_index += 1
         psnr = psnr_of(mse) if math.isfinite(mse) else None
@@ -173,6 +190,7 @@ class Trainer:
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
             **({"networks": [network.name for network in self.parts.networks]} if self.parts.networks else {}),
+            **(self.motion.header() if self.motion is not None else {}),
         }
         return tensors, header
 
@@ -185,6 +203,7 @@ class Trainer:
         header: dict,
         where: str,
         parts: Parts | None = None,
+        motion: Motion | None = None,
     ) -> Trainer:
         """Continue from a checkpoint.
 
@@ -192,7 +211,8 @@ class Trainer:
             config, frames: As they were; `save_every` may change.
             tensors, header: Of the checkpoint.
             where: It, for messages.
-            parts: As they were; networks are overwritten by those of the checkpoint.
+            parts: As they were at the first step; networks are overwritten by those of the checkpoint.
+            motion: As it was at the first step.
         Raises:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
@@ -209,7 +229,11 @@ class Trainer:
             raise ValueError(
                 f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
-        trainer = cls(config, frames, GaussianRows.from_state(tensors), header["extent"], parts)
+        rows, extent = GaussianRows.from_state(tensors), header["extent"]
+        parts = parts_of(config, extent) if parts is None else parts
+        if motion is not None and motion.has_begun(rows):
+            parts = motion.restored(rows, parts, extent)
+        trainer = cls(config, frames, rows, extent, parts, motion)
         was, now = header.get("networks", []), [network.name for network in trainer.parts.networks]
         if was != now:
             raise ValueError(
@@ -235,9 +259,10 @@ class Trainer:
         while rows.sh_degree < min(config.sh_degree, done / max(1, round(config.sh_every * config.max_steps)) - 1e-9):
             rows.raise_sh_degree()
             events.append({"event": "sh_degree", "degree": rows.sh_degree})
-        every = max(1, round(config.refine_every * config.max_steps))
-        start, stop = config.refine_start * config.max_steps, config.refine_stop * config.max_steps
-        if done % every == 0 and max(start, 1) <= done < stop:
+        stage = self._stage()
+        every = max(1, round(config.refine_every * stage.length))
+        start, stop = config.refine_start * stage.length, config.refine_stop * stage.length
+        if (done - stage.begin) % every == 0 and max(start, 1) <= done - stage.begin < stop:
             events.append(self._refine(done, start))
         rows.set_rates({name: rate_at(self.parts.rates[name], self._part()) for name in rows.tensors})
         for network in self.parts.networks:
@@ -245,20 +270,40 @@ class Trainer:
         return events
 
     def _refine(self, done: int, start: float) -> dict:
-        """Density control at step `done`; `start` is the step of the first one. What it did, for the log."""
-        config, rows = self.config, self.rows
+        """Density control at step `done`; `start`: when the first is due in a stage. What it did, for the log."""
+        config, rows, stage = self.config, self.rows, self._stage()
         moved = relocate(rows, config.min_opacity, config.jitter, self._generator)
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
-        full = max(config.grow_until * config.max_steps - start, 1)
-        part = min(1.0, (done - start + config.refine_every * config.max_steps) / full)
-        budget = config.max_gaussians - self.reserved
+        full = max(config.grow_until * stage.length - start, 1)
+        part = min(1.0, (done - stage.begin - start + config.refine_every * stage.length) / full)
+        budget = round(stage.budget * config.max_gaussians) - self.reserved
         wanted = round(self._start_count * (budget / self._start_count) ** part) if self._start_count < budget else 0
         added = add_gaussians(rows, min(wanted, budget) - len(rows), config.min_opacity, config.jitter, self._generator)
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
 
+    def _stage(self) -> Stage:
+        """The steps that density control runs over now."""
+        return Stage(0, self.config.max_steps) if self.motion is None else self.motion.stage()
+
+    def _begin_motion(self) -> list[dict]:
+        """From the static to the dynamic stage: gates, a field, its rates and terms, and photographs of all times."""
+        assert self.motion is not None
+        self.parts = self.motion.begin(self.rows, self.parts, self.extent)
+        self._check_parts()
+        self._queue, self._start_count = self._queue[:0], len(self.rows)
+        return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}]
+
+    def _fitted_scene(self) -> Scene:
+        """What a step renders and differentiates."""
+        if self.motion is None or not self.motion.has_begun(self.rows):
+            return self.parts.scene(self.rows)
+        return self.motion.fitted(self.rows, self.step_index)
+
     def _next_view(self) -> int:
+        """Index of a photograph, each once an epoch; in a static stage, those of the first time alone."""
         if not len(self._queue):
-            self._queue = torch.randperm(len(self.frames), generator=self._generator)
+            shown = range(len(self.frames)) if self.motion is None else self.motion.shown(self.frames)
+            self._queue = torch.tensor(shown)[torch.randperm(len(shown), generator=self._generator)]
         view, self._queue = int(self._queue[0]), self._queue[1:].clone()
         return view
 
@@ -294,12 +339,23 @@ class Trainer:
             return float(error.mean())
         return float((error * frame.mask).sum() / frame.mask.sum().clamp(min=1))
 
-    def _is_finite(self, loss: torch.Tensor) -> bool:
-        """Whether the loss and every gradient are; a sum is not finite where one of its numbers is not."""
-        fitted = [
-            *self.rows.tensors.values(),
-            *(x for network in self.parts.networks for x in network.module.parameters()),
-        ]
+    def _not_finite(self, loss: torch.Tensor) -> str | None:
+        """What of a parameter, the loss and every gradient is not finite, the first of them; None if all are.
+
+        A sum is not finite where one of its numbers is not.
+        """
+        named = [*self.rows.tensors.items()]
+        named += [(f"{n.name}.{key}", x) for n in self.parts.networks for key, x in n.module.named_parameters()]
         # Values that are looked at.
-        sums = [loss.detach(), *(x.grad.sum() for x in fitted if x.grad is not None)]
-        return all(math.isfinite(float(x)) for x in sums)
+        if all(
+            math.isfinite(float(x)) for x in (loss.detach(), *(x.grad.sum() for _, x in named if x.grad is not None))
+        ):
+            return None
+        for name, x in named:
+            if not math.isfinite(float(x.detach().sum())):
+                return name
+        gradients = [(name, x.grad) for name, x in named if x.grad is not None]
+        bad = next((name for name, grad in gradients if not math.isfinite(float(grad.sum()))), "")
+        if not math.isfinite(float(loss.detach())):
+            return f"loss (and the gradient of {bad})" if bad else "loss"
+        return f"gradient of {bad}"

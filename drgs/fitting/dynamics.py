@@ -1,0 +1,309 @@
+"""The two stages of a fit to what moves: Gaussians that stand still, then a deformation field that moves some of them.
+
+Which Gaussians move is learned. Each has a gate, `motion` in the rows. While it is open the Gaussian moves as the
+field says, times a factor between 0 and 1; the loss has `motion_weight` times the mean gate in it, so that a gate stays
+open only if photographs need what it lets through. Once it is closed nothing is computed for the Gaussian. In one step
+out of ten all closed gates are ajar: those whose photographs would be shown better by a little of the field's motion
+open again, and the field hears of places where nothing moved.
+
+A gate is optimized in units of what its penalty weighs (Adam's epsilon is the penalty's own gradient): a Gaussian whose
+motion the photographs hardly tell about is not moved by the noise of that, as it would be where only signs count.
+
+Reference:
+    Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code: the two stages,
+    rates and regularizers. Gates, and planes of space that are smooth along both axes, are not from there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+
+from drgs.deform import DeformationField, DynamicGaussians, FieldConfig
+from drgs.fitting.networks import Network
+from drgs.fitting.stages import Stage, first_time
+from drgs.guards.json_files import check_json
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.config import FitConfig
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.parts import Parts
+    from drgs.fitting.rows import GaussianRows
+    from drgs.integrator import Output
+
+__all__ = ["FIELD", "Motion", "moving_scene"]
+
+FIELD = ("deformation.grid", "deformation.mlp")
+"""Names of the networks of a fit to what moves."""
+
+_STATIC_BUDGET = 0.5  # of the Gaussians there may be
+_WARM_UP = 0.2  # of the dynamic stage, in which all gates stay open: the field must have learned something
+_OPEN = 2.0  # logit of a gate at the start, which lets 0.76 of a motion through
+_CLOSED = -1.0  # logit below which a gate has no penalty: it must be able to come back
+_PROBE_EVERY = 10  # steps
+_NOISE = 0.3  # gradients of a gate below this part of its penalty's weight are taken for what they are, not for signs
+_FASTEST = 0.2  # change of a logit in a step
+_AJAR = 0.2  # logit of a closed gate in such a step: it lets 0.1 of a motion through
+_OUTSIDE = 0.005  # part of the Gaussians that may lie below the bounds of the field along an axis, and above
+_MARGIN = 0.1  # of the field's size
+_REPEATS = 5  # of a measured time
+_ADVICE = "restore the file, or fit again in another folder"
+
+
+class Motion:
+    """What a fit has besides its parts if things move: stages, the field, and who moves.
+
+    Args:
+        config: Of the fit.
+        times: All that views of the data set have, sorted; at least two.
+    Attributes:
+        field: None in the static stage.
+    """
+
+    def __init__(self, config: FitConfig, times: Sequence[float]) -> None:
+        self.config, self.times = config, tuple(times)
+        self.first_step = round(config.static_share * config.max_steps)
+        self.field: DeformationField | None = None
+        self._step = 0
+
+    def has_begun(self, rows: GaussianRows) -> bool:
+        """Whether the dynamic stage has."""
+        return "motion" in rows.tensors
+
+    def is_due(self, step: int) -> bool:
+        """Whether the dynamic stage is to begin before a step."""
+        return self.field is None and step >= self.first_step
+
+    def stage(self) -> Stage:
+        """Over which density control runs now."""
+        if self.field is None:
+            return Stage(0, self.first_step, _STATIC_BUDGET)
+        return Stage(self.first_step, self.config.max_steps)
+
+    def shown(self, frames: list[Frame]) -> list[int]:
+        """Indices of the photographs that this stage is fitted to."""
+        first = {id(frame) for frame in (first_time(frames) if self.field is None else frames)}
+        return [i for i, frame in enumerate(frames) if id(frame) in first]
+
+    def begin(self, rows: GaussianRows, parts: Parts, extent: float) -> Parts:
+        """Go on to the dynamic stage.
+
+        Args:
+            rows: Get gates.
+            parts: Of the static stage.
+            extent: Of the scene.
+        Returns:
+            With the field's networks, terms and rates, and a scene that moves.
+        """
+        means = rows.tensors["means"].detach().double()  # where the field lies is a constant
+        ends = torch.tensor([_OUTSIDE, 1 - _OUTSIDE], dtype=torch.float64)
+        bounds = torch.quantile(means, ends, dim=0)
+        margin = _MARGIN * (bounds[1] - bounds[0])
+        rows.add_tensor("motion", torch.full((len(rows),), _OPEN))
+        return self._extended(rows, parts, extent, torch.stack([bounds[0] - margin, bounds[1] + margin]))
+
+    def restored(self, rows: GaussianRows, parts: Parts, extent: float) -> Parts:
+        """As `begin`, for the rows of a checkpoint of the dynamic stage, whose networks are restored afterwards."""
+        return self._extended(rows, parts, extent, torch.tensor([[0.0] * 3, [1.0] * 3]))
+
+    def new_gates(self, count: int, rows: GaussianRows) -> dict[str, torch.Tensor]:
+        """Gates of Gaussians that are added from points."""
+        return {"motion": torch.full((count,), _OPEN)} if self.has_begun(rows) else {}
+
+    def fitted(self, rows: GaussianRows, step: int) -> DynamicGaussians:
+        """What a step renders; every tenth, closed gates are ajar, with the gradient of an open one."""
+        assert self.field is not None
+        self._step, gates = step, rows.tensors["motion"]
+        group = next(group for group in rows.optimizer.param_groups if group["name"] == "motion")
+        group["eps"] = max(_NOISE * self.config.motion_weight / max(len(rows), 1), 1e-15)
+        if (step - self.first_step) % _PROBE_EVERY == 0:
+            fixed = gates.detach()  # the difference is added as a constant
+            gates = gates + (fixed.clamp(min=_AJAR) - fixed)
+        return DynamicGaussians(rows.gaussians(), self.field, gates)
+
+    def is_warm(self) -> bool:
+        """Whether gates have their penalty in the current step."""
+        return self._step - self.first_step >= _WARM_UP * (self.config.max_steps - self.first_step)
+
+    def header(self) -> dict:
+        """What a checkpoint's header says beside the rest."""
+        return {} if self.field is None else {"field": dataclasses.asdict(self.field.config)}
+
+    def share(self, rows: GaussianRows) -> float | None:
+        """Part of the Gaussians that move; None in the static stage."""
+        if not self.has_begun(rows):
+            return None
+        # Told, not optimized.
+        return float((rows.tensors["motion"].detach() >= 0).float().mean()) if len(rows) else 0.0
+
+    def report(self, rows: GaussianRows) -> dict | None:
+        """How many Gaussians move, and what not deforming the others saves: medians of 5 runs there and back.
+
+        Returns:
+            JSON-serializable: `moving`, `share`, `seconds` of deforming them and `seconds_all` of deforming all, a
+            step; None in the static stage.
+        """
+        if self.field is None:
+            return None
+        gates = rows.tensors["motion"]
+        scenes = [DynamicGaussians(rows.gaussians(), self.field, motion) for motion in (gates, gates.abs() + 1)]
+        took: list[list[float]] = [[], []]
+        moment = self.times[len(self.times) // 2]
+        for _ in range(_REPEATS):
+            for scene, spent in zip(scenes, took, strict=True):
+                began = time.perf_counter()
+                parameters = [x for x in scene.parameters().values() if x.requires_grad]
+                seen = scene.at(moment)
+                total = seen.means.sum() + seen.quats.sum() + seen.log_scales.sum()
+                torch.autograd.grad(total, parameters, allow_unused=True, retain_graph=True)
+                spent.append(time.perf_counter() - began)
+        seconds, everything = (sorted(spent)[_REPEATS // 2] for spent in took)
+        moving = int(scenes[0].moving.sum())
+        share = moving / max(len(rows), 1)
+        return {"moving": moving, "share": share, "seconds": seconds, "seconds_all": everything}
+
+    def _extended(self, rows: GaussianRows, parts: Parts, extent: float, bounds: torch.Tensor) -> Parts:
+        """The parts of the dynamic stage, around a new field."""
+        config = self.config
+        sizes = FieldConfig.preset(config.field_preset, times=len(self.times))
+        self.field = field = DeformationField(sizes, bounds, (self.times[0], self.times[-1]), seed=config.seed)
+        begin = self.first_step / config.max_steps
+
+        def rate(ends: tuple[float, float], part: float) -> float:
+            share = min(max((part - begin) / (1 - begin), 0.0), 1.0)
+            return ends[0] * (ends[1] / ends[0]) ** share
+
+        # Adam's steps have the rate's length: what makes lengths of features steps in units of the extent.
+        lengths = dict.fromkeys(("means.3.weight", "means.3.bias"), extent)
+        networks = [
+            Network(FIELD[0], field.grid, lambda part: rate(config.grid_rate, part)),
+            Network(FIELD[1], field.mlp, lambda part: rate(config.field_rate, part), lengths),
+        ]
+        terms = [*parts.terms]
+        if config.smooth_weight or config.plane_weight or config.l1_time_weight:
+            terms.append(Smoothness(field, config.smooth_weight, config.plane_weight, config.l1_time_weight))
+        if config.motion_weight:
+            terms.append(Rest(self, rows, config.motion_weight))
+        steps = max(config.max_steps - self.first_step, 1)
+        gates = min(config.motion_rate / steps, _FASTEST)
+        warm = begin + (1 - begin) * _WARM_UP
+        return dataclasses.replace(
+            parts,
+            terms=terms,
+            rates={**parts.rates, "motion": lambda part: gates if part >= warm else 0.0},
+            networks=[*parts.networks, *networks],
+            scene=lambda rows: DynamicGaussians(rows.gaussians(), field, rows.tensors["motion"]),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Smoothness:
+    """Second differences of the field's planes, squared: of those with a time axis along it, of the others along both
+    of theirs; and the distance from 1 of those with a time axis. Means over a plane, sums over planes.
+    """
+
+    field: DeformationField
+    smooth_weight: float
+    plane_weight: float
+    l1_weight: float
+    name: ClassVar[str] = "field"
+    outputs: ClassVar[tuple[str, ...]] = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
+        """See `LossTerm`."""
+        planes = list(self.field.grid)
+        total = planes[0].new_zeros(())
+        for k, plane in enumerate(planes):
+            if k % 6 < 3:
+                if self.plane_weight:
+                    total = total + self.plane_weight * (_bend(plane, 0) + _bend(plane, 1)) / 2
+                continue
+            if self.smooth_weight:
+                total = total + self.smooth_weight * _bend(plane, 0)
+            if self.l1_weight:
+                total = total + self.l1_weight * (1 - plane).abs().mean()
+        return total
+
+
+def _bend(plane: torch.Tensor, axis: int) -> torch.Tensor:
+    """Mean squared second difference along an axis; 0 where there are fewer than three nodes."""
+    return plane.diff(n=2, dim=axis).square().mean() if plane.shape[axis] > 2 else plane.new_zeros(())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rest:
+    """The mean gate, that is what part of the Gaussians moves; closed gates count as they are when just closed."""
+
+    motion: Motion
+    rows: GaussianRows
+    weight: float
+    name: ClassVar[str] = "rest"
+    outputs: ClassVar[tuple[str, ...]] = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """See `LossTerm`; None while the field is new."""
+        if not self.motion.is_warm():
+            return None
+        return self.weight * self.rows.tensors["motion"].clamp(min=_CLOSED).sigmoid().mean()
+
+
+def moving_scene(
+    gaussians: Gaussians, tensors: dict[str, torch.Tensor], networks: dict[str, dict], header: dict, where: str
+) -> DynamicGaussians:
+    """The scene of a checkpoint of the dynamic stage, to be looked at.
+
+    Args:
+        gaussians: Its canonical Gaussians.
+        tensors, header: Of the checkpoint.
+        networks: As `saved_networks` gives them.
+        where: It, for messages.
+    Raises:
+        ValueError: If the field is missing, or its tensors have other shapes than its sizes ask for.
+    """
+    sizes = _sizes(header, networks, where)
+    field = DeformationField(sizes, [[0.0] * 3, [1.0] * 3])
+    for name, module in zip(FIELD, (field.grid, field.mlp), strict=True):
+        held = networks[name]
+        for key, x in module.state_dict().items():
+            got = tuple(held[key].shape) if key in held else "none"
+            if got != tuple(x.shape):
+                raise ValueError(
+                    f"{where}: {name}.parameter.{key} must have shape {tuple(x.shape)}, got {got}; {_ADVICE}"
+                )
+        module.load_state_dict({key: held[key] for key in module.state_dict()})
+        if bad := [key for key, x in module.state_dict().items() if not bool(torch.isfinite(x).all())]:
+            raise ValueError(f"{where}: {name}.parameter.{bad[0]} must be finite, is not; {_ADVICE}")
+    field.requires_grad_(False)
+    gates = tensors.get("parameter.motion")
+    if gates is None or tuple(gates.shape) != (len(gaussians),) or not bool(torch.isfinite(gates).all()):
+        raise ValueError(f"{where}: motion must be {len(gaussians)} finite numbers, one a Gaussian; {_ADVICE}")
+    return DynamicGaussians(gaussians, field, gates)
+
+
+def _sizes(header: dict, networks: dict[str, dict], where: str) -> FieldConfig:
+    """The sizes of a checkpoint's field, as far as its tensors bear them out: nothing is made by what a header says."""
+    kind: dict[str, Any] = dict.fromkeys(("channels", "resolution", "time_resolution", "width", "depth"), int)
+    check_json(where, header, {"field": {**kind, "levels": [int], "last_std": float}}, _ADVICE)
+    said = header["field"]
+    try:
+        sizes = FieldConfig(**{**said, "levels": tuple(said["levels"])})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}; {_ADVICE}") from None
+    if missing := [name for name in FIELD if name not in networks]:
+        raise ValueError(f"{where}: networks must have {missing[0]}, got {', '.join(networks) or 'none'}; {_ADVICE}")
+    grid, mlp = (networks[name] for name in FIELD)
+    layers = sum(key.startswith("trunk.") and key.endswith(".weight") for key in mlp)
+    shape = lambda x: None if x is None else tuple(x.shape)  # noqa: E731
+    sides = [sizes.resolution * level for level in sizes.levels]
+    borne_out = len(grid) == 6 * len(sides) + 2 and layers == max(sizes.depth, 1)
+    for k, side in enumerate(sides):
+        borne_out = borne_out and shape(grid.get(str(6 * k))) == (side, side, sizes.channels)
+        borne_out = borne_out and shape(grid.get(str(6 * k + 3))) == (sizes.time_resolution, side, sizes.channels)
+    if not borne_out or shape(mlp.get("trunk.0.weight")) != (sizes.width, sizes.channels * len(sides)):
+        raise ValueError(f"{where}: the sizes of the field must be those of its tensors, are {said}; {_ADVICE}")
+    return sizes

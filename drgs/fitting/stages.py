@@ -1,0 +1,72 @@
+"""Which steps a schedule runs over, and which times the photographs of a fit are of; of every fit, also of what stands
+still, and therefore without what moves (dynamics.py).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+
+__all__ = ["Stage", "first_time", "times_of"]
+
+_FEWEST = 3  # photographs of one time that show the depth of things, with one to spare
+
+
+class _Seen(Protocol):
+    """A view or a photograph."""
+
+    @property
+    def camera(self) -> Camera:
+        """Whose time counts."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+
+_T = TypeVar("_T", bound=_Seen)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Steps over which density control runs through its schedule once.
+
+    Attributes:
+        begin, end: The first of them, and the one after the last.
+        budget: Part of the Gaussians that there may be.
+    """
+
+    begin: int
+    end: int
+    budget: float = 1.0
+
+    @property
+    def length(self) -> int:
+        """How many steps."""
+        return self.end - self.begin
+
+
+def times_of(views: Sequence[_Seen]) -> tuple[float, ...]:
+    """The distinct times of views, sorted; none if nothing can have moved: there is one time, or no view has one.
+
+    Raises:
+        ValueError: If some views have a time and others do not.
+    """
+    times = {view.camera.time for view in views}
+    if None in times and len(times) > 1:
+        name = next(view.name for view in views if view.camera.time is None)
+        raise ValueError(
+            f"fit: all training views must have a time or none, {name!r} has none; add it, or use --dynamics ignore"
+        )
+    return tuple(sorted(t for t in times if t is not None)) if len(times) > 1 else ()
+
+
+def first_time(views: Sequence[_T]) -> list[_T]:
+    """Those of the first time; all, where fewer than 3 are of it, as of one camera that walks around what moves."""
+    first = min((t for view in views if (t := view.camera.time) is not None), default=None)
+    found = [view for view in views if view.camera.time == first]
+    return found if len(found) >= _FEWEST else list(views)

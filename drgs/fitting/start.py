@@ -1,0 +1,76 @@
+"""What a fit begins with: a trainer at its first step, from points of the data set or of its training views."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import torch
+
+from drgs.data import initial_points, scene_extent
+from drgs.display.progress import Bar
+from drgs.fitting.parts import parts_of
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.stages import first_time, times_of
+from drgs.fitting.trainer import Trainer
+
+if TYPE_CHECKING:
+    from drgs.data import Dataset, View
+    from drgs.fitting.config import FitConfig
+    from drgs.fitting.dynamics import Motion
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.parts import Parts
+    from drgs.fitting.semantic_record import SemanticRecord
+
+__all__ = ["motion_of", "start"]
+
+_log = logging.getLogger("drgs.train")
+
+
+def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion | None:
+    """The stages of a fit to views; None if nothing can move in them, or is to: then nothing of it is loaded.
+
+    Args:
+        config: Of the fit.
+        train: Of these at least two times make a fit dynamic.
+        test: Whose times the field covers, too.
+    Raises:
+        ValueError: If some views have a time and others do not.
+    """
+    if config.dynamics == "ignore" or not times_of(train):
+        return None
+    from drgs.fitting.dynamics import Motion
+
+    return Motion(config, times_of([*train, *test]))
+
+
+def start(
+    dataset: Dataset,
+    views: list[View],
+    frames: list[Frame],
+    config: FitConfig,
+    parts: Parts | None,
+    taught: SemanticRecord | None,
+    strict: bool,
+    reserved: int,
+    motion: Motion | None = None,
+) -> tuple[Trainer, str]:
+    """A trainer at step 0, and where its points come from: by default, if `strict`, only from `views`."""
+    if not frames:
+        raise ValueError("fit: there must be at least one training view, got none; add photographs")
+    # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
+    given = config.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
+    with Bar("initial points") as bar:
+        seen = views if motion is None else first_time(views)
+        points, colors, source = initial_points(
+            dataset if given else seen, config.seed, config.max_gaussians - reserved, bar.stage
+        )
+        bar.note(f"initial points: {source}")
+    extent = scene_extent([frame.camera for frame in frames], points)
+    dense = not given and any(view.depth_path is not None for view in views)
+    width, channels = (taught.width, taught.channels) if taught else (0, None)
+    model = GaussianRows.from_points(
+        torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense), features=width
+    )
+    _log.info("%d initial points: %s", len(points), source)
+    return Trainer(config, frames, model, extent, parts or parts_of(config, extent, channels), motion), source

@@ -1,0 +1,244 @@
+"""Fits to what moves: two stages, who moves, checkpoints of either, and nothing of it where things stand still."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from drgs.cameras import orbit
+from drgs.data.views import Dataset, View
+from drgs.deform import DynamicGaussians, FieldConfig
+from drgs.display.pictures import write_png
+from drgs.ellipsoids import Gaussians
+from drgs.files import Run, load_state, save_state
+from drgs.fitting.density import add_gaussians
+from drgs.fitting.dynamics import FIELD, Motion
+from drgs.fitting.parts import parts_of
+from drgs.fitting.records import load_run
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.stages import first_time, times_of
+from drgs.integrator import render
+from drgs.settings import RenderSettings
+from drgs.train import FitConfig, Trainer, fit
+
+FAST = RenderSettings.preset("fast")
+TIMES = (0.0, 0.5, 1.0)
+MOVERS = 3
+
+
+@pytest.fixture(autouse=True)
+def _small_field(monkeypatch):
+    """A field of some hundred numbers, whatever the preset."""
+    small = {"channels": 4, "resolution": 6, "time_resolution": 3, "levels": (1,), "width": 16}
+    monkeypatch.setattr(FieldConfig, "preset", classmethod(lambda cls, name, times=None: cls(**small)))
+
+
+def blobs(seed: int = 0) -> Gaussians:
+    """Nine in a plane that stands still, and before them three together that may move."""
+    draw = torch.Generator().manual_seed(seed)
+    x, y = torch.meshgrid(torch.arange(3.0) - 1, torch.arange(3.0) - 1, indexing="ij")
+    plane = torch.stack([0.6 * x.flatten(), 0.6 * y.flatten(), torch.zeros(9)], 1)
+    group = torch.tensor([[-0.3, 0.0, -0.8]]) + 0.12 * torch.randn(MOVERS, 3, generator=draw)
+    colors = torch.rand(12, 3, generator=draw)
+    scales = torch.full((12, 3), 0.22)
+    scales[9:] = 0.12
+    sh = (colors - 0.5) * math.sqrt(4 * math.pi)
+    return Gaussians.from_arrays(torch.cat([plane, group]), torch.eye(4)[[0] * 12], scales, torch.full((12,), 0.9), sh)
+
+
+def made(folder, times=TIMES, way: float = 0.7) -> Dataset:
+    """Five synchronous cameras, the second held out; the three go `way` to the right in a unit of time."""
+    folder.mkdir()
+    g, views = blobs(), []
+    for i, camera in enumerate(orbit((0, 0, 0), 3.0, 5, width=20, height=16, up=(0, 0, -1), elevation=70.0)):
+        for k, time in enumerate(times):
+            means = g.means.clone()
+            means[9:, 0] += way * (time or 0.0)
+            name = f"cam{i}_{k}"
+            seen = dataclasses.replace(camera, time=time, name=name)
+            write_png(folder / f"{name}.png", render(g.replace(means=means), seen, FAST).rgb.numpy())
+            split = "test" if i == 1 else "train"
+            views.append(View(camera=seen, name=name, image_path=folder / f"{name}.png", split=split))
+    return Dataset(folder, "transforms", views, g.means.double().numpy(), np.full((12, 3), 0.5, np.float32), "made")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("moving") / "data")
+
+
+def config(**fields) -> FitConfig:
+    """Short, with rates for few steps."""
+    short = {"max_steps": 12, "max_gaussians": 16, "sh_degree": 0, "save_every": 2, "means_rate": (1e-3, 1e-4)}
+    rates = {"dc_rate": 0.03, "field_rate": (3e-3, 3e-4), "grid_rate": (3e-2, 3e-3), "static_share": 1 / 3}
+    return FitConfig(**{**short, **rates, **fields})
+
+
+def test_two_stages_leave_a_complete_run(dataset, tmp_path):
+    """The static stage sees the first time alone, the dynamic one all; the run holds the scene that was fitted, which
+    moves, and metrics say who does.
+    """
+    seen, step = [], Trainer.step
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "step", lambda self: [seen.append((r := step(self)).view), r][1])
+        result = fit(dataset, tmp_path / "run", config(), progress=False)
+    assert {name[-1] for name in seen[:4]} == {"0"}
+    assert {name[-1] for name in seen[4:]} == {"0", "1", "2"}
+    events = result.run.events()
+    assert [(e["name"], e["step"]) for e in events if e["event"] == "stage"] == [("dynamic", 4)]
+    assert [e["moving"] for e in events if e["event"] == "train"] == [result.metrics["motion"]["share"]]
+    loaded = load_run(result.run)
+    assert loaded.record.times == TIMES
+    assert isinstance(loaded.scene, DynamicGaussians)
+    assert torch.equal(loaded.scene.gaussians.means, result.gaussians.means)
+    there = [loaded.scene.at(t).means for t in TIMES]
+    assert not torch.equal(there[0], there[2])
+    assert int(loaded.scene.moving.sum()) == result.metrics["motion"]["moving"] > 0
+    assert not torch.equal(there[2][loaded.scene.moving], result.gaussians.means[loaded.scene.moving])
+    assert result.metrics["count"] == 3
+
+
+class Killed(BaseException):
+    """What ends a process without a word, as far as the loop of a fit can see."""
+
+
+@pytest.mark.parametrize("at", [3, 9], ids=["static", "dynamic"])
+def test_killed_in_either_stage(dataset, tmp_path, monkeypatch, at):
+    """It goes on from the last checkpoint, and ends with the same bits: of Gaussians, gates, field and optimizers."""
+    step = Trainer.step
+
+    def killed(self):
+        if self.step_index == at:
+            raise Killed
+        return step(self)
+
+    how = config(deterministic=True)
+    fit(dataset, tmp_path / "a", how, progress=False)
+    monkeypatch.setattr(Trainer, "step", killed)
+    with pytest.raises(Killed):
+        fit(dataset, tmp_path / "b", how, progress=False)
+    monkeypatch.setattr(Trainer, "step", step)
+    assert load_state(tmp_path / "b" / "state.safetensors")[1]["step"] == at - 1
+    fit(dataset, tmp_path / "b", how, resume=True, progress=False)
+    a, b = (load_state(tmp_path / name / "state.safetensors")[0] for name in "ab")
+    assert a.keys() == b.keys()
+    assert all(torch.equal(x, b[name]) for name, x in a.items())
+    assert {name.split(".")[1] for name in a if name.startswith("deformation.")} == {"grid", "mlp"}
+    assert (tmp_path / "a" / "point_cloud.ply").read_bytes() == (tmp_path / "b" / "point_cloud.ply").read_bytes()
+
+
+def test_what_is_not_finite_is_named(dataset, tmp_path, monkeypatch):
+    """After ten steps in a row the fit stops with the name of the first bad gradient; the last checkpoint stays."""
+    begin = Motion.begin
+
+    def broken(self, rows, parts, extent):
+        parts = begin(self, rows, parts, extent)
+        self.field.mlp["quats"][3].weight.register_hook(lambda grad: grad * math.nan)
+        return parts
+
+    monkeypatch.setattr(Motion, "begin", broken)
+    with pytest.raises(
+        ValueError, match=r"10 steps in a row .*, first the gradient of deformation\.mlp\.quats\.3\.weight;"
+    ):
+        fit(dataset, tmp_path / "run", config(max_steps=30, static_share=0.2), progress=False)
+    run = Run(tmp_path / "run")
+    held = load_run(run)
+    assert held.step == 14
+    assert all(bool(torch.isfinite(x).all()) for x in held.scene.parameters().values())
+    assert [e["reason"] for e in run.events() if e["event"] == "skipped"] == [
+        "gradient of deformation.mlp.quats.3.weight not finite"
+    ] * 9  # the tenth is the error
+
+
+def test_nothing_of_it_where_nothing_can_move(dataset, tmp_path, monkeypatch):
+    """Views of one time, or of none, or that are to be taken for such, are fitted without the code of deformations, and
+    to the same bits.
+    """
+    for name in ("drgs.deform", "drgs.dynamics", "drgs.dynamics.hexplane", "drgs.fitting.dynamics"):
+        monkeypatch.setitem(sys.modules, name, None)  # an import of it would fail
+    how, found = config(deterministic=True, max_steps=4), []
+    for name, times in (("one", (0.0,)), ("none", (None,))):
+        run = fit(made(tmp_path / name, times), tmp_path / f"{name}.run", how, progress=False).run
+        assert "motion" not in json.loads((run.path / "metrics.json").read_text())
+        assert not any(key.startswith("deformation") for key in load_state(run.state)[0])
+        found.append(run.point_cloud.read_bytes())
+        assert load_run(run).scene is not None
+    assert found[0] == found[1]
+    all_times = fit(dataset, tmp_path / "all.run", dataclasses.replace(how, dynamics="ignore"), progress=False)
+    assert not all_times.run.config().get("times")
+
+
+def rows_of(count: int = 12) -> GaussianRows:
+    return GaussianRows.from_points(blobs().means[:count], torch.full((count, 3), 0.5))
+
+
+def test_density_control_copies_gates(dataset):
+    """A copy moves if its original does, and what is added from points may move."""
+    how = config()
+    motion, rows = Motion(how, TIMES), rows_of()
+    parts = motion.begin(rows, parts_of(how, 1.0), 1.0)
+    assert {network.name for network in parts.networks} == set(FIELD)
+    with torch.no_grad():
+        rows.tensors["motion"][:] = torch.arange(12.0) - 6
+    draw = torch.Generator().manual_seed(0)
+    add_gaussians(rows, 20, 0.005, 0.1, draw)
+    gates, colors = rows.tensors["motion"], rows.tensors["means"]
+    nearest = torch.cdist(colors[12:], colors[:12]).argmin(1)  # jitter is a tenth of their size
+    assert torch.equal(gates[12:], gates[nearest])
+    assert motion.share(rows) == float((gates >= 0).float().mean())
+    assert torch.equal(motion.new_gates(2, rows)["motion"], torch.full((2,), 2.0))
+
+
+def test_closed_gates_are_ajar_now_and_then(dataset):
+    """In one step of ten what stands still is evaluated, and its gate has a gradient; in the others it has none."""
+    how = config()
+    motion, rows = Motion(how, TIMES), rows_of()
+    motion.begin(rows, parts_of(how, 1.0), 1.0)
+    torch.nn.init.ones_(motion.field.mlp["means"][3].bias)
+    with torch.no_grad():
+        rows.tensors["motion"][:6] = -3
+    for step, moving in ((motion.first_step, 12), (motion.first_step + 1, 6), (motion.first_step + 10, 12)):
+        scene = motion.fitted(rows, step)
+        assert int(scene.moving.sum()) == moving
+        (grad,) = torch.autograd.grad(scene.at(0.5).means.sum(), rows.tensors["motion"])
+        assert bool((grad[:6] != 0).all()) == (moving == 12)
+        assert bool((grad[6:] != 0).all())
+
+
+def test_claims_of_a_header_are_not_believed(dataset, tmp_path):
+    """Sizes of a field that its tensors do not have are refused before anything of that size is made."""
+    run = fit(dataset, tmp_path / "run", config(max_steps=6), progress=False).run
+    tensors, header = load_state(run.state)
+    run.point_cloud.unlink()
+    for key, value in (
+        ("resolution", 10**9),
+        ("width", 10**9),
+        ("depth", 10**9),
+        ("levels", [1] * 99),
+        ("channels", "x"),
+    ):
+        save_state(run.state, tensors, {**header, "field": {**header["field"], key: value}})
+        with pytest.raises(ValueError, match=r"state\.safetensors: .*; restore the file, or fit again") as error:
+            load_run(run)
+        assert "\n" not in str(error.value)
+    save_state(run.state, {**tensors, "parameter.motion": tensors["parameter.motion"] * math.nan}, header)
+    with pytest.raises(ValueError, match="motion must be 16 finite numbers|parameter.motion must be"):
+        load_run(run)
+
+
+def test_times_of_views(dataset):
+    """Two times make things move; one, or none at all, does not; some views with and some without are refused."""
+    views = dataset.views
+    assert times_of(views) == TIMES
+    assert times_of(views[::3]) == ()
+    assert len(first_time(views)) == 5
+    assert len(first_time(views[:6])) == 6  # two photographs tell no depths
+    lost = dataclasses.replace(views[0], camera=dataclasses.replace(views[0].camera, time=None))
+    with pytest.raises(ValueError, match="all training views must have a time or none, 'cam0_0' has none"):
+        times_of([lost, *views[1:]])
