@@ -6,8 +6,9 @@ known views and Hc that of the view itself:
     variance    sum_k J_pk^2 / (H_k + lambda): predictive variance of the pixel for unit noise; its sum is `eig`
     share       sum_k J_pk^2 / Hc_k log(1 + Hc_k / (H_k + lambda)): the pixel's share of the view's `logdet`
 
-The rows of J are the pixel's colors and, where the scene has features, its decoded features; where both count there is
-a map of each block beside that of both, whose sum it is a part of.
+The rows of J are the pixel's colors and, where the scene has features, its decoded features; the parameters are those
+of the Gaussians and, where a network moves them, the network's, estimated by random probes. Where several blocks count
+there is a map of each beside that of all, whose sum it is a part of.
 """
 
 from __future__ import annotations
@@ -21,14 +22,16 @@ import torch
 
 from drgs import fisher
 from drgs.commands.given import Given
+from drgs.commands.rivals import Rivals
 from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, save_state, write_json
-from drgs.fisher import Information
+from drgs.fisher import GROUPS, Information
 from drgs.gain import Prior, check, information_gain, variances
 from drgs.guards.outputs import claim
+from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Scoring
 
@@ -36,13 +39,14 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Fisher
     from drgs.commands.viewpoints import Known
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 
 __all__ = ["KINDS", "Told", "added", "map_weights", "run"]
 
 KINDS = ("variance", "share")  # of maps
-_OTHERS = {"geometry": "features", "semantic": "sh"}  # block of the image -> group that it says nothing about
+# Block -> groups that it says nothing about.
+_OTHERS = {"geometry": ("features", *NETWORK_GROUPS), "semantic": ("sh", *NETWORK_GROUPS), "deformation": tuple(GROUPS)}
 
 
 def run(args: Fisher) -> None:
@@ -68,7 +72,8 @@ def run(args: Fisher) -> None:
     views = evenly(views, args.limit)
     names = pictures.file_names([camera.name for camera in views])
     told = Told.of(given, args, settings)
-    output.check(f"{name}.{kind}.png" for name in names for kind in told.kinds)
+    rivals = Rivals(told, prior) if args.maps else None
+    output.check(f"{name}.{kind}.png" for name in names for kind in (*told.kinds, *(["maps"] if rivals else [])))
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
         by_block: dict[str, Information] = {}
         for camera in known.cameras:
@@ -76,11 +81,13 @@ def run(args: Fisher) -> None:
                 check(f"fisher: view {camera.name}", part)
                 old = by_block.get(block, {})
                 by_block[block] = {name: x + old[name] if old else x for name, x in part.items()}
+            if rivals:
+                rivals.know(camera)
             bar.advance()
         H = added(by_block)
         rows = []
         for camera, name in zip(views, names, strict=True):
-            rows.append(_view(args, told, camera, name, H, prior))
+            rows.append(_view(args, told, camera, name, H, prior, rivals))
             bar.advance()
     groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
@@ -95,6 +102,7 @@ def run(args: Fisher) -> None:
         "prior": {"value": args.prior, "relative": args.relative_prior},
         "blocks": list(told.blocks),
         "semantics": told.metric.to_json() if told.metric else None,
+        "probes": args.probes if "deformation" in told.blocks or args.method == "probes" else None,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
@@ -112,14 +120,15 @@ class Told:
     """What of an image is asked about the scene.
 
     Attributes:
-        gaussians, settings, method: As for `drgs.fisher.diagonal`.
-        blocks: The blocks of the image that count.
+        scene, settings, method, probes: As for `drgs.fisher.diagonal` and `drgs.fisher.network`.
+        blocks: The blocks that count.
         metric: In which features count, where `semantic` is among them.
     """
 
-    gaussians: Gaussians
+    scene: Scene
     settings: RenderSettings
     method: str
+    probes: int
     blocks: tuple[str, ...]
     metric: SemanticMetric | None
 
@@ -127,11 +136,11 @@ class Told:
     def of(cls, given: Given, args: Fisher, settings: RenderSettings) -> Told:
         """As the options say, of a run in the metric of its decoder."""
         g, scoring = given.gaussians, Scoring(method=args.method, blocks=args.blocks)
-        blocks, metric = scoring.blocks_of(g, "fisher"), None
+        blocks, metric = scoring.blocks_of(g, "fisher", given.scene), None
         if "semantic" in blocks:
             assert g.features is not None  # else there is no such block
             metric = given.semantics() or SemanticMetric.of(None, g.features.shape[1])
-        return cls(g, settings, args.method, blocks, metric)
+        return cls(given.scene, settings, args.method, args.probes, blocks, metric)
 
     @property
     def kinds(self) -> list[str]:
@@ -140,31 +149,41 @@ class Told:
         return [part + kind for part in parts for kind in KINDS]
 
     def options(self, block: str) -> dict[str, Any]:
-        """Of `drgs.fisher.diagonal` and `drgs.fisher.variance_map`, for the rows of one block."""
-        return {"semantics": self.metric, "channel_weights": (0.0, 0.0, 0.0)} if block == "semantic" else {}
+        """Of what `drgs.fisher` computes, for the rows of one block; of the deformation for those of the others."""
+        rows: dict[str, Any] = {"probes": self.probes} if block == "deformation" else {}
+        counted = self.blocks if block == "deformation" else (block,)
+        if "semantic" in counted:
+            rows["semantics"] = self.metric
+            if "geometry" not in counted:
+                rows["channel_weights"] = (0.0, 0.0, 0.0)
+        return rows
 
     def own(self, block: str, information: Information) -> Information:
         """Without what a block says nothing about."""
-        return {name: x for name, x in information.items() if name != _OTHERS[block]}
+        return {name: x for name, x in information.items() if name not in _OTHERS[block]}
 
     def said(self, camera: Camera) -> dict[str, Information]:
         """What each block of a view says."""
-        found = {}
+        found: dict[str, Information] = {}
         for block in self.blocks:
             options = self.options(block)
-            found[block] = self.own(
-                block, fisher.diagonal(self.gaussians, camera, self.settings, self.method, **options)
-            )
+            if block == "deformation":
+                found[block] = fisher.network(self.scene, camera, self.settings, **options)
+                continue
+            if self.method == "probes":
+                options["probes"] = self.probes
+            said = fisher.diagonal(self.scene, camera, self.settings, self.method, **options)
+            found[block] = self.own(block, said)
         return found
 
     def maps(self, camera: Camera, weights: Information) -> dict[str, np.ndarray]:
         """Block -> (H, W) map of its rows."""
-        return {
-            block: fisher.variance_map(
-                self.gaussians, camera, self.own(block, weights), self.settings, **self.options(block)
-            ).numpy()
-            for block in self.blocks
-        }
+        found = {}
+        for block in self.blocks:
+            mapped = fisher.network_variance_map if block == "deformation" else fisher.variance_map
+            own = self.own(block, weights)
+            found[block] = mapped(self.scene, camera, own, settings=self.settings, **self.options(block)).numpy()
+        return found
 
 
 def added(by_block: dict[str, Information]) -> Information:
@@ -270,7 +289,9 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     return variance, share
 
 
-def _view(args: Fisher, told: Told, camera: Camera, name: str, H: Information, prior: Prior) -> MappedView:
+def _view(
+    args: Fisher, told: Told, camera: Camera, name: str, H: Information, prior: Prior, rivals: Rivals | None
+) -> MappedView:
     """Maps of one view, and what it says."""
     Hc = added(told.said(camera))
     weights = dict(zip(KINDS, map_weights(H, Hc, prior), strict=True))
@@ -282,9 +303,12 @@ def _view(args: Fisher, told: Told, camera: Camera, name: str, H: Information, p
         for prefix, values in shown.items():
             files.append(f"{name}.{prefix}{kind}.png")
             pictures.write_png(args.output / files[-1], pictures.map_picture(values))
+    if rivals:
+        files.append(f"{name}.maps.png")
+        pictures.write_png(args.output / files[-1], rivals.row(camera, maps["variance"]))
     pose = None
     if args.pose:
-        found = fisher.pose_information(told.gaussians, camera, told.settings)
+        found = fisher.pose_information(told.scene, camera, told.settings)
         pose = PoseSummary(found.tolist(), torch.linalg.eigvalsh(found).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
     blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in told.blocks}
@@ -293,23 +317,23 @@ def _view(args: Fisher, told: Told, camera: Camera, name: str, H: Information, p
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
     """What was found, as tables on stdout."""
-    rows, both = [], len(next(iter(groups.values())).blocks) > 1
+    rows, several = [], blocks if len(blocks := tuple(next(iter(groups.values())).blocks)) > 1 else ()
     for name, row in groups.items():
         share = f"{row.zero / max(math.prod(row.shape), 1):.1%}"
         shape = "x".join(map(str, row.shape))
         rows.append(
-            (name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share, *_parts(row.blocks, both))
+            (name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share, *_parts(row.blocks, several))
         )
     title = f"information of {len(known.cameras)} views ({known.source})"
-    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known", *_percent(both)), rows)
+    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known", *_percent(several)), rows)
     rows = []
     for row in views:
         values = row.pose.eigenvalues if row.pose else []
         numbers = (row.gain["eig"], row.gain["logdet"], row.variance.mean, *values[:1], *values[-1:])
-        parts = _parts({block: maps["variance"].sum for block, maps in row.blocks.items()}, both)
+        parts = _parts({block: maps["variance"].sum for block, maps in row.blocks.items()}, several)
         rows.append((row.name, *(f"{x:.3g}" for x in numbers), *parts))
     poses = ("pose: least", "most") if args.pose else ()
-    columns = ("view", "eig", "logdet", "mean variance", *poses, *(f"eig: {x}" for x in _percent(both)))
+    columns = ("view", "eig", "logdet", "mean variance", *poses, *(f"eig: {x}" for x in _percent(several)))
     tables.show(f"views ({source})", columns, rows)
     if args.pose:
         print("pose: information about the least and the best known of its six directions; fisher.json has all six")
@@ -317,12 +341,12 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
     print(f"information.safetensors, fisher.json and {files} maps: {args.output}")
 
 
-def _percent(both: bool) -> tuple[str, ...]:
-    """Columns of the blocks of the image, where there are two."""
-    return ("geometry %", "semantic %") if both else ()
+def _percent(several: tuple[str, ...]) -> tuple[str, ...]:
+    """Columns of the blocks, where there are several."""
+    return tuple(f"{block} %" for block in several)
 
 
-def _parts(blocks: dict[str, float], both: bool) -> tuple[str, ...]:
+def _parts(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...]:
     """What share of a sum each block has, for those columns."""
     total = sum(blocks.values())
-    return tuple(f"{100 * x / total:.1f}" if total else "-" for x in blocks.values()) if both else ()
+    return tuple(f"{100 * blocks[block] / total:.1f}" if total else "-" for block in several)

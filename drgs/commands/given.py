@@ -13,7 +13,7 @@ from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.information.semantics import SemanticMetric
@@ -32,6 +32,7 @@ class Given:
         fields: Render settings that hold whatever the preset is: what --set says, over the background of the fit. A
             run was fitted over its background; over another one its edges show a halo.
         decoder, classes: Of a run that was fitted with semantics; else None.
+        moving: The Gaussians and what moves them; None where nothing does.
     """
 
     gaussians: Gaussians
@@ -40,6 +41,7 @@ class Given:
     fields: dict[str, Any] = dataclasses.field(default_factory=dict)
     decoder: Decoder | None = None
     classes: Classes | None = None
+    moving: Scene | None = None
 
     @classmethod
     def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> Given:
@@ -70,7 +72,9 @@ class Given:
             )
         run = Run(path)
         loaded = load_run(run)
-        return cls(loaded.gaussians, run, loaded.record, decoder=loaded.decoder, classes=loaded.classes)
+        scene = loaded.scene
+        moving = None if scene is loaded.gaussians else scene
+        return cls(loaded.gaussians, run, loaded.record, decoder=loaded.decoder, classes=loaded.classes, moving=moving)
 
     def settings(self, preset: str) -> RenderSettings:
         """How a command renders it with a preset."""
@@ -81,6 +85,11 @@ class Given:
         from drgs.information.semantics import SemanticMetric  # not for those that ask for no information
 
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
+
+    @property
+    def scene(self) -> Scene:
+        """What is rendered: the Gaussians, or those that a field moves."""
+        return self.moving or self.gaussians
 
     @property
     def colors(self) -> Gaussians:

@@ -212,6 +212,8 @@ class Fisher(_Views):
     """Maps of at most this many views, evenly spaced."""
     pose: bool = False
     """Also report what each of these views says about its own pose, a 6x6 matrix."""
+    maps: bool = False
+    """Also write each view beside its maps of moments, of fisherrf and of every block, as one picture."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

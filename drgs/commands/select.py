@@ -35,12 +35,22 @@ def run(args: Select) -> None:
     given = Given.of(args)
     settings = given.settings(args.preset)
     semantics = given.semantics()
-    scoring = Scoring(args.criterion, settings, args.method, prior, blocks=args.blocks, semantics=semantics)
+    scoring = Scoring(
+        args.criterion,
+        settings,
+        args.method,
+        prior,
+        blocks=args.blocks,
+        semantics=semantics,
+        network=args.network,
+        combine=args.combine,
+        probes=args.probes,
+    )
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
         selection = select(
-            given.gaussians,
+            given.scene,
             candidates,
             known.cameras,
             args.k,
@@ -62,6 +72,8 @@ def run(args: Select) -> None:
         "prior": {"value": args.prior, "relative": args.relative_prior},
         "blocks": selection.blocks,
         "semantics": selection.semantics,
+        "network": selection.network,
+        "combine": selection.combine,
         "seed": args.seed,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
@@ -72,7 +84,7 @@ def run(args: Select) -> None:
             for rank, pick in enumerate(selection.picks, 1)
         ],
         "candidates": [
-            {"index": i, "name": camera.name, "score": score, "parts": parts, "unseen": unseen}
+            {"index": i, "name": camera.name, "time": camera.time, "score": score, "parts": parts, "unseen": unseen}
             for i, (camera, score, parts, unseen) in enumerate(rows)
         ],
         "left_out": selection.left_out,

@@ -1,0 +1,65 @@
+"""A view beside maps of what different rules look at in it, as one picture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs import fisher
+from drgs.display import pictures
+from drgs.information.maps import fisherrf_map
+from drgs.information.moments import moments_map
+from drgs.integrator import render
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.fisher import Told
+    from drgs.gain import Prior
+
+__all__ = ["Rivals"]
+
+_SMALL = 200  # pixels of width, below which a picture is enlarged by a whole number
+
+
+class Rivals:
+    """Maps of `moments`, of `fisherrf` and of every block, of views that are compared with known ones.
+
+    Args:
+        told: Whose scene and blocks they are of.
+        prior: lambda.
+    """
+
+    def __init__(self, told: Told, prior: Prior) -> None:
+        self.told, self.prior = told, prior
+        self.known: dict[str, torch.Tensor] = {}  # as FisherRF's code computes it
+
+    def know(self, camera: Camera) -> None:
+        """Add a known view."""
+        told = self.told
+        for name, x in fisher.diagonal(told.scene, camera, told.settings, "fisherrf").items():
+            self.known[name] = self.known[name] + x if name in self.known else x
+
+    def row(self, camera: Camera, blocks: dict[str, np.ndarray]) -> np.ndarray:
+        """(H, W, 3) uint8: the view as it is rendered, then the maps, each on a scale of its own.
+
+        Args:
+            camera: Of the view.
+            blocks: Block -> (H, W) variance map.
+        """
+        told = self.told
+        with torch.no_grad():
+            seen = told.scene.at(camera.time)
+        image = render(seen.replace(features=None), camera, told.settings, outputs=()).rgb.cpu().numpy()
+        maps = {
+            "moments": moments_map(seen, camera, told.settings).numpy(),
+            "fisherrf": fisherrf_map(seen, camera, self.known, self.prior, told.settings).numpy(),
+            **blocks,
+        }
+        times = max(1, -(-_SMALL // camera.width))
+        large = lambda x: np.repeat(np.repeat(x, times, 0), times, 1)  # noqa: E731
+        when = "" if camera.time is None else f" at {camera.time:g}"
+        panels = [pictures.caption(large(image), f"{camera.name or 'view'}{when}")]
+        panels += [pictures.caption(pictures.map_picture(large(x)), name) for name, x in maps.items()]
+        return np.concatenate(panels, axis=1)

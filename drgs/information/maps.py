@@ -1,0 +1,50 @@
+"""Maps of what other rules would look at, in the pixels of a view: beside those of `drgs.fisher.variance_map`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from drgs.ellipsoids import Y_00
+from drgs.gain import Information, Prior, variances
+from drgs.information.groups import groups_of
+from drgs.information.replay import Replay
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Gaussians
+    from drgs.settings import RenderSettings
+
+__all__ = ["fisherrf_map"]
+
+
+def fisherrf_map(
+    gaussians: Gaussians, camera: Camera, known: Information, prior: Prior, settings: RenderSettings
+) -> torch.Tensor:
+    """(H, W) float32: each pixel's share of the score that FisherRF's rasterizer would give the view.
+
+    It sums the channels before it squares: what it looks at is one gray image, the sum of the colors. Each parameter's
+    square is divided by what is known of it, and by the derivative of its activation, which it multiplies once instead
+    of twice. The map adds up to `eig` of method `fisherrf` where no color is clamped.
+
+    Args:
+        gaussians: As the camera sees them.
+        camera, settings: As for `drgs.render`.
+        known: `drgs.fisher.diagonal(..., method="fisherrf")` of the known views.
+        prior: lambda.
+    """
+    g, weights = gaussians.detach().replace(features=None), {}
+    inputs = g.parameters()
+    for name, group in groups_of(g).items():
+        if name in known and group.fisherrf is not None:
+            weights[name] = variances({name: known[name]}, prior)[name] / group.fisherrf(inputs)
+    sh = torch.zeros_like(g.sh)
+    sh[..., 0] = g.sh.sum(2)
+    sh[:, 0, 0] += 1 / Y_00  # color is 0.5 + Y sh: of three, 1.5
+    if "sh" in weights:
+        gray = torch.zeros_like(weights["sh"])
+        gray[..., 0] = weights["sh"].sum(2)
+        weights["sh"] = gray
+    behind = (float(sum(settings.background)), 0.0, 0.0)
+    return Replay(g.replace(sh=sh), camera, settings.replace(background=behind)).variance(weights, (1.0, 0.0, 0.0))
