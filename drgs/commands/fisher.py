@@ -23,7 +23,7 @@ import torch
 from drgs import fisher
 from drgs.commands.given import Given
 from drgs.commands.rivals import Rivals
-from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views
+from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -66,10 +66,11 @@ def run(args: Fisher) -> None:
             )
         text = args.cameras
     known = known_views(text, args, given)
+    known = dataclasses.replace(known, cameras=timed(known.cameras, args, given))
     views, source = known.cameras, known.source
     if args.cameras is not None:
         views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
-    views = evenly(views, args.limit)
+    views = evenly(timed(views, args, given), args.limit)
     names = pictures.file_names([camera.name for camera in views])
     told = Told.of(given, args, settings)
     rivals = Rivals(told, prior) if args.maps else None

@@ -184,6 +184,8 @@ class _Views(Informed, Around, Views):
     """Which of the other views, where they are a data set's."""
     count: int = 40
     """Cameras of an orbit or a dome."""
+    time: float | None = None
+    """Of cameras that state none, in a run that moves: e.g. those of an orbit."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.commands.given import Given
-from drgs.commands.viewpoints import check_counts, known_views, other_views
+from drgs.commands.viewpoints import check_counts, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -48,11 +48,12 @@ def run(args: Select) -> None:
     )
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
+    candidates, train = timed(candidates, args, given), timed(known.cameras, args, given)
     with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
         selection = select(
             given.scene,
             candidates,
-            known.cameras,
+            train,
             args.k,
             args.policy,
             scoring=scoring,

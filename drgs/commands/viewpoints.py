@@ -42,6 +42,7 @@ __all__ = [
     "known_views",
     "other_views",
     "seen_views",
+    "timed",
 ]
 
 MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
@@ -313,6 +314,24 @@ def other_views(
             f"use {option} orbit or dome, or another data set"
         )
     return [_camera(view, known.sizes if same else {}, known.pixels) for view in left], f"{text} ({args.split})"
+
+
+def timed(cameras: list[Camera], args: Select | Fisher, given: Given) -> list[Camera]:
+    """Cameras with the time of `--time` where they state none, if the scene moves.
+
+    Raises:
+        ValueError: If one has no time then.
+    """
+    if given.moving is None:
+        return cameras
+    found = [camera if camera.time is not None else dataclasses.replace(camera, time=args.time) for camera in cameras]
+    for camera in found:
+        if camera.time is None:
+            raise ValueError(
+                f"{args.scene}: cameras must have a time, as the scene moves, {camera.name or 'one'!r} has none; "
+                "say --time"
+            )
+    return found
 
 
 def _compared_orbit(wish: Wish, given: Given, known: Known, count: int) -> list[Camera]:
