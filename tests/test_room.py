@@ -272,5 +272,5 @@ def test_still_life_has_no_teacher(tmp_path, capsys):
     assert cli.main(["scene", "still_life", "-o", str(tmp_path / "x"), "--test-every", "3"]) == 2
     assert "is for `drgs scene room`" in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:
-        cli.main(["scene", "kitchen", "-o", str(tmp_path / "x")])
+        cli.main(["scene", "bathroom", "-o", str(tmp_path / "x")])
     assert end.value.code == 2

@@ -376,21 +376,27 @@ class Demo(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene(Common):
-    """Make a data set by path tracing: a furnished room with labels and teacher features, or a still life."""
+    """Make a data set by path tracing: a kitchen in motion or a furnished room, both with labels and teacher features,
+    or a still life."""
 
-    name: Positional[Literal["room", "still_life"]]
-    """What to make; the room has classes, depth, sparse points and features of a simulated teacher."""
+    name: Positional[Literal["room", "kitchen", "still_life"]]
+    """What to make: room and kitchen have classes, sparse points and features of a simulated teacher; the kitchen is
+    filmed by several cameras."""
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
-    size: str = "320x240"
-    """WIDTHxHEIGHT of the images in pixels."""
+    size: str | None = None
+    """WIDTHxHEIGHT of the images in pixels; default 320x240, 240x180 (kitchen)."""
     views: int | None = None
     """How many images; default 75 (room) or 32 (still_life)."""
+    cameras: int | None = None
+    """How many cameras film (kitchen); default 15. cam00, in the middle of their arc, is the test view."""
+    times: int | None = None
+    """How many frames each camera films (kitchen); default 40."""
     seed: int = 0
-    """Of shapes, textures, cameras, light paths and all errors that are made on purpose."""
+    """Of shapes, textures, motions, cameras, light paths and all errors that are made on purpose."""
     spp: int | None = None
-    """Light paths a pixel; default 25 (room) or 30 (still_life)."""
+    """Light paths a pixel; default 25, 30 (still_life)."""
     teacher_size: str | None = None
-    """WIDTHxHEIGHT of the teacher's feature maps (room); default 80x60."""
+    """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
     test_every: int | None = None
     """Every how many views one is for testing (room); default 5, 3 gives 25 of 75."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import json
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from drgs.commands.overrides import parsed_size
@@ -14,15 +16,32 @@ if TYPE_CHECKING:
 
 __all__ = ["run"]
 
+_ONLY = {  # options that not every scene has
+    "--views": ("room", "still_life"),
+    "--cameras": ("kitchen",),
+    "--times": ("kitchen",),
+    "--teacher-size": ("room", "kitchen"),
+    "--test-every": ("room",),
+}
+
 
 def run(args: Scene) -> None:
     """`drgs scene room -o DATA`."""
-    numbers = {"seed": args.seed} | _pair("--size", args.size, "width", "height")
-    numbers |= {name: value for name, value in (("views", args.views), ("spp", args.spp)) if value is not None}
-    for option, value in (("--teacher-size", args.teacher_size), ("--test-every", args.test_every)):
-        if value is not None and args.name != "room":
-            raise ValueError(f"{option}: is for `drgs scene room`, not for a still life; leave it out")
-    numbers |= {} if args.test_every is None else {"test_every": args.test_every}
+    given = {
+        "--views": args.views,
+        "--cameras": args.cameras,
+        "--times": args.times,
+        "--teacher-size": args.teacher_size,
+        "--test-every": args.test_every,
+    }
+    for option, value in given.items():
+        if value is not None and args.name not in _ONLY[option]:
+            scenes = " and ".join(f"`drgs scene {name}`" for name in _ONLY[option])
+            raise ValueError(f"{option}: is for {scenes}, not for {args.name}; leave it out")
+    names = ("views", "cameras", "times", "spp", "test_every")
+    numbers = {"seed": args.seed} | {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if args.size is not None:
+        numbers |= _pair("--size", args.size, "width", "height")
     if args.teacher_size is not None:
         numbers |= _pair("--teacher-size", args.teacher_size, "teacher_width", "teacher_height")
     try:
@@ -33,15 +52,22 @@ def run(args: Scene) -> None:
         ) from None
     with Bar("path tracing", show=not args.quiet) as bar:
         folder = maker.generate(args.output, **numbers, progress=bar.update)
-    if args.quiet:
-        return
-    if args.name == "room":
+    if not args.quiet:
+        _say(args.name, folder, maker, numbers)
+
+
+def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, int]) -> None:
+    """What was made, and what to do next."""
+    every = ""
+    if name != "still_life":
         right = json.loads((folder / "teacher.json").read_text())["pixel_accuracy"]
-        tested = len((folder / "test_views.txt").read_text().split())
-        print(f"{len(maker.CLASSES)} classes, {tested} test views, teacher right at {100 * right:.1f} % of the pixels")
-        print(f"next: drgs fit {folder} -o RUN --test-every {numbers.get('test_every', maker.TEST_EVERY)}")
-    else:
-        print(f"next: drgs fit {folder} -o RUN")
+        if name == "room":
+            held_out = f"{len((folder / 'test_views.txt').read_text().split())} test views"
+            every = f" --test-every {numbers.get('test_every', maker.TEST_EVERY)}"
+        else:
+            held_out = f"{len(maker.MOVING)} of them move"
+        print(f"{len(maker.CLASSES)} classes, {held_out}, teacher right at {100 * right:.1f} % of the pixels")
+    print(f"next: drgs fit {folder} -o RUN{every}")
 
 
 def _pair(option: str, text: str, *names: str) -> dict[str, int]:

@@ -1,0 +1,59 @@
+"""Videos of made scenes, and the poses of their cameras as LLFF keeps them."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+__all__ = ["RATE", "llff_rows", "write"]
+
+RATE = 30.0  # frames a second
+
+
+def write(path, frames):
+    """Writes frames (h, w, 3) uint8 BGR as FFV1 in an .mp4, at once: what is read again is equal to the bit.
+
+    Measured on 12 path-traced frames of 240x180: MPEG-4 (`mp4v`) at the highest quality that OpenCV gives comes back
+    with a PSNR of 34 dB, VP9 with 35 dB, which is less than a good fit has; FFV1 and PNG without any error, FFV1 at
+    3/4 of PNG's size. OpenCV's wheels have no encoder for H.264.
+
+    Raises:
+        OSError: If this OpenCV cannot write or read it.
+    """
+    import cv2
+
+    hidden = path.with_name(f".{path.stem}.part.mp4")
+    writer, count = None, 0
+    for frame in frames:
+        if writer is None:
+            codec = cv2.VideoWriter_fourcc(*"FFV1")
+            writer = cv2.VideoWriter(str(hidden), cv2.CAP_FFMPEG, codec, RATE, frame.shape[1::-1])
+        writer.write(frame)
+        count, last = count + 1, frame
+    writer.release()
+    reader, found = cv2.VideoCapture(str(hidden)), []
+    found = [reader.read() for _ in range(count)]
+    if not found[-1][0] or not np.array_equal(found[-1][1], last):
+        hidden.unlink(missing_ok=True)
+        raise OSError(
+            f"scenes: {path} must be writable as FFV1, OpenCV could not; install opencv-contrib-python-headless"
+        )
+    reader.release()
+    os.replace(hidden, path)
+
+
+def llff_rows(K, poses, width, height, bounds):
+    """Rows (cameras, 17) of poses_bounds.npy.
+
+    Args:
+        K: (3, 3) intrinsics in pixels; the format has one focal length and a centered principal point.
+        poses: (cameras, 4, 4) camera-to-world, OpenCV axes; LLFF's are down, right, backward.
+        bounds: (cameras, 2) nearest and farthest depth.
+    """
+    rows = np.zeros((len(poses), 17))
+    for row, c2w, near_far in zip(rows, poses, bounds, strict=True):
+        right, down, forward, eye = c2w[:3].T
+        size = np.array([height, width, K[0, 0]])
+        row[:15], row[15:] = np.stack([down, right, -forward, eye, size], 1).ravel(), near_far
+    return rows
