@@ -1,8 +1,10 @@
 """Videos of synchronous cameras, read a frame at a time with OpenCV (FFmpeg).
 
 What a header says about the number of frames is not believed: the packets of the file are walked, undecoded, which also
-tells when each frame is shown. That time stamp says afterwards whether a seek has arrived where it should; where it has
-not, frames are decoded one after the other from the start.
+tells when each frame is shown. If the first and the last frame, decoded, are not shown when the packets say (a list of
+edits, AVI with frames that refer to later ones), all frames are decoded once instead. Afterwards the time stamp of a
+frame says whether a seek has arrived where it should; where it has not, frames are decoded one after the other from the
+start.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from drgs.data.checks import native_stderr
+from drgs.display.progress import Bar
 from drgs.guards import memory
 from drgs.guards.foreign import refuse_foreign
 
@@ -26,7 +29,7 @@ __all__ = ["VIDEO_SUFFIXES", "VideoFile", "VideoFrame", "list_videos", "read_vid
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi")
 _MAX_PIXELS = 2**31
 _MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
-_MISSING = 0.02  # share of the frames that a header may claim too many: some containers state a duration alone
+_MISSING = (0.02, 8)  # share or number of frames that a header may claim too many, where it states a duration alone
 _NEAR = 16  # frames ahead that are decoded rather than sought
 _SAME = 0.01  # milliseconds between time stamps of one frame
 _OPEN = 4  # videos held open at once
@@ -64,14 +67,13 @@ class VideoFrame:
 
 @dataclasses.dataclass(frozen=True)
 class VideoFile:
-    """What the packets of a video file say; no frame has been decoded.
+    """What is in a video file.
 
     Attributes:
         path: The file.
         width, height: In pixels.
-        stamps: Milliseconds at which each frame is shown, ascending; empty where the packets do not say, and all
-            frames had to be decoded to be counted.
-        count: Frames that are there.
+        stamps: Milliseconds at which each frame is shown, ascending; empty where the file does not say.
+        count: Frames that are shown.
         version: Size and time of change of the file.
     """
 
@@ -89,7 +91,7 @@ def list_videos(folder: Path) -> list[Path]:
 
 
 def read_video(path: Path) -> VideoFile:
-    """Size and number of frames of a video, from its packets.
+    """Size and number of frames of a video, from its packets and its first and last frame.
 
     Raises:
         FileNotFoundError: No such file.
@@ -106,7 +108,7 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
     """`read_video` of a file that has not changed since."""
     import cv2
 
-    _check_kind(path)
+    is_mp4 = _check_kind(path)
     raw = _opened(path, [cv2.CAP_PROP_FORMAT, -1])  # packets, undecoded
     width, height = int(raw.get(cv2.CAP_PROP_FRAME_WIDTH)), int(raw.get(cv2.CAP_PROP_FRAME_HEIGHT))
     claimed = raw.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -118,23 +120,47 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
             stamps.append(raw.get(cv2.CAP_PROP_POS_MSEC))
             if len(stamps) > _MAX_FRAMES:
                 raise ValueError(f"{path}: must have at most {_MAX_FRAMES} frames, has more; cut it")
-    count = len(stamps)
+    if len(stamps) < claimed - (0 if is_mp4 else max(_MISSING[0] * claimed, _MISSING[1])):
+        raise ValueError(
+            f"{path}: must hold the {claimed:.0f} frames that its header claims, holds {len(stamps)}; {_COPY}"
+        )
     stamps.sort()  # packets come in the order of decoding
-    if count > 1 and min(np.diff(stamps)) < _SAME:
-        stamps, count = [], _decoded(path)
-    if count == 0:
+    if not _is_ascending(stamps) or not _ends_agree(path, stamps):
+        stamps = _decoded(path, len(stamps))
+    if not stamps:
         raise ValueError(f"{path}: must hold at least one frame, none can be read; {_COPY}")
-    if count < claimed * (1 - _MISSING):
-        raise ValueError(f"{path}: must hold the {claimed:.0f} frames that its header claims, holds {count}; {_COPY}")
-    return VideoFile(path, width, height, tuple(stamps), count, version)
+    return VideoFile(path, width, height, tuple(stamps) if _is_ascending(stamps) else (), len(stamps), version)
 
 
-def _check_kind(path: Path) -> None:
-    """Raise ValueError unless a file begins as a video; a playlist, which names other files, does not."""
+def _is_ascending(stamps: list[float]) -> bool:
+    return len(stamps) == 1 or bool(stamps and min(np.diff(stamps)) >= _SAME)
+
+
+def _ends_agree(path: Path, stamps: list[float]) -> bool:
+    """Whether the first and the last frame are decoded with their time stamps, and nothing comes after them."""
+    import cv2
+
+    capture = _opened(path, [])
+    with native_stderr():
+        for index in sorted({0, len(stamps) - 1}):
+            if index and not capture.set(cv2.CAP_PROP_POS_FRAMES, index):
+                return False
+            if not capture.grab() or abs(capture.get(cv2.CAP_PROP_POS_MSEC) - stamps[index]) >= _SAME:
+                return False
+        return not capture.grab()
+
+
+def _check_kind(path: Path) -> bool:
+    """Whether a file begins as an mp4, which lists its frames; ValueError unless it begins as a video.
+
+    A playlist, which names other files, does not.
+    """
     with path.open("rb") as file:
         head = file.read(16)
-    if head[4:8] == b"ftyp" or head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI "):
-        return
+    if head[4:8] == b"ftyp":
+        return True
+    if head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI "):
+        return False
     refuse_foreign(path, "a video")
     raise ValueError(f"{path}: must be a video (mp4, webm, mkv, avi), begins as none of them; convert it with ffmpeg")
 
@@ -151,20 +177,35 @@ def _opened(path: Path, options: list[int]) -> Any:
     return capture
 
 
-def _decoded(path: Path) -> int:
-    """Number of frames, by decoding all of them."""
-    capture, count = _opened(path, []), 0
-    with native_stderr():
-        while count <= _MAX_FRAMES and capture.grab():
-            count += 1
-    return count
+def _decoded(path: Path, packets: int) -> list[float]:
+    """Time stamps of all frames, as they are decoded; some decoders do not know those of the last ones.
+
+    Raises:
+        ValueError: A frame cannot be decoded. Where fewer are shown than there are packets, as a list of edits may say,
+            the log tells.
+    """
+    import cv2
+
+    capture, stamps = _opened(path, []), []
+    with native_stderr() as complaints, Bar(f"frames of {path.name}") as bar:
+        while len(stamps) <= _MAX_FRAMES and capture.grab():
+            stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+            bar.update(len(stamps))
+    if len(stamps) < packets and complaints:
+        raise ValueError(
+            f"{path}: frame {len(stamps)} of {packets} must be decoded, could not be ({complaints[0].strip()[:100]}); "
+            f"{_COPY}"
+        )
+    if len(stamps) < packets:
+        _log.warning("%s: shows %d of the %d frames that it holds; these are used", path, len(stamps), packets)
+    return stamps
 
 
 class _Reader:
     """An open video and the place where it is."""
 
     def __init__(self, video: VideoFile) -> None:
-        self.video, self._next, self._told = video, 0, False
+        self.video, self._next, self._told, self._sought = video, 0, False, False
         self._capture = _opened(video.path, [])
         memory.require(
             f"{video.path}", 6 * video.width * video.height, f"a frame of {video.width}x{video.height}", "reduce it"
@@ -178,7 +219,8 @@ class _Reader:
             raise ValueError(
                 f"{self.video.path}: frame {index} of {self.video.count} must be decoded, could not be; {_COPY}"
             )
-        if complaints and not self._told:
+        # After a seek, decoders complain about frames before it that others refer to, and leave these out.
+        if complaints and not self._told and not self._sought:
             self._told = True
             text = complaints[0].strip()
             _log.warning("%s: is damaged, frames may be wrong (%s); copy it again", self.video.path, text)
@@ -192,11 +234,11 @@ class _Reader:
             if self._forward(index):
                 return self._pixels()
         elif self.video.stamps and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
-            self._next = index
+            self._next, self._sought = index, True
             if self._forward(index):
                 return self._pixels()
         self._capture.release()
-        self._capture, self._next = _opened(self.video.path, []), 0
+        self._capture, self._next, self._sought = _opened(self.video.path, []), 0, False
         return self._pixels() if self._forward(index) else None
 
     def _forward(self, index: int) -> bool:
