@@ -193,13 +193,13 @@ def _mlp(config: FieldConfig) -> torch.nn.ModuleDict:
 
 def _deltas(weights: Mapping[str, torch.Tensor], features: torch.Tensor) -> Deltas:
     """The MLP: hidden layers of all heads in one product."""
-    linear, relu = torch.nn.functional.linear, torch.nn.functional.relu
+    linear = torch.nn.functional.linear
     hidden, layer = features, 0
     while f"mlp.trunk.{layer}.weight" in weights:
-        hidden = linear(hidden, weights[f"mlp.trunk.{layer}.weight"], weights[f"mlp.trunk.{layer}.bias"]).relu()
+        hidden = linear(hidden, weights[f"mlp.trunk.{layer}.weight"], weights[f"mlp.trunk.{layer}.bias"]).relu_()
         layer += 2
     inner = [torch.cat([weights[f"mlp.{name}.1.{kind}"] for name in _HEADS]) for kind in ("weight", "bias")]
-    parts = relu(linear(hidden, *inner)).chunk(len(_HEADS), 1)
+    parts = linear(hidden, *inner).relu_().chunk(len(_HEADS), 1)
     last = [(weights[f"mlp.{name}.3.weight"], weights[f"mlp.{name}.3.bias"]) for name in _HEADS]
     return Deltas(*(linear(part, *own) for part, own in zip(parts, last, strict=True)))
 

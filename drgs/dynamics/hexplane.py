@@ -10,6 +10,7 @@ Reference:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 
@@ -86,38 +87,67 @@ def features(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.T
     """
     out = []
     for space, times in levels(planes):
-        columns = [_between(places[:, axis], space[0].shape[0]) for axis in range(3)]
-        below, part = _between(time, times[0].shape[0])
-        found = [_bilinear(plane, columns[a], columns[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
-        product = found[0] * found[1] * found[2]
+        cells = [_between(places[:, axis], space[0].shape[0], space[0].dtype) for axis in range(3)]
+        below, part = _between(time, times[0].shape[0], times[0].dtype)
+        found = [_bilinear(plane, cells[a], cells[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
+        both = torch.stack([1 - part, part])[:, None, None]
         for plane, axis in zip(times, TIME_AXES, strict=True):
-            line = torch.lerp(plane[int(below)], plane[int(below) + 1], part.to(plane.dtype))
-            product = product * _linear(line, *columns[axis])
+            line = (plane.narrow(0, int(below), 2) * both).sum(0)
+            index, s = cells[axis]
+            found.append(_Gather.apply(line, _ends(index, 1), torch.stack([1 - s, s], 1)))
+        product = found[0]
+        for factor in found[1:]:
+            product = product * factor
         out.append(product)
     return torch.cat(out, 1)
 
 
-def _between(x: torch.Tensor, nodes: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _between(x: torch.Tensor, nodes: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     """The node below and how far it is to the next, of coordinates where 0 is the first node and 1 the last.
 
     NaN stays NaN in the second, and is a legal index.
     """
     x = x.clamp(0, 1) * (nodes - 1)
     below = x.detach().long().clamp(0, nodes - 2)  # which cell it is has no derivative
-    return below, x - below
+    return below, (x - below).to(dtype)
 
 
-def _linear(line: torch.Tensor, below: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
-    part = part.to(line.dtype)[:, None]
-    pick = torch.nn.functional.embedding
-    return pick(below, line) * (1 - part) + pick(below + 1, line) * part
+def _ends(first: torch.Tensor, step: int) -> torch.Tensor:
+    return torch.stack([first, first + step], -1)
 
 
 def _bilinear(plane: torch.Tensor, column: tuple, row: tuple) -> torch.Tensor:
+    """(N, C) of cells and parts along the second and the first axis of a plane."""
     (a, s), (b, t) = column, row
-    width, rows = plane.shape[1], plane.reshape(-1, plane.shape[2])
-    s, t = s.to(plane.dtype)[:, None], t.to(plane.dtype)[:, None]
-    first, pick = b * width + a, torch.nn.functional.embedding
-    near = pick(first, rows) * (1 - s) + pick(first + 1, rows) * s
-    far = pick(first + width, rows) * (1 - s) + pick(first + width + 1, rows) * s
-    return near * (1 - t) + far * t
+    corners = _ends(_ends(b * plane.shape[1] + a, 1), plane.shape[1]).flatten(1)
+    along, across = torch.stack([1 - s, s], 1), torch.stack([1 - t, t], 1)
+    return _Gather.apply(plane.reshape(-1, plane.shape[2]), corners, (along[:, :, None] * across[:, None]).flatten(1))
+
+
+class _Gather(torch.autograd.Function):
+    """(R, C) rows, (N, J) indices and weights -> (N, C) weighted sums of rows, without the N J rows between."""
+
+    @staticmethod
+    def forward(rows: torch.Tensor, index: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.embedding_bag(index, rows, mode="sum", per_sample_weights=weights)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, slope: torch.Tensor) -> tuple:  # type: ignore[override]
+        rows, index, weights = ctx.saved_tensors
+        by_rows = by_weights = None
+        if ctx.needs_input_grad[0]:
+            each = slope[:, None] * weights[..., None]
+            by_rows = torch.zeros_like(rows).index_put_((index.flatten(),), each.flatten(0, 1), accumulate=True)
+        if ctx.needs_input_grad[2]:
+            by_weights = (torch.nn.functional.embedding(index, rows) @ slope[..., None])[..., 0]
+        return by_rows, None, by_weights
+
+    @staticmethod
+    def jvp(ctx: Any, by_rows: torch.Tensor, _: None, by_weights: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        rows, index, weights = ctx.saved_tensors
+        return _Gather.apply(by_rows, index, weights) + _Gather.apply(rows, index, by_weights)

@@ -26,7 +26,7 @@ def time_smoothness(grid: HexPlane) -> torch.Tensor:
 
     0 of a plane with fewer than three times.
     """
-    return _sum(_SecondDifference.apply(plane, 0) for _, times in levels(list(grid)) for plane in times)
+    return _sum(_Bend.apply(plane, (0,)) for _, times in levels(list(grid)) for plane in times)
 
 
 def plane_smoothness(grid: HexPlane) -> torch.Tensor:
@@ -34,12 +34,7 @@ def plane_smoothness(grid: HexPlane) -> torch.Tensor:
 
     The mean over both axes, so that a weight of 4DGS keeps its strength.
     """
-    return _sum(
-        0.5 * _SecondDifference.apply(plane, axis)
-        for space, _ in levels(list(grid))
-        for plane in space
-        for axis in (0, 1)
-    )
+    return _sum(_Bend.apply(plane, (0, 1)) for space, _ in levels(list(grid)) for plane in space)
 
 
 def time_l1(grid: HexPlane) -> torch.Tensor:
@@ -51,31 +46,29 @@ def _sum(parts: Iterable[torch.Tensor]) -> torch.Tensor:
     return torch.stack(list(parts)).sum()
 
 
-class _SecondDifference(torch.autograd.Function):
-    """Mean of |x_(k-1) - 2 x_k + x_(k+1)|^2 along an axis: one buffer of differences, and one for their gradient."""
+class _Bend(torch.autograd.Function):
+    """Mean of |x_(k-1) - 2 x_k + x_(k+1)|^2, over entries and axes; its gradient is known with it."""
 
     @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, axis: int) -> torch.Tensor:
-        inner = x.shape[axis] - 2
-        ctx.axis, ctx.inner, ctx.shape = axis, inner, x.shape
-        if inner < 1:
-            return x.new_zeros(())
-        d = x.narrow(axis, 0, inner) + x.narrow(axis, 2, inner)
-        d.sub_(x.narrow(axis, 1, inner), alpha=2)
-        ctx.save_for_backward(d)
-        return torch.dot(d.reshape(-1), d.reshape(-1)) / d.numel()
+    def forward(ctx: Any, x: torch.Tensor, axes: tuple[int, ...]) -> torch.Tensor:
+        total, slope = x.new_zeros(()), torch.zeros_like(x)
+        for axis in axes:
+            inner = x.shape[axis] - 2
+            if inner < 1:
+                continue
+            d = x.narrow(axis, 0, inner) + x.narrow(axis, 2, inner)
+            d.sub_(x.narrow(axis, 1, inner), alpha=2)
+            scale = 1 / (d.numel() * len(axes))
+            total.add_(torch.dot(d.reshape(-1), d.reshape(-1)), alpha=scale)
+            for start, weight in ((0, 1.0), (1, -2.0), (2, 1.0)):
+                slope.narrow(axis, start, inner).add_(d, alpha=2 * weight * scale)
+        ctx.save_for_backward(slope)
+        return total
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
-        axis, inner = ctx.axis, ctx.inner
-        g = slope.new_zeros(ctx.shape)
-        if inner > 0:
-            (d,) = ctx.saved_tensors
-            factor = float(2 * slope / d.numel())
-            for start, weight in ((0, 1.0), (1, -2.0), (2, 1.0)):
-                g.narrow(axis, start, inner).add_(d, alpha=weight * factor)
-        return g, None
+    def backward(ctx: Any, cotangent: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
+        return ctx.saved_tensors[0] * cotangent, None
 
 
 class _FromOne(torch.autograd.Function):
