@@ -63,7 +63,9 @@ _FOV_X = 46.0  # degrees across the image width
 _TARGET = (0.0, 0.05, 0.085)
 _ARC, _DISTANCE, _ELEVATIONS = 88.0, 1.08, (20.0, 33.0)  # degrees, meters, degrees
 _EXPOSURE = 1.25
-_MAX_DEPTH = 2  # vertices of a path after the camera: `room` in `_lights` stands for further bounces
+_LIGHT_SAMPLES = (
+    3  # of the lights, beside one of the surface, for each light path; further bounces: `room` in `_lights`
+)
 _POINTS = 8000  # sparse points that are drawn
 
 
@@ -231,7 +233,7 @@ class _Recording:
         feature = teacher.feature_map(labels, points, CLASSES, self.teacher_size, self.seed, number, CONFUSIONS)
         sensor = scenes.sensor(self.K, self.width, self.height)
         scenes.aim(sensor, c2w)
-        integrator = mi.load_dict({"type": "path", "max_depth": _MAX_DEPTH, "rr_depth": 2 * _MAX_DEPTH})
+        integrator = mi.load_dict({"type": "direct", "emitter_samples": _LIGHT_SAMPLES, "bsdf_samples": 1})
         seed = self.seed * 65536 + camera
         image = mi.render(stage.scene, sensor=sensor, integrator=integrator, spp=self.spp, seed=seed)
         output.write_png(label_path, labels)
@@ -298,7 +300,7 @@ def generate(
     times=40,
     width=240,
     height=180,
-    spp=25,
+    spp=16,
     seed=0,
     teacher_width=60,
     teacher_height=45,

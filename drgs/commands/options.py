@@ -395,7 +395,7 @@ class Scene(Common):
     seed: int = 0
     """Of shapes, textures, motions, cameras, light paths and all errors that are made on purpose."""
     spp: int | None = None
-    """Light paths a pixel; default 25, 30 (still_life)."""
+    """Light paths a pixel; default 25 (room), 16 (kitchen), 30 (still_life)."""
     teacher_size: str | None = None
     """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
     test_every: int | None = None
