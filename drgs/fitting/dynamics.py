@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig
+from drgs.dynamics.regularizers import plane_smoothness, time_l1, time_smoothness
 from drgs.fitting.networks import Network
 from drgs.fitting.stages import Stage, first_time
 from drgs.guards.json_files import check_json
@@ -181,8 +182,8 @@ class Motion:
         # Adam's steps have the rate's length: what makes lengths of features steps in units of the extent.
         lengths = dict.fromkeys(("means.3.weight", "means.3.bias"), extent)
         networks = [
-            Network(FIELD[0], field.grid, lambda part: rate(config.grid_rate, part)),
-            Network(FIELD[1], field.mlp, lambda part: rate(config.field_rate, part), lengths),
+            Network(FIELD[0], field.grid, lambda part: rate(config.grid_rate, part), fused=True),
+            Network(FIELD[1], field.mlp, lambda part: rate(config.field_rate, part), lengths, fused=True),
         ]
         terms = [*parts.terms]
         if config.smooth_weight or config.plane_weight or config.l1_time_weight:
@@ -216,23 +217,16 @@ class Smoothness:
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
-        planes = list(self.field.grid)
-        total = planes[0].new_zeros(())
-        for k, plane in enumerate(planes):
-            if k % 6 < 3:
-                if self.plane_weight:
-                    total = total + self.plane_weight * (_bend(plane, 0) + _bend(plane, 1)) / 2
-                continue
-            if self.smooth_weight:
-                total = total + self.smooth_weight * _bend(plane, 0)
-            if self.l1_weight:
-                total = total + self.l1_weight * (1 - plane).abs().mean()
+        grid = self.field.grid
+        total = grid[0].new_zeros(())
+        for weight, penalty in (
+            (self.smooth_weight, time_smoothness),
+            (self.plane_weight, plane_smoothness),
+            (self.l1_weight, time_l1),
+        ):
+            if weight:
+                total = total + weight * penalty(grid)
         return total
-
-
-def _bend(plane: torch.Tensor, axis: int) -> torch.Tensor:
-    """Mean squared second difference along an axis; 0 where there are fewer than three nodes."""
-    return plane.diff(n=2, dim=axis).square().mean() if plane.shape[axis] > 2 else plane.new_zeros(())
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

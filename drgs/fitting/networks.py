@@ -27,18 +27,26 @@ class Network:
         module: What losses, or the scene, call.
         rate: Its learning rate.
         factors: Of the learning rate of some parameters, by name, e.g. of those that have a unit of length in them.
+        fused: One pass of the optimizer over the memory of a parameter, for large ones; rounds in other places.
         optimizer: Adam, with torch's defaults.
     """
 
     def __init__(
-        self, name: str, module: torch.nn.Module, rate: Rate, factors: Mapping[str, float] | None = None
+        self,
+        name: str,
+        module: torch.nn.Module,
+        rate: Rate,
+        factors: Mapping[str, float] | None = None,
+        fused: bool = False,
     ) -> None:
         self.name, self.module, self.rate = name, module, rate
         groups: dict[float, list] = {}
         for key, x in module.named_parameters():
             groups.setdefault((factors or {}).get(key, 1.0), []).append(x)
         self.optimizer = torch.optim.Adam(
-            [{"params": listed, "factor": factor} for factor, listed in groups.items()], lr=rate_at(rate, 0.0)
+            [{"params": listed, "factor": factor} for factor, listed in groups.items()],
+            lr=rate_at(rate, 0.0),
+            fused=fused or None,
         )
 
     def set_rate(self, part: float) -> None:
