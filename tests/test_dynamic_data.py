@@ -688,3 +688,18 @@ def test_points_that_are_none(tmp_path):
         assert "init_pt_cld.npz" in refused(tmp_path)
     write_train_meta(tmp_path, cameras(3), times=2, name="test_meta.json", first=1)
     assert "must have other cameras than train_meta.json, 1 is in both" in refused(tmp_path, points=False)
+
+
+def test_what_is_almost_a_data_set(neu3d, tmp_path):
+    """Videos or frames without poses, and videos of other names, are told what they lack; the file of poses may be
+    named itself.
+    """
+    assert len(load(neu3d / "poses_bounds.npy").views) == 4 * FRAMES
+    write_video(tmp_path / "take1.mp4", [coded(0)])
+    assert "found 1 videos without; write poses_bounds.npy" in refused(tmp_path, FileNotFoundError)
+    write_poses(tmp_path, cameras(1))
+    assert "must be named cam00.mp4, cam01.mp4, ..., got take1.mp4" in refused(tmp_path, FileNotFoundError)
+    write_frames(tmp_path / "frames", count=2, numbers=(0,))
+    assert "found frames of 2 cameras (cam00, ...) without; run COLMAP" in refused(
+        tmp_path / "frames", FileNotFoundError
+    )

@@ -25,6 +25,7 @@ __all__ = [
     "Settings",
     "Split",
     "Taught",
+    "Timed",
     "Views",
 ]
 
@@ -101,11 +102,17 @@ class Data:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Views(Data):
-    """Options of commands that load data sets to take some of their views."""
+class Timed(Data):
+    """Options of commands that load data sets of one time or of several."""
 
     times: int | None = None
     """Of videos, how many synchronous frames of each are used, evenly over their length; default as a run, else 40."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Views(Timed):
+    """Options of commands that take some of the views of a data set."""
+
     test_cameras: Annotated[tuple[str, ...] | None, _CAMERAS] = None
     """Cameras of videos that are held out at all times (cam00,cam05), or none; default as a run, else the first."""
 

@@ -23,6 +23,7 @@ from drgs.commands.option_groups import (
     Settings,
     Split,
     Taught,
+    Timed,
     Views,
 )
 from drgs.commands.overrides import check_color
@@ -105,7 +106,7 @@ class Fit(Choosing, Data, Taught, Moving):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
-    """A data set: COLMAP, transforms.json, LLFF, Replica, or a folder made by drgs sfm."""
+    """COLMAP, transforms.json (D-NeRF too), LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, or folders cam00, ..."""
     output: OutputPath
     """The run folder."""
     preset: Preset = "fast"
@@ -345,7 +346,7 @@ class Sfm(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Teach(Common, Data):
+class Teach(Common, Timed):
     """Add a teacher to a data set: feature maps of its photographs by a local CLIP model, and text embeddings."""
 
     data: Positional[Path]
@@ -358,8 +359,6 @@ class Teach(Common, Data):
     """WIDTHxHEIGHT of a map in cells; default 80 along the longer side, of the photograph's shape."""
     scales: str = "0.75,1,1.5"
     """Of the photographs as the model sees them, averaged; 1: the short side is twice the model's image size."""
-    times: int = FitConfig.times
-    """Of videos, how many synchronous frames of each get a map, evenly over their length."""
     flip: bool = True
     """Average with the mirrored photographs, too; --no-flip takes half the time."""
 

@@ -10,13 +10,14 @@ from pathlib import Path
 from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
-from drgs.data.multicamera import find_camera_folders, load_cameras
-from drgs.data.neu3d import find_videos, load_neu3d
+from drgs.data.multicamera import find_camera_folders, frame_folders, load_cameras
+from drgs.data.neu3d import POSES_BOUNDS, find_videos, load_neu3d
 from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
 from drgs.data.train_meta import META, load_train_meta
 from drgs.data.transforms import find_transforms, load_transforms
+from drgs.data.videos import list_videos
 from drgs.data.view_checks import check_times
 from drgs.data.views import Dataset, View
 from drgs.guards.foreign import refuse_foreign
@@ -39,10 +40,17 @@ def load(
 ) -> Dataset:
     """Load a data set; its format is found out from its files. No image is decoded.
 
-    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json``; a COLMAP
-        model in ``.``,
-    ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt`` (Replica, as
-    Semantic-NeRF renders it). A JSON or npy file may be named itself.
+    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json`` (D-NeRF's too); videos
+    ``cam*.mp4`` beside ``poses_bounds.npy`` (Neural 3D Video); ``train_meta.json`` (Dynamic 3D Gaussians); folders of
+    frames ``cam00``, ``cam01``, ... beside a COLMAP model, also in ``sparse_``; a COLMAP model in ``.``, ``sparse/0``,
+    ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt`` (Replica, as Semantic-NeRF renders it). A
+    JSON or npy file may be named itself.
+
+    Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
+    Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
+    (``cam03/0007``), and their times are 0 at the first frame that is used and 1 at the last. A frame of a video is
+    decoded when its image is asked for. The first camera is held out at all times, unless ``test_meta.json`` says
+    which are.
 
     Args:
         path: folder or file.
@@ -53,12 +61,13 @@ def load(
             `View.checked` compares it with the image. Where intrinsics are angles and no size is stated (Blender), all
             views get the size of the first training image, the only one opened.
         points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
-            from all its images.
+            from all its images; of a model of synchronous cameras, those are read that two cameras show which are not
+            held out.
         strict: refuse a data set that lists images which are not there. By default at least 3 must be left; the
             missing ones are named in the log and held in `Dataset.absent`.
         semantics: look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
         times: how many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
-            if there are no more.
+            if there are no more; `Dataset.frames` says which. D-NeRF's photographs are all used.
         test_cameras: names of synchronous cameras that `Dataset.split` holds out at all times, which wins over
             `test_every`; None: those that the format holds out; empty: none.
 
@@ -73,6 +82,8 @@ def load(
         loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
         if path.name == META:
             loader = load_train_meta
+        elif path.name == POSES_BOUNDS and find_videos(path.parent):
+            path, loader = path.parent, load_neu3d
         if loader is None:
             refuse_foreign(path, "a data set")
             raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
@@ -86,7 +97,12 @@ def load(
         loader = load_cameras
     elif find_model(path):
         loader = load_colmap
-    elif (path / "poses_bounds.npy").is_file():
+    elif (path / POSES_BOUNDS).is_file():
+        if (found := list_videos(path)) and not (path / "images").is_dir():
+            raise FileNotFoundError(
+                f"{path}: videos of {POSES_BOUNDS} must be named cam00.mp4, cam01.mp4, ..., got {found[0].name}; "
+                "rename them in the order of its rows"
+            )
         loader = load_llff
     elif (path / POSES).is_file():
         loader = load_replica
@@ -112,19 +128,30 @@ def load(
 
 def _nothing_found(path: Path) -> FileNotFoundError:
     """The error for a folder that holds no data set: it has photographs without poses, or nothing where one looks."""
+    if videos := list_videos(path):
+        return FileNotFoundError(
+            f"{path}: must hold camera poses, found {len(videos)} videos without; write {POSES_BOUNDS} with a row for "
+            "each (LLFF), or run COLMAP on one frame of each"
+        )
     for folder in (path, path / "images"):
         if folder.is_dir() and list_images(folder):
             return FileNotFoundError(
                 f"{path}: must hold camera poses, found {len(list_images(folder))} photos without; "
                 f"run `drgs sfm {folder} -o OUT` and load OUT"
             )
+    if folders := frame_folders(path):
+        return FileNotFoundError(
+            f"{path}: must hold camera poses, found frames of {len(folders)} cameras ({folders[0].name}, ...) without; "
+            f"run COLMAP on one frame of each, named {folders[0].name}.png, ..., and put its model into sparse/0"
+        )
     for sequence in sorted(path.glob(f"*/{POSES}"))[:1]:
         return FileNotFoundError(f"{path}: must be one sequence of Replica, found several; name {sequence.parent}")
     looked = [
         "transforms.json",
         "transforms_{train,val,test}.json",
         *MODEL_FOLDERS,
-        "poses_bounds.npy",
+        POSES_BOUNDS,
+        META,
         POSES,
         "images",
     ]

@@ -21,7 +21,7 @@ from drgs.data.colmap import find_model, model_camera, model_points, read_model
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.views import Dataset
 
-__all__ = ["add_model_points", "find_camera_folders", "load_cameras"]
+__all__ = ["add_model_points", "find_camera_folders", "frame_folders", "load_cameras"]
 
 _CAMERA = re.compile(r"cam[a-z_-]*(\d{1,9})", re.IGNORECASE)
 _NUMBER = re.compile(r"(\d{1,9})$")
@@ -33,8 +33,11 @@ _log = logging.getLogger(__name__)
 
 def find_camera_folders(path: Path) -> list[Path]:
     """The folders of two cameras or more that have frames; empty where there are none, or no COLMAP model with them."""
-    if _model(path) is None:
-        return []
+    return [] if _model(path) is None else frame_folders(path)
+
+
+def frame_folders(path: Path) -> list[Path]:
+    """The folders of two cameras or more that have frames; empty where there are none."""
     folders = [folder for folder in sorted(path.iterdir()) if _CAMERA.fullmatch(folder.name) and folder.is_dir()]
     folders = [folder for folder in folders if list_images(_frame_folder(folder))]
     return folders if len(folders) >= 2 else []

@@ -14,16 +14,16 @@ from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
 from drgs.data.views import Dataset
 from drgs.display.progress import Bar
 
-__all__ = ["find_videos", "load_neu3d"]
+__all__ = ["POSES_BOUNDS", "find_videos", "load_neu3d"]
 
-_POSES = "poses_bounds.npy"
+POSES_BOUNDS = "poses_bounds.npy"
 
 _log = logging.getLogger(__name__)
 
 
 def find_videos(path: Path) -> list[Path]:
     """The videos of a folder that has poses for them, by name; empty if it has none."""
-    if not (path / _POSES).is_file():
+    if not (path / POSES_BOUNDS).is_file():
         return []
     return [video for video in list_videos(path) if video.stem.startswith("cam")]
 
@@ -53,10 +53,10 @@ def load_neu3d(
         ValueError: a damaged video, poses for another number of them or of another shape, a pose that is none, or with
             `strict` videos of different length.
     """
-    files, rows = find_videos(path), pose_rows(path / _POSES)
+    files, rows = find_videos(path), pose_rows(path / POSES_BOUNDS)
     if len(files) != len(rows):
         raise ValueError(
-            f"{path / _POSES}: must have one row a video, in the order of their names, got {len(rows)} rows and "
+            f"{path / POSES_BOUNDS}: must have one row a video, in the order of their names, got {len(rows)} rows and "
             f"{len(files)} videos (cam*{', cam*'.join(VIDEO_SUFFIXES)}); restore the missing ones, or drop their rows"
         )
     stems = [file.stem for file in files]
@@ -78,7 +78,7 @@ def load_neu3d(
     numbers = evenly_spaced(range(shortest.count), times)
     recordings = []
     for index, (row, video) in enumerate(zip(rows, videos, strict=True)):
-        where = f"{path / _POSES}: row {index}"
+        where = f"{path / POSES_BOUNDS}: row {index}"
         camera = row_camera(f"{where} ({video.path.name})", row, video.path.stem)
         recordings.append(Recording(video.path.stem, dict.fromkeys(numbers, camera), video, where))
     dataset = Dataset(path, "neu3d", [], test_cameras=tuple(stems[:1]) if len(stems) > 1 else None)
