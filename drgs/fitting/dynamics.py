@@ -185,9 +185,7 @@ class Motion:
             Network(FIELD[0], field.grid, lambda part: rate(config.grid_rate, part), fused=True),
             Network(FIELD[1], field.mlp, lambda part: rate(config.field_rate, part), lengths, fused=True),
         ]
-        terms = [*parts.terms]
-        if config.smooth_weight or config.plane_weight or config.l1_time_weight:
-            terms.append(Smoothness(field, config.smooth_weight, config.plane_weight, config.l1_time_weight))
+        terms = [*parts.terms, Smoothness(field, config)]
         if config.motion_weight:
             terms.append(Rest(self, rows, config.motion_weight))
         steps = max(config.max_steps - self.first_step, 1)
@@ -204,29 +202,22 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Smoothness:
-    """Second differences of the field's planes, squared: of those with a time axis along it, of the others along both
-    of theirs; and the distance from 1 of those with a time axis. Means over a plane, sums over planes.
-    """
+    """What keeps the planes of a field smooth in time and space, and near 1 (`drgs.dynamics.regularizers`)."""
 
     field: DeformationField
-    smooth_weight: float
-    plane_weight: float
-    l1_weight: float
+    config: FitConfig
     name: ClassVar[str] = "field"
     outputs: ClassVar[tuple[str, ...]] = ()
 
-    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
-        """See `LossTerm`."""
-        grid = self.field.grid
-        total = grid[0].new_zeros(())
-        for weight, penalty in (
-            (self.smooth_weight, time_smoothness),
-            (self.plane_weight, plane_smoothness),
-            (self.l1_weight, time_l1),
-        ):
-            if weight:
-                total = total + weight * penalty(grid)
-        return total
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """See `LossTerm`; None where all weights are 0."""
+        weights = {
+            time_smoothness: self.config.smooth_weight,
+            plane_smoothness: self.config.plane_weight,
+            time_l1: self.config.l1_time_weight,
+        }
+        parts = [weight * of(self.field.grid) for of, weight in weights.items() if weight]
+        return torch.stack(parts).sum() if parts else None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
