@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METRICS",
+    "MOVING",
     "DEFINITIONS",
     "VIEW_PICTURES",
     "Lpips",
@@ -47,6 +48,8 @@ DEFINITIONS = {
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
 }
 METRICS = tuple(DEFINITIONS)
+MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
+"""What is measured beside `METRICS` where labels say what moves: a background that stands still hides the rest."""
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
@@ -164,6 +167,7 @@ def evaluate(
     lpips: Lpips | None = None,
     pictures: Path | None = None,
     segmentation: Segmentation | str | None = None,
+    moving: frozenset[int] = frozenset(),
 ) -> dict:
     """All metrics of the given views.
 
@@ -175,12 +179,13 @@ def evaluate(
         pictures: Folder for one PNG a view: photograph, render, and error times 4, side by side; and, with a
             segmentation, NAME.semantics.png: labels, reference, features, and labels over the photograph.
         segmentation: As `drgs.fitting.segments.segmentation_of` makes it; in words: why there is none.
+        moving: Numbers of the classes that move; if there are any, views have `psnr_moving`, too.
     Returns:
         JSON-serializable: `views` (a list of name, size and metrics), `mean`, `variants`, `reasons` of what is None; of
         a run with features `segmentation` (`Segmentation.result`), whose views have `pixel_accuracy` and `miou`, too.
     """
     with Bar("measuring views", len(frames)) as bar:
-        result = _evaluated(g, frames, settings, lpips, pictures, segmentation, bar)
+        result = _evaluated(g, frames, settings, lpips, pictures, segmentation, moving, bar)
     if isinstance(segmentation, str):
         result["segmentation"], result["reasons"]["segmentation"] = None, segmentation
     elif segmentation is not None:
@@ -195,6 +200,7 @@ def _evaluated(
     lpips: Lpips | None,
     pictures: Path | None,
     segmentation: Segmentation | str | None,
+    moving: frozenset[int],
     bar: Bar,
 ) -> dict:
     """`evaluate`, under a bar that it has begun."""
@@ -212,6 +218,8 @@ def _evaluated(
         height, width = target.shape[:2]
         row: dict[str, Any] = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
         row["psnr"] = psnr(image, frame.image(), frame.mask)
+        if moving:
+            row["psnr_moving"] = _moving_psnr(image, frame, moving)
         row["ssim_padded"] = float(_ssim_map(shown, target).mean())
         row["flip"] = flip(shown, target)
         if min(height, width) >= _SSIM_MIN_SIDE:
@@ -237,10 +245,24 @@ def _evaluated(
         mean[name] = sum(values) / len(values) if values and len(values) == len(views) else None
         if not views:
             reasons[name] = "no view is held out"
-    variants = dict(DEFINITIONS)
+    variants = DEFINITIONS | (MOVING if moving else {})
+    if moving:
+        values = [row["psnr_moving"] for row in views if row["psnr_moving"] is not None]
+        mean["psnr_moving"] = sum(values) / len(values) if values else None
+        if not values:
+            reasons["psnr_moving"] = "no view shows anything with the label of a class that moves"
     if lpips is not None:
         variants["lpips"] += f", {lpips.backbone} backbone"
     return {"views": views, "mean": mean, "variants": variants, "reasons": reasons}
+
+
+def _moving_psnr(image: torch.Tensor, frame: Frame, moving: frozenset[int]) -> float | None:
+    """PSNR of the pixels whose label is among `moving`, inside the mask; None where there is none."""
+    if frame.labels is None:
+        return None
+    chosen = torch.from_numpy(np.isin(frame.labels(), sorted(moving))).float()
+    chosen = chosen if frame.mask is None else chosen * frame.mask
+    return psnr(image, frame.image(), chosen) if bool((chosen > 0).any()) else None
 
 
 def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:

@@ -31,6 +31,7 @@ from drgs.fitting.parts import parts_of
 from drgs.fitting.records import config_record
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
+from drgs.fitting.stages import moving_labels
 from drgs.fitting.start import motion_of, start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
@@ -154,7 +155,12 @@ def _fit(
     moved = None if motion is None else motion.report(trainer.rows)
     segmentation = _segmentation(trainer, taught, run, held_out)
     result = metrics.evaluate(
-        scene, held_out, config.settings, pictures=run.renders / "test", segmentation=segmentation
+        scene,
+        held_out,
+        config.settings,
+        pictures=run.renders / "test",
+        segmentation=segmentation,
+        moving=moving_labels(dataset) if motion else frozenset(),
     )
     written = metrics.write_metrics(
         run,

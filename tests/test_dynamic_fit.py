@@ -5,25 +5,30 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 import sys
 
 import numpy as np
 import pytest
 import torch
 
+from drgs import cli
 from drgs.cameras import orbit
+from drgs.data.checks import read_image
 from drgs.data.views import Dataset, View
 from drgs.deform import DynamicGaussians, FieldConfig
-from drgs.display.pictures import write_png
+from drgs.display.pictures import to_bytes, write_png
 from drgs.ellipsoids import Gaussians
-from drgs.files import Run, load_state, save_state
+from drgs.files import Run, load_ply, load_state, save_state
 from drgs.fitting.density import add_gaussians
 from drgs.fitting.dynamics import FIELD, Motion
+from drgs.fitting.frames import load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import first_time, times_of
 from drgs.integrator import render
+from drgs.metrics import evaluate, psnr
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig, Trainer, fit
 
@@ -242,3 +247,111 @@ def test_times_of_views(dataset):
     lost = dataclasses.replace(views[0], camera=dataclasses.replace(views[0].camera, time=None))
     with pytest.raises(ValueError, match="all training views must have a time or none, 'cam0_0' has none"):
         times_of([lost, *views[1:]])
+
+
+@pytest.fixture(scope="module")
+def run(dataset, tmp_path_factory):
+    """A finished run whose gates are open for five Gaussians, with a field that has learned something."""
+    with pytest.MonkeyPatch.context() as patch:
+        _small_field.__wrapped__(patch)
+        run = fit(dataset, tmp_path_factory.mktemp("run") / "run", config(max_steps=6), progress=False).run
+    tensors, header = load_state(run.state)
+    tensors["parameter.motion"] = torch.where(torch.arange(len(tensors["parameter.motion"])) < 5, 2.0, -2.0)
+    tensors["deformation.mlp.parameter.means.3.bias"] += 0.2
+    save_state(run.state, tensors, header)
+    return run
+
+
+def cameras_of(folder) -> list[dict]:
+    return [view["camera"] for view in json.loads((folder / "render.json").read_text())["views"]]
+
+
+@pytest.mark.parametrize(
+    ("options", "times", "poses"),
+    [
+        ("--view cam2_0 --time 0..1 --frames 3", [0.0, 0.5, 1.0], 1),
+        ("--time 0.5 --limit 6", [0.5, 0.5], 2),
+        ("--time 1..0 --limit 7", [1.0, 0.5, 0.0], 3),
+        ("--cameras orbit --frames 3", [0.0, 0.5, 1.0], 3),
+        ("--limit 2", [0.0, 0.5], 1),
+    ],
+    ids=["frozen camera", "frozen time", "both move", "orbit", "own times"],
+)
+def test_times_of_drawn_views(dataset, run, tmp_path, monkeypatch, options, times, poses):
+    """The camera, the time, or both move; every pose counts once, whatever times its views have."""
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    cameras = "" if "--cameras" in options else f"--cameras {run.path} "
+    line = f"render {run.path} {cameras}{options} --preset fast --width 20 --format ply -o {tmp_path / 'out'} --quiet"
+    assert cli.main(line.split()) == 0
+    found = cameras_of(tmp_path / "out")
+    assert [camera["time"] for camera in found] == times
+    assert len({json.dumps(camera["c2w"]) for camera in found}) == poses
+
+
+def test_ply_sequence_and_pictures_show_the_time(dataset, run, tmp_path, monkeypatch):
+    """Each file holds every field as it is at its time, or what moves alone; pictures are `drgs.render`'s then."""
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    line = f"render {run.path} --cameras {run.path} --view cam2_0 --time 0..1 --frames 2 --preset fast --quiet"
+    scene = load_run(run).scene
+    for name, flag in (("all", ""), ("moving", "--moving")):
+        out = tmp_path / name
+        assert cli.main(f"{line} --format png,ply,webm {flag} -o {out}".split()) == 0
+        assert (out / "video.webm").stat().st_size > 0
+        for k, time in enumerate((0.0, 1.0)):
+            held, there = load_ply(out / f"gaussians_{k:04d}.ply").parameters(), scene.at(time)
+            there = there.take(scene.moving) if flag else there
+            assert all(torch.equal(x, held[key]) for key, x in there.parameters().items())
+            assert len(held["means"]) == (5 if flag else len(scene))
+            view = next(v.camera for v in dataset.views if v.name == "cam2_0")
+            image = render(scene, dataclasses.replace(view, time=time), FAST).rgb
+            assert np.array_equal(read_image(out / f"cam2_0_{k:04d}.png"), to_bytes(image.numpy()))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ("--time 0..2", "--time must be in 0..1, the times of the run, got '0..2'; correct it"),
+        ("--time now", "--time must be a time or a range of two, e.g. 0.5 or 0..1, got 'now'; correct it"),
+        ("--view cam9", "--view must name one of the 15 views of"),
+        ("--moving", "--moving must have ply among --format"),
+    ],
+)
+def test_times_that_cannot_be_drawn(dataset, run, tmp_path, monkeypatch, capsys, options, told):
+    """One line, exit code 2, and nothing drawn; of a PLY, which stands still, too."""
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    line = f"render {run.path} --cameras {run.path} {options} --preset fast -o {tmp_path / 'out'} --quiet"
+    assert cli.main(line.split()) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not list((tmp_path / "out").glob("*.png"))
+    assert cli.main(f"render {run.point_cloud} --time 0 --frames 2 -o {tmp_path / 'still'} --quiet".split()) == 2
+    assert "--time must have a scene that moves, this one stands still; drop it" in capsys.readouterr().err
+
+
+def test_psnr_of_moving_pixels(dataset):
+    """It is that of the pixels whose label moves, in the mean of the views that show one."""
+    frames = load_frames(dataset.views[:2], 10**6)
+    labels = np.zeros((16, 20), np.int64)
+    labels[4:9, 5:11] = 3
+    frames[0].labels, frames[1].labels = lambda: labels, lambda: np.ones_like(labels)
+    found = evaluate(blobs(), frames, FAST, moving=frozenset({2, 3}))
+    image = render(blobs(), frames[0].camera, FAST).rgb.clamp(0, 1)
+    want = psnr(image[4:9, 5:11], frames[0].image()[4:9, 5:11])
+    assert found["views"][0]["psnr_moving"] == pytest.approx(want, abs=1e-9)
+    assert found["views"][1]["psnr_moving"] is None
+    assert found["mean"]["psnr_moving"] == found["views"][0]["psnr_moving"]
+    assert "psnr_moving" not in evaluate(blobs(), frames[:1], FAST)["mean"]
+
+
+def test_eval_shows_what_moves(dataset, run, tmp_path, monkeypatch, capsys):
+    """`drgs eval` measures the scene at the time of each view, and says how many move."""
+    shutil.copytree(run.path, tmp_path / "run")
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    assert cli.main(["eval", str(tmp_path / "run")]) == 0
+    said, written = capsys.readouterr().out, json.loads((tmp_path / "run" / "metrics.json").read_text())
+    frames, scene = load_frames(dataset.split()[1], 10**6), load_run(run).scene
+    for row, frame in zip(written["views"], frames, strict=True):
+        image = render(scene, frame.camera, FAST).rgb.clamp(0, 1)
+        assert row["psnr"] == pytest.approx(psnr(image, frame.image()), abs=1e-6)
+    assert f"5 of {len(scene)} Gaussians move" in said

@@ -11,10 +11,12 @@ from drgs.files import Run
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.resume import claim_run
-from drgs.metrics import METRICS, VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
+from drgs.fitting.stages import moving_labels
+from drgs.metrics import METRICS, MOVING, VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
 
 if TYPE_CHECKING:
     from drgs.commands.options import Eval
+    from drgs.deform import DynamicGaussians
     from drgs.fitting.frames import Frame
     from drgs.fitting.records import LoadedRun
     from drgs.fitting.segments import Segmentation
@@ -31,7 +33,7 @@ def run(args: Eval) -> None:
     recorded.check_data(run.path)
     output = claim_run(run, "eval")
     loaded = load_run(run)
-    g = loaded.gaussians
+    g, scene = loaded.gaussians, loaded.scene
     config = recorded.config
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
     # Of an active run, images may be missing that were never picked.
@@ -45,7 +47,7 @@ def run(args: Eval) -> None:
         lazy=recorded.is_active,
         points=False,
         strict=args.strict,
-        semantics=recorded.semantics is not None,
+        semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
     )
     train, test = dataset.split()
     if recorded.is_active:  # the rest of the training split was never seen
@@ -60,11 +62,24 @@ def run(args: Eval) -> None:
     output.check(f"renders/{args.split}/{name}.{kind}" for name in names for kind in kinds)
     segmentation = _segmentation(loaded, dataset, frames)
     result = evaluate(
-        g, frames, config.settings, lpips=lpips, pictures=run.renders / args.split, segmentation=segmentation
+        scene,
+        frames,
+        config.settings,
+        lpips=lpips,
+        pictures=run.renders / args.split,
+        segmentation=segmentation,
+        moving=moving_labels(dataset) if recorded.times else frozenset(),
     )
-    viewers = through_viewers(g, frames, config.settings, args.split)
+    viewers = through_viewers(scene, frames, config.settings, args.split)
     written = write_metrics(
-        run, args.split, frames, result, split_rule=dataset.split_rule(), gaussians=len(g), viewers=viewers
+        run,
+        args.split,
+        frames,
+        result,
+        split_rule=dataset.split_rule(),
+        gaussians=len(g),
+        viewers=viewers,
+        **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
     )
     if not args.quiet:
         print_table(written)
@@ -92,13 +107,13 @@ def _segmentation(loaded: LoadedRun, dataset: data.Dataset, frames: list[Frame])
 
 def print_table(metrics: dict) -> None:
     """The metrics of `write_metrics` as tables on stdout, reasons of missing ones below, and what viewers show."""
-    digits = {"psnr": ".2f"}
-    names = [name for name in METRICS if metrics["mean"][name] is not None]
+    digits = {"psnr": ".2f", "psnr_moving": ".2f"}
+    names = [name for name in (*METRICS, *MOVING) if metrics["mean"].get(name) is not None]
     rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
     tables.show(
         f"{metrics['count']} {metrics['split']} views",
         ("view", *names),
-        [(row["name"], *(f"{row[name]:{digits.get(name, '.4f')}}" for name in names)) for row in rows],
+        [(row["name"], *(_shown(row[name], digits.get(name, ".4f")) for name in names)) for row in rows],
     )
     if found := metrics.get("segmentation"):
         _print_segmentation(metrics, found)
@@ -106,6 +121,26 @@ def print_table(metrics: dict) -> None:
         print(f"{name}: none ({reason})")
     if metrics["viewers"]:
         print(viewers_line(metrics["viewers"]))
+    if moved := metrics.get("motion"):
+        print(_motion_line(moved, metrics["gaussians"]))
+
+
+def _shown(value: float | None, digits: str) -> str:
+    return "-" if value is None else f"{value:{digits}}"
+
+
+def _who_moves(scene: DynamicGaussians) -> dict:
+    moving = int(scene.moving.sum())
+    return {"moving": moving, "share": moving / max(len(scene), 1)}
+
+
+def _motion_line(moved: dict, count: int) -> str:
+    """Who moves and, after a fit, what it saves that the others do not."""
+    line = f"{moved['moving']:,} of {count:,} Gaussians move ({moved['share']:.1%})"
+    if "seconds" not in moved:
+        return line
+    some, everything = (1000 * moved[key] for key in ("seconds", "seconds_all"))
+    return f"{line}: deforming them takes {some:.1f} ms of a step, deforming all would take {everything:.1f} ms"
 
 
 def _print_segmentation(metrics: dict, found: dict) -> None:

@@ -20,6 +20,7 @@ __all__ = [
     "Common",
     "Data",
     "Informed",
+    "Moments",
     "Moving",
     "OutputPath",
     "Settings",
@@ -187,6 +188,18 @@ class Taught:
     """Features are rendered at the size of the image and then reduced, or at that of the teacher's map: faster."""
     couple_features: bool = FitConfig.couple_features
     """Let features move the geometry, too; else only colors do."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Moments:
+    """Options of commands that draw a scene that moves."""
+
+    time: str | None = None
+    """Of a scene that moves: one time, or a range as 0..1 over all frames; default the views' own, else all times."""
+    view: str | None = None
+    """Only this one of the cameras, by its name; with a range of --time, --frames frames of it."""
+    moving: bool = False
+    """Into ply files only what moves."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

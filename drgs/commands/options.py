@@ -18,6 +18,7 @@ from drgs.commands.option_groups import (
     Common,
     Data,
     Informed,
+    Moments,
     Moving,
     OutputPath,
     Settings,
@@ -66,7 +67,7 @@ class Info(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(Settings, Around, Views):
+class Render(Settings, Around, Views, Moments):
     """Render a Gaussian PLY, or a finished run, to pictures or a video."""
 
     scene: Positional[Path]
@@ -84,7 +85,7 @@ class Render(Settings, Around, Views):
     fov: float | None = None
     """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     format: str = "png"
-    """Comma-separated list of png, exr, webm."""
+    """Comma-separated list of png, exr, webm, and ply: all Gaussians as they are at each time."""
     fps: float = 24.0
     """Frames a second of the video."""
     depth: bool = False

@@ -20,12 +20,14 @@ import torch
 from drgs import runtime
 from drgs.commands.forecast import forecast
 from drgs.commands.given import Given
+from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.viewpoints import MAX_SIDE, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
 from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, write_json
 from drgs.guards import memory
 from drgs.guards.outputs import claim
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Render
     from drgs.commands.painters import Painter
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Gaussians, Scene
     from drgs.settings import RenderSettings
 
 __all__ = ["render_views", "run"]
@@ -44,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 _MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as doing it
 _LONG = 10.0  # seconds that are worth a word
-_FORMATS = ("png", "exr", "webm")
+_FORMATS = ("png", "exr", "webm", "ply")
 
 
 def run(args: Render) -> None:
@@ -52,6 +54,8 @@ def run(args: Render) -> None:
     args.settings()  # refuses what cannot be, before anything is read
     formats = _formats(args.format)
     _check_numbers(args)
+    if args.moving and "ply" not in formats:
+        raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
     movie = "turntable.webm" if args.cameras == "orbit" else "video.webm"
     kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
     movies = [movie, *(_movie_of(movie, kind) for kind in kinds)] if "webm" in formats else []
@@ -62,19 +66,22 @@ def run(args: Render) -> None:
     gaussians, settings = given.gaussians if paint else given.colors, given.settings(args.preset)
     size = args.width, args.height
     cameras, source = drawn_views(args, args.cameras, given, args.frames, size, returns=True)
-    cameras = [_resized(camera, args.width, args.height) for camera in cameras[: args.limit]]
+    cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)
+    cameras = [_resized(camera, args.width, args.height) for camera in cameras]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
     _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
-    ends = [*(kind for kind in formats if kind != "webm"), *(["depth.png"] * args.depth)]
+    ends = [*(kind for kind in formats if kind not in ("webm", "ply")), *(["depth.png"] * args.depth)]
     ends += [f"{kind}.png" for kind in kinds]
     output.check(f"{name}.{end}" for name in pictures.file_names([x.name for x in cameras]) for end in ends)
+    if "ply" in formats:
+        output.check(ply_names(cameras))
     if not args.quiet:
         _say_how_long(args, gaussians, cameras, settings)
     with Bar("render", len(cameras), not args.quiet) as bar:
         report = render_views(
-            gaussians,
+            gaussians if given.moving is None else given.moving,
             cameras,
             settings,
             args.output,
@@ -86,6 +93,8 @@ def run(args: Render) -> None:
             advance=bar.advance,
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
+    if "ply" in formats:
+        report["ply"] = write_plys(given.scene, cameras, args.output, args.moving, args.features)
     if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
         save_cameras_json(args.output / "cameras.json", cameras)
     else:
@@ -95,7 +104,7 @@ def run(args: Render) -> None:
 
 
 def render_views(
-    gaussians: Gaussians,
+    scene: Scene,
     cameras: list[Camera],
     settings: RenderSettings,
     out_dir: Path,
@@ -110,10 +119,10 @@ def render_views(
     """Render cameras to files, each of which appears once it is complete.
 
     Args:
-        gaussians, cameras, settings: As for `drgs.render`, a list of cameras.
+        scene, cameras, settings: As for `drgs.render`, a list of cameras; without `paint`, features are left out.
         out_dir: Folder of the files; made if absent.
         formats: Of png (8 bits, clamped, no transfer function), exr (float32; R G B, A, and Z, the
-            distance along the ray) and webm (one video).
+            distance along the ray) and webm (one video); others are left to the caller.
         depth: A color-mapped `NAME.depth.png` for each view, too.
         fps: Of the video.
         video: Its file name.
@@ -132,7 +141,7 @@ def render_views(
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
             began = time.perf_counter()
             with torch.no_grad():  # a picture
-                out = render(gaussians, camera, settings, outputs)
+                out = render(scene if paint else colors_only(scene, camera.time), camera, settings, outputs)
             rgb, alpha = out.rgb.cpu().numpy(), out.alpha.cpu().numpy()
             seconds = time.perf_counter() - began
             files = []
@@ -227,7 +236,7 @@ def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tupl
     """Refuse a view that is too large to be rendered and written, before the first one is."""
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     pixels = largest.width * largest.height
-    pictures_need = max(memory.PICTURES[name] for name in formats)
+    pictures_need = max(memory.PICTURES.get(name, 0) for name in formats)
     where, what = f"view {largest.name!r}", f"its {largest.width}x{largest.height} pixels"
     needed = memory.frame_bytes(pixels, settings, features)
     if runtime.backend().name == "cuda":

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
+    from drgs.data import Dataset
 
-__all__ = ["Stage", "first_time", "times_of"]
+__all__ = ["Stage", "first_time", "moving_labels", "times_of"]
 
 _FEWEST = 3  # photographs of one time that show the depth of things, with one to spare
 
@@ -70,3 +71,12 @@ def first_time(views: Sequence[_T]) -> list[_T]:
     first = min((t for view in views if (t := view.camera.time) is not None), default=None)
     found = [view for view in views if view.camera.time == first]
     return found if len(found) >= _FEWEST else list(views)
+
+
+def moving_labels(dataset: Dataset) -> frozenset[int]:
+    """The labels of what moves, as the data set says; none where it says nothing, or has no labels."""
+    known = dataset.semantics
+    if known is None or not known.labels or not known.moving or not known.classes:
+        return frozenset()
+    names = known.classes.names
+    return frozenset(1 + names.index(name) for name in known.moving)
