@@ -212,7 +212,7 @@ def test_lens(scene, gaussians, tmp_path, capsys):
         ("nowhere.ply", "nowhere.ply: must be a PLY file, found none"),
         ("{dir}", "must be a run folder, found no config.json"),
         ("{scene} --set sigma=3", "--set: must be a render setting, got 'sigma=3'"),
-        ("{scene} --format gif", "--format must be a list of png, exr, webm, got 'gif'"),
+        ("{scene} --format gif", "--format must be a list of png, exr, webm, ply, got 'gif'"),
         ("{scene} --format ,", "--format must be a list of png, exr, webm"),
         ("{scene} --cameras nowhere", "nowhere: must be a data set, found no such file or folder"),
         ("{scene} --cameras cameras.json", "cameras.json: must be a cameras.json file, found none"),
