@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from drgs.commands.overrides import parsed
@@ -23,6 +23,7 @@ __all__ = [
     "Moments",
     "Moving",
     "OutputPath",
+    "Seen",
     "Settings",
     "Split",
     "Taught",
@@ -134,6 +135,26 @@ class Around:
     """Degrees of an orbit above its center; default the photographs' median, else 20."""
     span: float | None = None
     """Degrees of an orbit; default as the photographs (select, fisher: 360 if they look at a point), else 360."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Seen(Settings, Around, Views):
+    """Options of commands that look at a scene from a few cameras."""
+
+    scene: Positional[Path]
+    """A 3DGS point_cloud.ply or a run folder."""
+    cameras: str | None = None
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
+    split: Split = "all"
+    """Which views of a data set."""
+    limit: int = 2
+    """At most this many views, evenly spaced."""
+    max_pixels: int = 20_000
+    """Views are reduced to at most this many pixels."""
+    fov: float | None = None
+    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
+    seed: int = 0
+    """Seed of everything random."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ from drgs.commands.option_groups import (
     Moments,
     Moving,
     OutputPath,
+    Seen,
     Settings,
     Split,
     Taught,
@@ -221,27 +222,7 @@ class Fisher(_Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seen(Settings, Around, Views):
-    """Options of commands that look at a scene from a few cameras."""
-
-    scene: Positional[Path]
-    """A 3DGS point_cloud.ply or a run folder."""
-    cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
-    split: Split = "all"
-    """Which views of a data set."""
-    limit: int = 2
-    """At most this many views, evenly spaced."""
-    max_pixels: int = 20_000
-    """Views are reduced to at most this many pixels."""
-    fov: float | None = None
-    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
-    seed: int = 0
-    """Seed of everything random."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Crossval(_Seen):
+class Crossval(Seen):
     """Compare a rasterizer's image and gradients with ours and name what differs, group by group."""
 
     rasterizer: str = "drgs:ewa"
@@ -259,7 +240,7 @@ class Crossval(_Seen):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tradeoff(_Seen):
+class Tradeoff(Seen):
     """Time every accuracy/speed setting on a scene, with its image, gradient and information error."""
 
     max_error: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
