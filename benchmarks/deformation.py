@@ -46,8 +46,8 @@ def cloud(count: int, rng: np.random.Generator) -> tuple[Gaussians, torch.Tensor
     kind = rng.choice(3, count, p=(0.5, 0.25, 0.25))
     unit = rng.normal(size=(count, 3))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    floor = np.c_[rng.uniform(-1, 1, count), 0.5 + 0.02 * unit[:, 1], rng.uniform(-1, 1, count)]
-    pillar = np.c_[0.15 * unit[:, 0], rng.uniform(-0.5, 0.5, count), 0.15 * unit[:, 2]]
+    floor = np.c_[rng.uniform(-1, 1, (count, 2)), 0.02 * unit[:, 2] - 0.5]
+    pillar = np.c_[0.15 * unit[:, :2], rng.uniform(-0.5, 0.5, count)]
     ball = 0.2 * unit + (0.6, 0.0, 0.0)
     means = np.choose(kind[:, None], (floor, pillar, ball))
     scale = 0.9 * count ** (-1 / 3) * np.exp(0.3 * rng.normal(size=(count, 3))) * 0.3
@@ -57,9 +57,9 @@ def cloud(count: int, rng: np.random.Generator) -> tuple[Gaussians, torch.Tensor
 
 
 def swung(g: Gaussians, swings: torch.Tensor, time: float) -> Gaussians:
-    """The cloud at a time: the ball has gone a third of a turn at 1."""
-    angle = time * 2 * np.pi / 3
-    turn = torch.tensor([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    """The cloud at a time: the ball has gone a sixth of a turn at 1."""
+    angle = time * np.pi / 3
+    turn = torch.tensor([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     return g.replace(means=torch.where(swings[:, None], g.means @ turn.T.float(), g.means))
 
 
@@ -68,7 +68,7 @@ def fitted(g: Gaussians, swings: torch.Tensor, cameras: list[Camera], config: Fi
     bounds = torch.stack([g.means.amin(0), g.means.amax(0)])
     scene = DynamicGaussians(g, DeformationField(config, bounds), torch.where(swings, 4.0, -4.0))
     optimizer = torch.optim.Adam(
-        [{"params": scene.field.grid.parameters(), "lr": 2e-2}, {"params": scene.field.mlp.parameters(), "lr": 2e-3}]
+        [{"params": scene.field.grid.parameters(), "lr": 1e-2}, {"params": scene.field.mlp.parameters(), "lr": 1e-3}]
     )
     draw = np.random.default_rng(0)
     for _ in range(steps):

@@ -344,7 +344,7 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
 
 def _percent(several: tuple[str, ...]) -> tuple[str, ...]:
     """Columns of the blocks, where there are several."""
-    return tuple(f"{block} %" for block in several)
+    return tuple(f"{block if len(several) < 3 else block[:4] + '.'} %" for block in several)  # of 80 columns
 
 
 def _parts(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...]:
