@@ -103,6 +103,39 @@ def test_frames_are_spread_over_the_whole_video(neu3d, times, numbers):
     assert data.split_rule() == "camera cam00 held out at all times"
 
 
+def test_folders_of_frames_in_place_of_videos(neu3d, tmp_path):
+    """As 4DGaussians takes them out of the videos: same views, same cameras, calibrated for the size of the images."""
+    for k in range(4):
+        (tmp_path / f"cam{k:02d}" / "images").mkdir(parents=True)
+        for i in range(FRAMES):
+            cv2.imwrite(str(tmp_path / f"cam{k:02d}" / "images" / f"{i:04d}.png"), coded(i, k))
+    write_poses(tmp_path, cameras(), scale=2)
+    data, videos = load(tmp_path, times=3), load(neu3d, times=3)
+    assert data.format == "neu3d"
+    assert data.split_rule() == "camera cam00 held out at all times"
+    assert decoded(data.views[5].image()) == (1, 5)
+    for a, b in zip(data.views, videos.views, strict=True):
+        assert (a.name, a.camera.time) == (b.name, b.camera.time)
+        np.testing.assert_allclose(a.camera.w2c, b.camera.w2c, atol=1e-12)
+        np.testing.assert_allclose(a.camera.K, b.camera.K)
+    shutil.rmtree(tmp_path / "cam02")
+    assert "got 4 rows and 3 folders of frames" in refused(tmp_path)
+
+
+def test_maps_of_a_teacher_are_written_where_they_are_found(neu3d, tmp_path):
+    """`drgs teach` names the map of a frame as the loader looks for it."""
+    from drgs.commands import teach
+
+    shutil.copytree(neu3d, tmp_path, dirs_exist_ok=True)
+    files = teach._files(load(tmp_path, times=2).views)
+    for number, name in enumerate(files):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        torch.save(torch.full((2, 3, 4), float(number)), tmp_path / name)
+    again = load(tmp_path, times=2)
+    assert [view.teacher_path for view in again.views] == [tmp_path / name for name in files]
+    assert len(files) == 8
+
+
 def test_which_cameras_are_held_out(neu3d):
     """Cameras that are named are held out instead; none leaves it to `test_every`; a config wins over the data set."""
     data = load(neu3d, test_cameras=("cam03", "cam01"))
@@ -519,10 +552,20 @@ def copied(neu3d, tmp_path):
     return shutil.copytree(neu3d, tmp_path / "data")
 
 
-def test_poses_for_another_number_of_cameras(copied):
-    """Rows name no video, so that a missing one would give all others wrong poses."""
+def test_poses_for_another_number_of_cameras(copied, caplog):
+    """Rows name no video, so that a missing one would give all others wrong poses; so would names in another order than
+    that of their numbers, which is told.
+    """
     (copied / "cam01.mp4").unlink()
     assert "got 4 rows and 3 videos" in refused(copied)
+    for name in ("cam02", "cam03"):
+        (copied / f"{name}.mp4").rename(copied / f"{name.replace('0', '')}.mp4")
+    write_poses(copied, cameras(3))
+    shutil.copy(copied / "cam3.mp4", copied / "cam10.mp4")
+    (copied / "cam00.mp4").unlink()
+    load(copied)
+    assert "rows are those of cam10, cam2, cam3, ..., in the order of the letters" in caplog.text
+    (copied / "cam10.mp4").rename(copied / "camera.avi")
     (copied / "camera.avi").write_bytes(b"")
     assert "camera.avi: must be a video" in refused(copied)
 

@@ -11,7 +11,7 @@ from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
 from drgs.data.llff import load_llff
 from drgs.data.multicamera import find_camera_folders, frame_folders, load_cameras
-from drgs.data.neu3d import POSES_BOUNDS, find_videos, load_neu3d
+from drgs.data.neu3d import POSES_BOUNDS, find_posed_frames, find_videos, load_neu3d
 from drgs.data.points import added_points, initial_points, scene_extent
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
@@ -42,9 +42,9 @@ def load(
 
     Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json`` (D-NeRF's too); videos
     ``cam*.mp4`` beside ``poses_bounds.npy`` (Neural 3D Video); ``train_meta.json`` (Dynamic 3D Gaussians); folders of
-    frames ``cam00``, ``cam01``, ... beside a COLMAP model, also in ``sparse_``; a COLMAP model in ``.``, ``sparse/0``,
-    ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt`` (Replica, as Semantic-NeRF renders it). A
-    JSON or npy file may be named itself.
+    frames ``cam00``, ``cam01``, ... beside a COLMAP model, also in ``sparse_``, or beside ``poses_bounds.npy``; a
+    COLMAP model in ``.``, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt``
+    (Replica, as Semantic-NeRF renders it). A JSON or npy file may be named itself.
 
     Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
@@ -82,7 +82,7 @@ def load(
         loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
         if path.name == META:
             loader = load_train_meta
-        elif path.name == POSES_BOUNDS and find_videos(path.parent):
+        elif path.name == POSES_BOUNDS and (find_videos(path.parent) or find_posed_frames(path.parent)):
             path, loader = path.parent, load_neu3d
         if loader is None:
             refuse_foreign(path, "a data set")
@@ -95,6 +95,8 @@ def load(
         loader = load_train_meta
     elif find_camera_folders(path):
         loader = load_cameras
+    elif find_posed_frames(path):
+        loader = load_neu3d
     elif find_model(path):
         loader = load_colmap
     elif (path / POSES_BOUNDS).is_file():

@@ -21,7 +21,7 @@ from drgs.data.colmap import find_model, model_camera, model_points, read_model
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.views import Dataset
 
-__all__ = ["add_model_points", "find_camera_folders", "frame_folders", "load_cameras"]
+__all__ = ["add_model_points", "find_camera_folders", "frame_folders", "frames_of", "load_cameras"]
 
 _CAMERA = re.compile(r"cam[a-z_-]*(\d{1,9})", re.IGNORECASE)
 _NUMBER = re.compile(r"(\d{1,9})$")
@@ -78,14 +78,10 @@ def load_cameras(
         if strict or len(posed) < 2:
             raise FileNotFoundError(f"{told}; name its images by their cameras, as cam00.png, or run COLMAP again")
         _log.warning("%s; going on without them", told)
-    frames = {folder.name: _numbered(_frame_folder(folder)) for folder in folders if folder.name in posed}
-    numbers = evenly_spaced(sorted(set().union(*frames.values())), times)
+    numbers, frames = frames_of([folder for folder in folders if folder.name in posed], times)
     recordings = []
-    for name, found in frames.items():
+    for name, images in frames.items():
         image_id, camera = posed[name]
-        # A frame that one camera lacks would be named there as it is in the camera that has it.
-        expected = {n: next(f[n].name for f in frames.values() if n in f) for n in numbers}
-        images = {n: found.get(n, _frame_folder(path / name) / expected[n]) for n in numbers}
         where = f"{model}: image {reconstruction.images[image_id].name}"
         recordings.append(Recording(name, dict.fromkeys(numbers, camera), images, where))
     held_out = tuple(frames)[:1] if len(frames) > 1 else None
@@ -94,6 +90,18 @@ def load_cameras(
     if points:
         _add_points(dataset, reconstruction, model, posed, held_out if test_cameras is None else test_cameras)
     return dataset
+
+
+def frames_of(folders: Sequence[Path], times: int) -> tuple[tuple[int, ...], dict[str, dict[int, Path]]]:
+    """The numbers of the frames that are used, and the file of each by the name of the camera; some may not exist."""
+    found = {folder: _numbered(_frame_folder(folder)) for folder in folders}
+    numbers = evenly_spaced(sorted(set().union(*found.values())), times)
+    # A frame that one camera lacks would be named there as it is in the camera that has it.
+    names = {n: next(frames[n].name for frames in found.values() if n in frames) for n in numbers}
+    return numbers, {
+        folder.name: {n: frames.get(n, _frame_folder(folder) / names[n]) for n in numbers}
+        for folder, frames in found.items()
+    }
 
 
 def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras: tuple[str, ...] | None) -> None:

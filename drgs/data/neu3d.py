@@ -1,20 +1,23 @@
 """Neural 3D Video (Li et al., CVPR 2022): a video a camera, ``cam00.mp4``, ..., and LLFF's ``poses_bounds.npy`` with a
 row for each, in the order of their names. ``cam00`` is the test view of that data set.
+
+In place of videos there may be folders of their frames, ``cam00/images/0000.png``, ..., as 4DGaussians takes them out.
 """
 
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 
 from drgs.data.llff import pose_rows, row_camera
-from drgs.data.multicamera import add_model_points
+from drgs.data.multicamera import add_model_points, frame_folders, frames_of
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
-from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
+from drgs.data.videos import VIDEO_SUFFIXES, VideoFile, list_videos, read_video
 from drgs.data.views import Dataset
 from drgs.display.progress import Bar
 
-__all__ = ["POSES_BOUNDS", "find_videos", "load_neu3d"]
+__all__ = ["POSES_BOUNDS", "find_posed_frames", "find_videos", "load_neu3d"]
 
 POSES_BOUNDS = "poses_bounds.npy"
 
@@ -28,6 +31,11 @@ def find_videos(path: Path) -> list[Path]:
     return [video for video in list_videos(path) if video.stem.startswith("cam")]
 
 
+def find_posed_frames(path: Path) -> list[Path]:
+    """The folders of frames of cameras, in a folder that has poses for them, by name; empty if it has none."""
+    return frame_folders(path) if (path / POSES_BOUNDS).is_file() else []
+
+
 def load_neu3d(
     path: Path,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -38,7 +46,7 @@ def load_neu3d(
     strict: bool = False,
     **_,
 ) -> Dataset:
-    """Load the videos of synchronous cameras; no frame is decoded.
+    """Load the videos of synchronous cameras, or folders of their frames. No image is decoded.
 
     The focal length belongs to the size that the poses state, and is scaled to that of the videos. Of videos of
     different length, as many frames are used as the shortest one has. Points are those of a COLMAP model of the first
@@ -53,15 +61,45 @@ def load_neu3d(
         ValueError: a damaged video, poses for another number of them or of another shape, a pose that is none, or with
             `strict` videos of different length.
     """
-    files, rows = find_videos(path), pose_rows(path / POSES_BOUNDS)
+    videos, rows = find_videos(path), pose_rows(path / POSES_BOUNDS)
+    files = videos or find_posed_frames(path)
     if len(files) != len(rows):
+        found = f"videos (cam*{', cam*'.join(VIDEO_SUFFIXES)})" if videos else "folders of frames (cam00, ...)"
         raise ValueError(
-            f"{path / POSES_BOUNDS}: must have one row a video, in the order of their names, got {len(rows)} rows and "
-            f"{len(files)} videos (cam*{', cam*'.join(VIDEO_SUFFIXES)}); restore the missing ones, or drop their rows"
+            f"{path / POSES_BOUNDS}: must have one row a camera, in the order of their names, got {len(rows)} rows and "
+            f"{len(files)} {found}; restore the missing ones, or drop their rows"
         )
     stems = [file.stem for file in files]
+    if stems != (ordered := sorted(stems, key=lambda stem: [int(x) for x in re.findall(r"\d{1,9}", stem)])):
+        _log.warning(
+            "%s: rows are those of %s, ..., in the order of the letters of their names; if they should be those of %s, "
+            "..., rename them with as many digits each",
+            path / POSES_BOUNDS,
+            ", ".join(stems[:3]),
+            ", ".join(ordered[:3]),
+        )
     if twice := [stem for stem in stems if stems.count(stem) > 1]:
         raise ValueError(f"{path}: must hold one video a camera, {twice[0]} is there twice; remove one")
+    numbers, sources = _videos(path, videos, times, strict) if videos else frames_of(files, times)
+    recordings = []
+    for index, (row, file) in enumerate(zip(rows, files, strict=True)):
+        where = f"{path / POSES_BOUNDS}: row {index}"
+        camera = row_camera(f"{where} ({file.name})", row, file.stem)
+        recordings.append(Recording(file.stem, dict.fromkeys(numbers, camera), sources[file.stem], where))
+    dataset = Dataset(path, "neu3d", [], test_cameras=tuple(stems[:1]) if len(stems) > 1 else None)
+    synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
+    if points:
+        seen = {recording.name: recording.cameras[numbers[0]] for recording in recordings}
+        add_model_points(dataset, seen, dataset.test_cameras if test_cameras is None else test_cameras)
+    return dataset
+
+
+def _videos(path: Path, files: list[Path], times: int, strict: bool) -> tuple[tuple[int, ...], dict[str, VideoFile]]:
+    """The numbers of the frames that are used, and the videos by their names.
+
+    Raises:
+        ValueError: A damaged video, or with `strict` videos of different length.
+    """
     videos = []
     with Bar("videos", len(files)) as bar:
         for file in files:
@@ -75,15 +113,4 @@ def load_neu3d(
         _log.warning(
             "%s: videos are of different length (%s); frames from %d on are left out", path, text, shortest.count
         )
-    numbers = evenly_spaced(range(shortest.count), times)
-    recordings = []
-    for index, (row, video) in enumerate(zip(rows, videos, strict=True)):
-        where = f"{path / POSES_BOUNDS}: row {index}"
-        camera = row_camera(f"{where} ({video.path.name})", row, video.path.stem)
-        recordings.append(Recording(video.path.stem, dict.fromkeys(numbers, camera), video, where))
-    dataset = Dataset(path, "neu3d", [], test_cameras=tuple(stems[:1]) if len(stems) > 1 else None)
-    synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
-    if points:
-        seen = {recording.name: recording.cameras[0] for recording in recordings}
-        add_model_points(dataset, seen, dataset.test_cameras if test_cameras is None else test_cameras)
-    return dataset
+    return evenly_spaced(range(shortest.count), times), {video.path.stem: video for video in videos}
