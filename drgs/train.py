@@ -115,16 +115,14 @@ def _fit(
     train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
     if train:
         check_parallax(train)
-    plan = ActiveViews(active, train, config) if active else None
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
+    plan = ActiveViews(active, train, config, motion is not None) if active else None
     # Parts of a caller's own say themselves what is fitted to what.
     begun = [plan.views[i] for i in plan.chosen] if plan else train
     taught = SemanticRecord.of(dataset, config, begun) if parts is None else None
-    if active and active.policy == "fisher" and "semantic" in (active.blocks or ()) and parts is None and not taught:
-        raise ValueError(  # else the first pick would be where it is found out
-            "active: blocks must be of what is fitted, got semantic for a fit without a teacher's maps; use geometry"
-        )
+    if plan and parts is None:
+        plan.check_blocks({"semantic": taught is not None, "deformation": motion is not None})
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
     frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
     held_out = load_frames(test, config.max_pixels, config.mask)

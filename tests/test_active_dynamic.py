@@ -247,6 +247,16 @@ def test_a_single_time_has_no_later_ones(swing):
         ActiveViews(plan(), views, config(dynamics="ignore"))
 
 
+def test_blocks_of_what_is_not_fitted_are_refused(swing, tmp_path):
+    """Before the first step, and no run folder is begun."""
+    still = config(dynamics="ignore")
+    for block, why in (("semantic", "a fit without a teacher's maps"), ("deformation", "a fit of what is still")):
+        active = plan(schedule="views", policy="fisher", add=2, blocks=("geometry", block))
+        with pytest.raises(ValueError, match=f"blocks must be of what is fitted, got {block} for {why}; use geometry"):
+            fit(lazily(swing), tmp_path / "run", still, active=active, progress=False)
+        assert not (tmp_path / "run/config.json").exists()
+
+
 # ---- policies over (camera, time)
 
 

@@ -494,3 +494,38 @@ def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
         assert len({repr(study.configs(cell)) for cell in cells[:9]}) == 9
         assert {policy for pair in study.comparisons for policy in pair} <= set(study.policies)
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
+
+
+def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
+    """All policies on a unit before the next; their configs are legal and all differ; the page has the three tables,
+    whose policies are the study's, and each is compared with its own reference.
+    """
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    kitchen = importlib.import_module("kitchen")
+    for scale in kitchen.SCALES:
+        study = kitchen.study_of(scale, tmp_path)
+        cells = study.cells(kitchen.units_of(study, 3))
+        count = len(kitchen.POLICIES)
+        assert len(cells) == len({cell.name for cell in cells}) == 3 * count
+        assert [cell.policy for cell in cells] == 3 * list(kitchen.POLICIES)
+        assert len({repr(study.configs(cell)) for cell in cells[:count]}) == count
+        assert {study.configs(cell)[0].test_cameras for cell in cells} == {("cam00",)}
+        rows = [
+            {
+                **row_of(cell.scene, (0, 0), cell.policy, psnr=number),
+                "study": study.name,
+                "camera": cell.camera,
+                "metrics": {metric.key: float(number) for metric in study.metrics},
+            }
+            for number, cell in enumerate(cells)
+        ]
+        text = kitchen.report(study, rows)
+        assert [line for line in text.splitlines() if line.startswith("### ")] == [
+            "### Policies",
+            "### lambda",
+            "### Blocks",
+        ]
+        for reference in ("random", "joint", "geometry"):
+            assert f"#### Against `{reference}`" in text
+        assert {name for table in kitchen.TABLES for name in table[2]} == set(kitchen.POLICIES)
+    assert not list(tmp_path.iterdir()), "nothing is made before it is needed"

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.features.decoder import Decoder
     from drgs.fitting.config import ActiveConfig, FitConfig
+    from drgs.information.choices import Block
 
 __all__ = ["SELECTION", "ActiveViews"]
 
@@ -79,6 +80,21 @@ class ActiveViews:
         self._generator = torch.Generator().manual_seed(config.seed)
         self._matches = Matches()
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def check_blocks(self, fitted: dict[Block, bool]) -> None:
+        """Refuse blocks that the fit does not have; else the first pick would be where that is found out.
+
+        Args:
+            fitted: Block -> whether there is what it tells about.
+        """
+        wanted = self.active.blocks or () if self.active.policy == "fisher" else ()
+        lacks: dict[Block, str] = {
+            "semantic": "a fit without a teacher's maps",
+            "deformation": "a fit of what is still",
+        }
+        for name, why in lacks.items():
+            if name in wanted and not fitted[name]:
+                raise ValueError(f"active: blocks must be of what is fitted, got {name} for {why}; use geometry")
 
     @property
     def names(self) -> list[str]:
