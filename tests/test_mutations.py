@@ -12,6 +12,7 @@ import pytest
 import torch
 from mutations import damaged_bytes, damaged_json
 from test_data import write_colmap, write_image, write_llff, write_transforms
+from test_dynamic_data import cameras, coded, write_poses, write_train_meta, write_video
 
 from drgs.cameras import orbit
 from drgs.data import load
@@ -79,6 +80,25 @@ def test_transforms(tmp_path, damage, lens):
     for lazy in (False, True):
         versions = (damaged_json(good, damage) for _ in range(50))
         attempt(lambda lazy=lazy: looked_at(load(tmp_path, lazy=lazy)), tmp_path / "transforms.json", versions)
+
+
+def test_train_meta(tmp_path, damage):
+    """60 edits of the lists of Dynamic 3D Gaussians, opened or not."""
+    write_train_meta(tmp_path, cameras(3), times=2)
+    path = tmp_path / "train_meta.json"
+    good = json.loads(path.read_text())
+    for lazy in (False, True):
+        versions = (damaged_json(good, damage) for _ in range(30))
+        attempt(lambda lazy=lazy: looked_at(load(tmp_path, lazy=lazy)), path, versions)
+
+
+@pytest.mark.parametrize(("suffix", "code"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v")])
+def test_videos(tmp_path, damage, suffix, code):
+    """25 versions of one video of three."""
+    paths = [write_video(tmp_path / f"cam{k}{suffix}", [coded(i, k) for i in range(4)], code) for k in range(3)]
+    write_poses(tmp_path, cameras(3))
+    whole = paths[1].read_bytes()
+    attempt(lambda: looked_at(load(tmp_path)), paths[1], (damaged_bytes(whole, damage) for _ in range(25)))
 
 
 @pytest.mark.parametrize("text", [False, True])

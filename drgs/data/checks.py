@@ -43,7 +43,8 @@ _MAX_PIXELS = 2**31
 _ROUNDING = 1e-2
 # What OpenCV, libpng, libjpeg, libtiff and FFmpeg begin their lines with; OpenCV ends some with an empty one.
 _DECODER = re.compile(
-    rb"^\[ *(WARN|ERROR|INFO)|^\[[\w, ]+ @ 0x|^OpenCV|^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$",
+    rb"^\[ *(WARN|ERROR|INFO)|^\[[\w, ]+ @ 0x|^OpenCV|^Truncating packet|"  # OpenCV, FFmpeg
+    rb"^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$",
     re.IGNORECASE,
 )
 
