@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 
 import numpy as np
@@ -232,7 +233,7 @@ def _volume(mesh):
 
 
 def test_things_do_not_meet():
-    """At three seeds, in three arrangements, what moves keeps apart at all times, and nothing is in the worktop."""
+    """At three seeds, in three arrangements, what moves keeps 3 cm apart at all times; nothing is in the worktop."""
     for seed in range(3):
         for time in np.linspace(0, 1, 9):
             places = {}
@@ -241,15 +242,9 @@ def test_things_do_not_meet():
                 assert points[:, 2].min() > -2e-3
                 places.setdefault(mover.name, []).append(points[::17])
             places = {name: np.concatenate(points) for name, points in places.items()}
-            for a, b in (
-                ("mug", "orange"),
-                ("mug", "jelly"),
-                ("orange", "jelly"),
-                ("tongs", "jelly"),
-                ("tongs", "mug"),
-            ):
+            for a, b in itertools.combinations(("mug", "orange", "jelly", "tongs"), 2):
                 gap = np.linalg.norm(places[a][:, None] - places[b][None], axis=-1).min()
-                assert gap > 0.008, (seed, time, a, b)
+                assert gap > 0.03, (seed, time, a, b)
 
 
 def test_what_moves_and_what_does_not(frames, stage):
