@@ -288,6 +288,29 @@ def test_dnerf(tmp_path):
     assert "4 cameras" in initial_points(train, max_points=50)[2]
 
 
+def test_transforms_of_synchronous_cameras(tmp_path):
+    """Frames with times in folders named as cameras are those of cameras, of which the first is held out."""
+    views = write_frames(tmp_path, count=3, numbers=(0, 1))
+    frames = [
+        {
+            "file_path": f"cam{k:02d}/frame_{i:05d}.png",
+            "transform_matrix": c2w_to_opengl(views[k].c2w).tolist(),
+            "time": 0.5 * i,
+        }
+        for i in range(2)
+        for k in range(3)
+    ]
+    top = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL}
+    (tmp_path / "transforms.json").write_text(json.dumps(top | {"frames": frames}))
+    data = load(tmp_path)
+    assert data.camera_names == ("cam00", "cam01", "cam02")
+    assert data.split_rule() == "camera cam00 held out at all times"
+    assert {view.camera_name for view in load(tmp_path, test_cameras=("cam02",)).split()[1]} == {"cam02"}
+    still = [{key: value for key, value in frame.items() if key != "time"} for frame in frames]
+    (tmp_path / "transforms.json").write_text(json.dumps(top | {"frames": still}))
+    assert load(tmp_path).camera_names == ()
+
+
 def test_times_that_cannot_be(tmp_path, caplog):
     """A view without a time among others is refused, a test view after all training views told of; views of one time
     stand still, with no word about those without.
@@ -621,6 +644,21 @@ def test_a_video_that_ends_early(copied, suffix, code, capfd):
     path.write_bytes(path.read_bytes()[: 6 * path.stat().st_size // 10])
     assert "must hold the 40 frames that its header claims, holds" in refused(copied)
     assert capfd.readouterr().err == ""
+
+
+def test_the_size_in_a_header_is_not_believed(copied):
+    """10^10 pixels, in the stream's header and in the file's, are not the size that the frames have."""
+    path = write_video(copied / "cam02.avi", [coded(i) for i in range(FRAMES)], "MJPG")
+    (copied / "cam02.mp4").unlink()
+    data = bytearray(path.read_bytes())
+    for mark, offset in ((b"avih", 8 + 32), (b"strf", 8 + 4)):
+        start = data.index(mark) + offset
+        assert int.from_bytes(data[start : start + 4], "little") == WIDTH
+        data[start : start + 8] = (10**5).to_bytes(4, "little") * 2
+    path.write_bytes(data)
+    view = load(copied).views[2 * FRAMES + 3]
+    assert (view.camera.width, view.camera.height) == (WIDTH, HEIGHT)
+    assert decoded(view.image()) == (0, 3)
 
 
 @pytest.mark.parametrize("claim", [2**31 - 1, 2])

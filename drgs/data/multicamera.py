@@ -18,12 +18,11 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import list_images
 from drgs.data.colmap import find_model, model_camera, model_points, read_model
-from drgs.data.synchronous import Recording, evenly_spaced, synchronous
+from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous
 from drgs.data.views import Dataset
 
 __all__ = ["add_model_points", "find_camera_folders", "frame_folders", "frames_of", "load_cameras"]
 
-_CAMERA = re.compile(r"cam[a-z_-]*(\d{1,9})", re.IGNORECASE)
 _NUMBER = re.compile(r"(\d{1,9})$")
 _MODEL = "sparse_"  # where 4DGaussians has it
 _SAME_POSE = 1e-2  # of the cameras' extent, and between the axes
@@ -38,7 +37,7 @@ def find_camera_folders(path: Path) -> list[Path]:
 
 def frame_folders(path: Path) -> list[Path]:
     """The folders of two cameras or more that have frames; empty where there are none."""
-    folders = [folder for folder in sorted(path.iterdir()) if _CAMERA.fullmatch(folder.name) and folder.is_dir()]
+    folders = [folder for folder in sorted(path.iterdir()) if CAMERA_NAME.fullmatch(folder.name) and folder.is_dir()]
     folders = [folder for folder in folders if list_images(_frame_folder(folder))]
     return folders if len(folders) >= 2 else []
 

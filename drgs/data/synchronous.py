@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data.videos import VideoFile
 
-__all__ = ["Recording", "evenly_spaced", "synchronous"]
+__all__ = ["CAMERA_NAME", "Recording", "evenly_spaced", "synchronous"]
 
-_log = logging.getLogger(__name__)
+# What folders of synchronous cameras are called.
+CAMERA_NAME = re.compile(r"cam[a-z_-]*\d{1,9}", re.IGNORECASE)
 
 
 @dataclasses.dataclass(frozen=True)

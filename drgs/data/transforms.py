@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, repaired_pose
 from drgs.data.points import read_point_ply
+from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
 from drgs.data.views import Dataset, View
 from drgs.guards.json_files import check_json, read_json
@@ -101,7 +102,22 @@ def load_transforms(
             xyz, colors = read_point_ply(ply)
             source = f"{ply.name}, {len(xyz)} points"
     dataset.points, dataset.colors, dataset.point_source = xyz, colors, source
+    _name_cameras(dataset)
     return dataset
+
+
+def _name_cameras(dataset: Dataset) -> None:
+    """Where frames have times and lie in folders named as cameras, note whose they are, and hold out the first camera
+    unless the files state a split.
+    """
+    folders = {view.name: PurePosixPath(view.name).parent.name for view in (*dataset.views, *dataset.absent)}
+    names = sorted(set(folders.values()))
+    if len(dataset.times) < 2 or len(names) < 2 or not all(CAMERA_NAME.fullmatch(name) for name in names):
+        return
+    for view in (*dataset.views, *dataset.absent):
+        view.camera_name = folders[view.name]
+    if not any(view.split for view in (*dataset.views, *dataset.absent)):
+        dataset.test_cameras = (names[0],)
 
 
 def _listed(read: dict[Path, dict], dataset: Dataset) -> dict[Path, list[View | None]]:

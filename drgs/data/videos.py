@@ -114,6 +114,7 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
     claimed = raw.get(cv2.CAP_PROP_FRAME_COUNT)
     if not 1 <= width * height <= _MAX_PIXELS:
         raise ValueError(f"{path}: a video must have 1 to 2^31 pixels, its header says {width}x{height}; {_COPY}")
+    memory.require(f"{path}", 6 * width * height, f"a frame of {width}x{height}", "reduce the video")
     stamps = []
     with native_stderr():
         while raw.grab():
@@ -207,9 +208,6 @@ class _Reader:
     def __init__(self, video: VideoFile) -> None:
         self.video, self._next, self._told, self._sought = video, 0, False, False
         self._capture = _opened(video.path, [])
-        memory.require(
-            f"{video.path}", 6 * video.width * video.height, f"a frame of {video.width}x{video.height}", "reduce it"
-        )
 
     def frame(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8, RGB, of the frame that is shown as number `index`; ValueError if it cannot be decoded."""
