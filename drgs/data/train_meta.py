@@ -8,7 +8,6 @@ and ``cam_id``; ``w`` and ``h`` of all. Where there is a ``test_meta.json``, its
 from __future__ import annotations
 
 import dataclasses
-import logging
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -29,8 +28,6 @@ _TEST, _POINTS, _IMAGES = "test_meta.json", "init_pt_cld.npz", "ims"
 _KIND = {"w": int, "h": int, "k": [list], "w2c": [list], "fn": [[str]], "cam_id": [[int]]}
 _ADVICE = "write w, h, and a list by time of lists by camera of each of k, w2c, fn and cam_id"
 _CLEARLY = 0.25  # of what is seen, more with matrices read the other way round
-
-_log = logging.getLogger(__name__)
 
 
 def load_train_meta(
