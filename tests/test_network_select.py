@@ -147,6 +147,7 @@ def test_constant_blocks_count_nothing(views, cache):
     scene, cams = views
     found = pick(scene, [cams[2], cams[2]], cams[:1], cache=cache, combine="zscore")
     assert found.scores == [0, 0]
+    assert any("all 2 candidates have the same score in each block" in note for note in found.notes)
     assert pick(scene, [cams[2]], cams[:1], cache=cache, combine="zscore").scores == [0]
 
 

@@ -162,7 +162,7 @@ class Informed(Settings):
     """Options of commands that compute Fisher information."""
 
     method: Method = ActiveConfig.method
-    """How information is computed: exactly (columns: slowly), by 16 random probes, or as FisherRF's code does."""
+    """How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does."""
     prior: float = ActiveConfig.prior
     """How firmly every parameter counts as known beforehand (lambda); 0 leaves out what no training view has seen."""
     relative_prior: bool = ActiveConfig.relative_prior
@@ -172,7 +172,7 @@ class Informed(Settings):
     blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
     """What of an image tells: geometry (its colors), semantic (its features), deformation (about what moves); all."""
     probes: int = ActiveConfig.probes
-    """Random probes of each view for what it tells about a deformation field."""
+    """Random probes of each view, for what it tells about a deformation field, and for --method probes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -217,6 +217,8 @@ class ActiveViews:
             "prior": {"value": active.prior, "relative": active.relative_prior},
             "blocks": selection.blocks,
             "semantics": selection.semantics,
+            "network": selection.network,
+            "combine": selection.combine,
             "gaussians": len(scene.at(frames[0].camera.time)),
             "left_out": selection.left_out,
             "notes": selection.notes,

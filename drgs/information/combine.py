@@ -224,7 +224,9 @@ def _of_gaussians(
     name, rows = blocks[0] if apart else "", _rows(blocks, metric)
     if scoring.criterion == "block_logdet":
         return Asked("blocks", (), tuple(sorted(rows.items())), name)
-    options = {"method": scoring.method, "groups": groups, **rows}
+    options: dict[str, Hashable] = {"method": scoring.method, "groups": groups, **rows}
+    if scoring.method == "probes":
+        options["probes"] = scoring.probes
     return Asked("diagonal", without, tuple(sorted(options.items())), name)
 
 

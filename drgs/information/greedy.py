@@ -92,7 +92,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         left_out=gains[0].left_out,
         evaluations=len(gains),
         computed=information.computed,
-        notes=[*_notes(gains), *_silent(information.told)],
+        notes=[*_notes(gains, combination.apart), *_silent(information.told)],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
     falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0 and combination.falls
@@ -139,10 +139,13 @@ def _nothing(part: Information) -> dict[str, torch.Tensor]:
     return {name: torch.zeros_like(x, dtype=torch.float64) for name, x in part.items()}
 
 
-def _notes(gains: list[Gain]) -> list[str]:
-    """What is worth saying about the first round."""
+def _notes(gains: list[Gain], apart: tuple[str, ...]) -> list[str]:
+    """What is worth saying about the first round, of blocks that are scored alone or of all groups together."""
     notes, scores = [], [gain.total for gain in gains]
-    if max(scores) == 0:
+    if max(scores) == 0 and apart:  # of z-scores, one is positive otherwise
+        if len(gains) > 1:
+            notes.append(f"all {len(scores)} candidates have the same score in each block; the order decided")
+    elif max(scores) == 0:
         notes.append("every score is 0: no candidate has information that counts; the order decided")
     elif len(scores) > 1 and max(scores) == min(scores):
         notes.append(f"all {len(scores)} candidates have the same score; the order decided")

@@ -43,7 +43,7 @@ class Scoring:
             scored by its own information, less the mean and divided by the standard deviation of the candidates (one
             that is the same for all counts 0), and these are added up. None: `sum`, but `zscore` where a trace stands
             beside another block, for their units differ.
-        probes: Random images, or tangents, of each view that the block `deformation` is estimated from.
+        probes: Random images, or tangents, of each view: of the block `deformation`, and of method `probes`.
     Raises:
         ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
             the wrong kind.
