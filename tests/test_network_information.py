@@ -57,10 +57,19 @@ def dense(scene, cam, directions=None):
     leaves = {name: x.detach().double() for name, x in scene.parameters().items()}
     phi = [leaves[name].requires_grad_() for name in names]
     field = DeformationField(scene.field.config, scene.field.grid.bounds).double()
-    out = reference.render(DynamicGaussians(scene.gaussians, field, scene.motion).deform(leaves, cam.time), cam, EXACT)
+    moved = DynamicGaussians(scene.gaussians, field, scene.motion).deform(leaves, cam.time)
+    ends = [getattr(moved, name) for name in ("means", "quats", "log_scales")]
+    # In two steps, as the field has no batched derivative: rows by Gaussians, Gaussians by weights.
+    middle = [x.detach().requires_grad_() for x in ends]
+    out = reference.render(moved.replace(means=middle[0], quats=middle[1], log_scales=middle[2]), cam, EXACT)
     rows = out.rgb if directions is None else torch.cat([out.rgb, out.features @ directions], -1)
     flat = rows.reshape(-1)
-    found = torch.autograd.grad(flat, phi, torch.eye(len(flat), dtype=flat.dtype), is_grads_batched=True)
+    first = torch.autograd.grad(flat, middle, torch.eye(len(flat), dtype=flat.dtype), is_grads_batched=True)
+    first = torch.cat([x.flatten(1) for x in first], 1)
+    second = [
+        torch.autograd.grad(x, phi, retain_graph=True, materialize_grads=True) for end in ends for x in end.flatten()
+    ]
+    found = [first @ torch.stack([x.flatten() for x in own]) for own in zip(*second, strict=True)]
     by_name = {name: x.reshape(*rows.flatten(0, 1).shape, -1) for name, x in zip(names, found, strict=True)}
     return {group: torch.cat([by_name[name] for name in own], -1) for group, own in groups_of(scene).items()}
 
@@ -161,15 +170,15 @@ def test_errors_fall_with_the_root_of_the_probes(seen):
     H = flat.square().sum(0)
     # Of one probe: Var (J_k u)^2 = 2 (H_k^2 - sum_p J_pk^4).
     sigma = (2 * (H.square() - flat.pow(4).sum(0))).sqrt()
-    seeds = {2: range(100, 116), 16: range(200, 208)}
+    seeds = {2: range(100, 108), 16: range(200, 206)}
     errors = {}
     for K, own in seeds.items():
         found = [torch.cat(list(fisher.network(scene, cam, EXACT, probes=K, seed=seed).values())) for seed in own]
         z = [((x - H) / sigma * K**0.5)[sigma > 1e-6 * sigma.max()] for x in found]
         errors[K] = float(torch.stack(z).square().mean()) ** 0.5
-        if K == 2:  # 32 probes, too
-            assert float((torch.stack(found).mean(0) - H).abs().div(sigma / 32**0.5 + 1e-12).max()) < 5
-    # 1 on average; of 8 seeds, whose entries are correlated, half more. Were errors not to fall, one would be 3.
+        if K == 2:  # 16 probes, too
+            assert float((torch.stack(found).mean(0) - H).abs().div(sigma / 16**0.5 + 1e-12).max()) < 5
+    # 1 on average; of 6 or 8 seeds, whose entries are correlated, half more. Were errors not to fall, one would be 3.
     assert all(0.5 < x < 1.7 for x in errors.values()), errors
 
 

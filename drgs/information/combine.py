@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Asked", "Combination", "asked_of"]
 
-_SAME = 1e-12  # relative standard deviation below which a block's scores are the same but for rounding
+_SAME = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
 
 
 @dataclasses.dataclass(frozen=True)
