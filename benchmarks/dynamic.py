@@ -1,0 +1,200 @@
+"""What a deformation field costs: the share of a training step, with and without gates, and seconds a pick.
+
+    python benchmarks/dynamic.py [--quick] [--run RUN]     prints, writes benchmarks/dynamic.json and docs/dynamic.md
+
+50,000 Gaussians, 320x240, 40 times. A step is the trainer's own (loss, backward pass, optimizer, gates that are ajar
+in every tenth); steps with a field and without take turns in one process, ten at a time. Times are CPU time of the
+process, which other programs on the machine change little; run it with DRGS_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
+
+import cubes  # noqa: E402
+import torch  # noqa: E402
+from where import ran  # noqa: E402
+
+import drgs  # noqa: E402
+from drgs.cameras import orbit  # noqa: E402
+from drgs.deform import DynamicGaussians  # noqa: E402
+from drgs.ellipsoids import Gaussians  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.dynamics import Motion, Smoothness  # noqa: E402
+from drgs.fitting.frames import Frame  # noqa: E402
+from drgs.fitting.records import load_run  # noqa: E402
+from drgs.fitting.rows import GaussianRows  # noqa: E402
+from drgs.fitting.trainer import Trainer  # noqa: E402
+from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.select import Scoring, select  # noqa: E402
+
+TIMES = 40
+CAMERAS = 15
+STEPS = 10  # of a turn: gates are ajar in one of them
+SHARES = (0.1, 0.25, 1.0)
+
+
+def frames(size: tuple[int, int]) -> list[Frame]:
+    """Random photographs of all cameras at all times: what a step costs does not depend on what they show."""
+    cameras = orbit((0, 0, 0), 4.0, CAMERAS, width=size[0], height=size[1])
+    image = torch.rand(size[1], size[0], 3, generator=torch.Generator().manual_seed(0))
+    times = [k / (TIMES - 1) for k in range(TIMES)]
+    return [
+        Frame(f"cam{i:02}/{k:04}", dataclasses.replace(camera, time=at), image)
+        for k, at in enumerate(times)
+        for i, camera in enumerate(cameras)
+    ]
+
+
+def trainer(g: Gaussians, shown: list[Frame], gates: torch.Tensor | None) -> Trainer:
+    """A fit at the first step of its dynamic stage; of what stands still where there are no gates."""
+    config = FitConfig(max_steps=10**6, static_share=0.0)  # so long that neither rates nor density control begin
+    tensors = g.parameters()
+    rows = GaussianRows(
+        {**{k: v for k, v in tensors.items() if k != "sh"}, "sh_dc": g.sh[:, :1], "sh_rest": g.sh[:, 1:]}
+    )
+    motion = None if gates is None else Motion(config, [k / (TIMES - 1) for k in range(TIMES)])
+    made = Trainer(config, shown, rows, 1.0, motion=motion)
+    made.step()
+    if gates is not None:
+        with torch.no_grad():
+            made.rows.tensors["motion"].copy_(gates)
+    return made
+
+
+def clock(run: Callable[[], object], turns: int) -> float:
+    """Median CPU seconds."""
+    run()
+    spent = []
+    for _ in range(turns):
+        began = time.process_time()
+        run()
+        spent.append(time.process_time() - began)
+    return statistics.median(spent)
+
+
+def steps(made: dict[str, Trainer], turns: int) -> dict[str, float]:
+    """CPU seconds a step by name, medians of turns of ten."""
+    spent: dict[str, list[float]] = {name: [] for name in made}
+    for turn in range(turns + 1):  # the first warms up
+        for name, fit in made.items():
+            began = time.process_time()
+            for _ in range(STEPS):
+                fit.step()
+            if turn:
+                spent[name].append((time.process_time() - began) / STEPS)
+    return {name: statistics.median(each) for name, each in spent.items()}
+
+
+def profile(fit: Trainer, turns: int) -> dict[str, float]:
+    """CPU seconds of the parts that a field adds, each by itself."""
+    scene = fit.parts.scene(fit.rows)
+    fitted = [x for x in scene.parameters().values() if x.requires_grad]
+    smooth = next(term for term in fit.parts.terms if isinstance(term, Smoothness))
+
+    def there_and_back():
+        seen = scene.at(0.3)
+        total = seen.means.sum() + seen.quats.sum() + seen.log_scales.sum()
+        torch.autograd.grad(total, fitted, allow_unused=True)
+
+    return {
+        "field, forward": clock(lambda: scene.at(0.3), turns),
+        "field, forward and backward": clock(there_and_back, turns),
+        "regularizers": clock(lambda: smooth(None, None, None).backward(), turns),
+        "optimizer": sum(clock(network.optimizer.step, turns) for network in fit.parts.networks),
+    }
+
+
+def pick(scene: DynamicGaussians, shown: list[Frame]) -> dict[str, float]:
+    """CPU seconds of choosing one of all cameras at a later time, all at the first one being known."""
+    known = [frame.camera for frame in shown[:CAMERAS]]
+    later = [frame.camera for frame in shown[CAMERAS : 2 * CAMERAS]]
+    held = DynamicGaussians(scene.gaussians.detach(), scene.field, scene.motion.detach())
+    spent = {}
+    for blocks in (("geometry",), ("geometry", "deformation")):
+        began = time.process_time()
+        scoring = Scoring(settings=drgs.RenderSettings.preset("fast"), blocks=blocks)
+        select(held, later, known, 1, "fisher", scoring=scoring)
+        spent["+".join(blocks)] = time.process_time() - began
+    return spent
+
+
+def report(result: dict) -> str:
+    """The tables and what they say."""
+    still = result["steps"]["still"]
+    lines = [
+        f"Made by `python benchmarks/dynamic.py` on {result['machine']}, {result['date']}, commit {result['commit']},",
+        f"on a loaded machine: CPU time, {result['gaussians']:,} Gaussians ({result['scene']}), "
+        f"{result['size'][0]}x{result['size'][1]}, {TIMES} times, field `neu3d`, medians of {result['turns']} turns of "
+        f"{STEPS} steps.",
+        "",
+        "| Gaussians that move | a step | share of the deformation |",
+        "|---|---|---|",
+        f"| none, no field | {1e3 * still:.0f} ms | |",
+    ]
+    for name, spent in result["steps"].items():
+        if name != "still":
+            lines.append(f"| {name} | {1e3 * spent:.0f} ms | {100 * (1 - still / spent):.0f} % |")
+    names = list(result["profile"])
+    lines += [
+        "",
+        "| by itself | " + " | ".join(f"{name} move" for name in names) + " |",
+        "|---" * (1 + len(names)) + "|",
+    ]
+    for part in result["profile"][names[0]]:
+        lines.append(f"| {part} | " + " | ".join(f"{1e3 * result['profile'][n][part]:.0f} ms" for n in names) + " |")
+    told = ", ".join(f"{spent:.0f} s by {name}" for name, spent in result["pick"].items())
+    lines += ["", f"One of {CAMERAS} cameras at a later time is picked, {CAMERAS} views being known, in {told}."]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
+    parser.add_argument("--run", type=Path, help="take the Gaussians and the gates of a fit to what moves")
+    parser.add_argument("--turns", type=int, default=5)
+    args = parser.parse_args()
+    count, size, turns = (500, (32, 24), 1) if args.quick else (50_000, (320, 240), args.turns)
+    shown = frames(size)
+    if args.run is not None:
+        scene = load_run(args.run).scene
+        g, shares = scene.gaussians, {f"{100 * float(scene.moving.float().mean()):.0f} %, as fitted": scene.motion}
+    else:
+        g = cubes.cube(count, sh_degree=1)
+        draw = torch.rand(count, generator=torch.Generator().manual_seed(1))
+        shares = {
+            "all" if share == 1 else f"{100 * share:.0f} %": torch.where(draw < share, 2.0, -2.0) for share in SHARES
+        }
+    made = {"still": trainer(g, shown, None)} | {name: trainer(g, shown, gates) for name, gates in shares.items()}
+    result = {
+        **ran(),
+        "scene": "a fitted run" if args.run else "a random cube",
+        "gaussians": len(g),
+        "size": size,
+        "turns": turns,
+        "steps": steps(made, turns),
+        "profile": {name: profile(made[name], turns) for name in shares},
+    }
+    first = made[next(iter(shares))]
+    result["pick"] = pick(first.parts.scene(first.rows), shown)
+    print(json.dumps(result))
+    print(report(result))
+    if not args.quick and args.run is None:
+        fill_between(ROOT / "docs" / "dynamic.md", "dynamic", report(result))
+        (ROOT / "benchmarks" / "dynamic.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
