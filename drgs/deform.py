@@ -105,7 +105,8 @@ class DeformationField(torch.nn.Module):
         config: Sizes.
         bounds: (2, 3) lowest and highest corner of the canonical means, in world units; means outside see the border.
             A side shorter than 1e-3 of the longest is widened to that, and a single point to sides of 1.
-        span: First and last time that will ever be asked for.
+        span: First and last time that will ever be asked for; others are refused, for nothing is known of them. They
+            may be one, at which the field is as at the first node.
         seed: Of the weights at the start.
     Attributes:
         grid: The `HexPlane`; its parameters are `grid.0`, ..., its buffers `grid.bounds` and `grid.span`.
@@ -173,7 +174,7 @@ class DeformationField(torch.nn.Module):
                 "for a time in it"
             )
         given = time if isinstance(time, torch.Tensor) else torch.tensor(value, dtype=torch.float64)
-        return (given.to(self.grid.span) - first) / ((last - first) or 1.0)
+        return (given.to(self.grid.span) - first) / ((last - first) or math.inf)  # of one time there is no other
 
 
 def _mlp(config: FieldConfig) -> torch.nn.ModuleDict:

@@ -344,6 +344,77 @@ def test_static_scenes_run_no_deformation_code(view, monkeypatch):
         render_jvp(scene, cam, tangent, FAST)
 
 
+def _far(g):
+    return g, [[-1e-3] * 3, [1e-3] * 3], {}  # all means lie outside
+
+
+def _flat(g):
+    return g.replace(means=g.means * torch.tensor([1.0, 1.0, 0.0])), None, {}
+
+
+def _point(g):
+    return g.replace(means=0 * g.means), None, {}
+
+
+def _alone(g):
+    return g.take([0]), None, {}
+
+
+def _nobody(g):
+    return g.take([]), [[0] * 3, [1] * 3], {}
+
+
+def _wide(g):
+    return g, None, {"channels": 512, "levels": (1,)}
+
+
+def _coarse(g):
+    return g, [[-1e30] * 3, [1e30] * 3], {"resolution": 2, "time_resolution": 2, "levels": (1, 2, 4, 8)}
+
+
+@pytest.mark.parametrize("extreme", [_far, _flat, _point, _alone, _nobody, _wide, _coarse])
+def test_extremes(view, extreme):
+    """Images, gradients by everything and tangents of the time are finite, at both ends of the span and within; what
+    can have a gradient has one."""
+    g, bounds, fields = extreme(view[0].gaussians)
+    if bounds is None:
+        bounds = torch.stack([g.means.amin(0), g.means.amax(0)])
+    config = FieldConfig(
+        **{"channels": 3, "resolution": 4, "time_resolution": 5, "width": 8, "last_std": 0.1, **fields}
+    )
+    field = DeformationField(config, bounds, (-1.0, 3.0))
+    with torch.no_grad():
+        for plane in field.grid:
+            plane.add_(0.1 * torch.rand(plane.shape))
+    g = g.replace(**{name: x.clone().requires_grad_() for name, x in g.parameters().items()})
+    scene = DynamicGaussians(g, field, torch.full((len(g),), 1.0, requires_grad=True))
+    for time in (-1.0, 0.3, 3.0):
+        cam = dataclasses.replace(view[1], time=time)
+        image = render(scene, cam, FAST).rgb
+        image.square().sum().backward()
+        pushed = render_jvp(scene, cam, {"time": torch.tensor(1.0)}, FAST).rgb
+        assert torch.isfinite(image).all()
+        assert torch.isfinite(pushed).all()
+    slopes = {name: x.grad for name, x in scene.parameters().items() if x.grad is not None}
+    assert all(torch.isfinite(x).all() for x in slopes.values())
+    if len(g):
+        assert all(slopes[f"phi.grid.{k}"].any() for k in range(6))
+        assert (
+            float(fisher.diagonal(scene, cam, FAST, "probes", groups=["phi.grid.3"], probes=1)["phi.grid.3"].max()) > 0
+        )
+
+
+def test_one_time(view):
+    """A field of one time is asked at that one; nothing is known of how it goes on."""
+    scene, cam = view
+    field = DeformationField(CONFIG, scene.field.grid.bounds, (0.7, 0.7))
+    one = DynamicGaussians(scene.gaussians, field)
+    assert not torch.equal(one.at(0.7).means, scene.gaussians.means)
+    assert not render_jvp(one, cam, {"time": torch.tensor(1.0)}, FAST).rgb.any()
+    with pytest.raises(ValueError, match=r"time must be in \[0\.7, 0\.7\], the span of the field, got 0\.8"):
+        one.at(0.8)
+
+
 def test_regularizers():
     """Each is what its formula says in plain torch, value and gradient; 0 for planes that are as smooth as it asks."""
     grid = DeformationField(CONFIG, [[0, 0, 0], [1, 1, 1]]).double().grid

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 
 import drjit as dr
@@ -236,6 +237,22 @@ def test_the_bridge_is_dr_wrap(view):
     assert not dr.grad(inputs["unused"]).torch().any()
     assert dr.grad(inputs["in.weight"]).torch().any()
     assert dr.grad_enabled(inputs["sh"]) is False
+
+
+def test_threads_take_turns(view):
+    """Forward and reverse mode through the bridge from four threads at once give what one thread gives."""
+    scene, cam = view
+    tangent = {"out.weight": torch.ones(3, 3)}
+
+    def work(_):
+        pushed = render_jvp(scene, cam, tangent, FAST).rgb
+        return pushed, fisher.diagonal(scene, cam, FAST, "probes", groups=["in.bias"], probes=2)["in.bias"]
+
+    want = work(0)
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        for found in pool.map(work, range(8)):
+            # Two threads of Dr.Jit add in any order.
+            torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-5)
 
 
 def test_refusals(view):
