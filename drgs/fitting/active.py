@@ -290,9 +290,13 @@ class ActiveViews:
     def _resolved(self, config: dict) -> dict:
         """A config whose schedule and numbers are those of this fit where it leaves them to the data set."""
         timetable = self.timetable
-        filled = {"add": timetable.add, "every": timetable.every}
-        schedule = timetable.schedule if config["schedule"] == "auto" else config["schedule"]
-        return {**config, "schedule": schedule, **{k: x for k, x in filled.items() if config[k] is None}}
+        filled: dict = {"add": timetable.add, "every": timetable.every}
+        filled = {name: x for name, x in filled.items() if config[name] is None}
+        if config["schedule"] == "auto":
+            filled["schedule"] = timetable.schedule
+        if timetable.schedule != "views":
+            filled["initial"] = len(timetable.start)
+        return {**config, **filled}
 
     def _where(self, index: int) -> dict:
         """Camera and time of a view, where these are what is picked."""
