@@ -187,9 +187,7 @@ def test_the_first_pick_knows_of_the_field(swing, tmp_path):
 
 
 def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
-    """With `deterministic`, a fit killed in the static stage and between two picks goes on to the same picks and the same
-    bits.
-    """
+    """With `deterministic`, a fit killed in the static stage and between two picks ends in the same picks and bits."""
     import drjit as dr
 
     threads, cfg, active, whole = dr.thread_count(), config(deterministic=True, save_every=5), plan(), Trainer.step
