@@ -20,6 +20,7 @@ Files, in the layout of Neu3D:
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import shutil
@@ -198,6 +199,11 @@ class _Recording:
         for name in self.names:
             (folder / "semantic_class" / name).mkdir(parents=True, exist_ok=True)
 
+    @functools.cached_property
+    def stage(self):
+        """The scene, built when something is left to trace."""
+        return Stage(self.seed)
+
     def paths(self, camera, k):
         """(image, labels, features) of a camera's frame; images are gone when the videos are made."""
         name = self.names[camera]
@@ -212,39 +218,38 @@ class _Recording:
 
         A camera's light paths are drawn by the same numbers at all times: where nothing changes, neither do pixels.
         """
-        stage, count = None, len(self.poses) * self.times
+        count = len(self.poses) * self.times
         for k in range(self.times):
             left = [c for c in range(len(self.poses)) if not self.paths(c, k)[0].exists()]
             if left:
-                stage = stage or Stage(self.seed)
-                stage.set(k / max(self.times - 1, 1))
+                self.stage.set(k / max(self.times - 1, 1))
             for c in left:
-                self._trace(stage, c, k)
+                self._trace(c, k)
                 if progress is not None:
                     progress(k * len(self.poses) + c + 1, count)
 
-    def _trace(self, stage, camera, k):
+    def _trace(self, camera, k):
         """One frame: labels, features, image."""
         import mitsuba as mi
 
         image_path, label_path, feature_path = self.paths(camera, k)
         c2w, number = self.poses[camera], k * len(self.poses) + camera
-        labels, points, _ = self._seen(stage, camera)
+        labels, points, _ = self._seen(camera)
         feature = teacher.feature_map(labels, points, CLASSES, self.teacher_size, self.seed, number, CONFUSIONS)
         sensor = scenes.sensor(self.K, self.width, self.height)
         scenes.aim(sensor, c2w)
         integrator = mi.load_dict({"type": "direct", "emitter_samples": _LIGHT_SAMPLES, "bsdf_samples": 1})
         seed = self.seed * 65536 + camera
-        image = mi.render(stage.scene, sensor=sensor, integrator=integrator, spp=self.spp, seed=seed)
+        image = mi.render(self.stage.scene, sensor=sensor, integrator=integrator, spp=self.spp, seed=seed)
         output.write_png(label_path, labels)
         output.write_file(feature_path, teacher.tensor_bytes(feature))
         output.write_png(image_path, scenes.encode_srgb(np.asarray(image) * _EXPOSURE)[..., ::-1])
 
-    def _seen(self, stage, camera):
+    def _seen(self, camera):
         """(labels, world points, depth) of the surfaces at a camera's pixel centers."""
         c2w = self.poses[camera]
-        depth, numbers = scenes.first_hits(stage.scene, self.K, c2w, self.width, self.height)
-        return stage.table[numbers], back_project(self.K, c2w, depth), depth
+        depth, numbers = scenes.first_hits(self.stage.scene, self.K, c2w, self.width, self.height)
+        return self.stage.table[numbers], back_project(self.K, c2w, depth), depth
 
     def finish(self):
         """What belongs to all frames; with poses_bounds.npy, the last file, the data set is complete."""
@@ -253,13 +258,13 @@ class _Recording:
         folder, first = self.folder, []
         vectors = teacher.embeddings(CLASSES, self.seed, CONFUSIONS)
         np.save(folder / "text_embeddings.npy", vectors)
-        some = [(c, k) for k in range(0, self.times, 5) for c in range(len(self.poses))]
+        some = [(c, k) for k in range(0, self.times, 10) for c in range(len(self.poses))]
         right = teacher.accuracy(((teacher.load(self.paths(*at)[2]), self._labels(*at)) for at in some), vectors)
-        stage = Stage(self.seed)
+        self.stage.set(0.0)
         for c in range(len(self.poses)):
             image = cv2.imread(str(self.paths(c, 0)[0]))
             output.write_png(folder / "frame0" / "images" / f"{self.names[c]}.png", image)
-            labels, _, depth = self._seen(stage, c)
+            labels, _, depth = self._seen(c)
             first.append((image[..., ::-1].copy(), depth, labels))
         self._write_frame0(first)
         for name in self.names:

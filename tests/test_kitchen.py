@@ -23,8 +23,11 @@ MOVING = [NUMBERS[name] for name in kitchen.MOVING]
 
 @pytest.fixture(scope="module")
 def stage():
-    """The Mitsuba scene of seed 0."""
-    return kitchen.Stage(0)
+    """The Mitsuba scene of seed 0; nothing shines in it, because tables of glossy materials take seconds."""
+    material = scenes.material
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "material", lambda bsdf, *rest: material({"type": "diffuse"}, *rest))
+        return kitchen.Stage(0)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +46,7 @@ def made(stage, tmp_path_factory):
             kitchen.generate(folder, **SMALL, progress=stop)
         assert [path.name for path in folder.iterdir()] == [".drgs.scene"]
         trace = kitchen._Recording._trace
-        patch.setattr(kitchen._Recording, "_trace", lambda *args: traced.append(args[2:]) or trace(*args))
+        patch.setattr(kitchen._Recording, "_trace", lambda *args: traced.append(args[1:]) or trace(*args))
         with pytest.MonkeyPatch.context() as broken:
             broken.setattr(videos, "write", lambda *args: stop(4, CAMERAS * TIMES))
             with pytest.raises(KeyboardInterrupt):
@@ -233,8 +236,8 @@ def _volume(mesh):
 
 
 def test_things_do_not_meet():
-    """At three seeds, in three arrangements, what moves keeps 3 cm apart at all times; nothing is in the worktop."""
-    for seed in range(3):
+    """At two seeds, in two arrangements, what moves keeps 3 cm apart at all times; nothing is in the worktop."""
+    for seed in range(2):
         for time in np.linspace(0, 1, 9):
             places = {}
             for mover in parts(seed)[1]:
