@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 __all__ = ["network", "network_variance_map"]
 
-_FLOATS = 1 << 24  # of the tangents that one traversal carries, or of their images
+_FLOATS = 1 << 23  # of the tangents that one traversal carries, or of their images
 _BATCH = 16  # tangents of one traversal
 
 
