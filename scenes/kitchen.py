@@ -64,9 +64,8 @@ _FOV_X = 46.0  # degrees across the image width
 _TARGET = (0.0, 0.05, 0.085)
 _ARC, _DISTANCE, _ELEVATIONS = 88.0, 1.08, (20.0, 33.0)  # degrees, meters, degrees
 _EXPOSURE = 1.25
-_LIGHT_SAMPLES = (
-    3  # of the lights, beside one of the surface, for each light path; further bounces: `room` in `_lights`
-)
+# Samples of the lights, beside one of the surface, of each light path; the light `room` stands for further bounces.
+_LIGHT_SAMPLES = 3
 _POINTS = 8000  # sparse points that are drawn
 
 
@@ -193,7 +192,8 @@ class _Recording:
     def __init__(self, folder, poses, times, size, teacher_size, spp, seed):
         self.folder, self.poses, self.times, (self.width, self.height) = folder, poses, times, size
         self.teacher_size, self.spp, self.seed, self.K = teacher_size, scenes.strata(spp), seed, intrinsics(*size)
-        self.names = [f"cam{k:02d}" for k in range(len(poses))]
+        digits = max(2, len(str(len(poses) - 1)))  # readers sort by name
+        self.names, self.digits = [f"cam{k:0{digits}d}" for k in range(len(poses))], max(4, len(str(times - 1)))
         for name in ("rgb_feature_langseg", "frame0/images", "frame0/sparse/0", *map("frames/{}".format, self.names)):
             (folder / name).mkdir(parents=True, exist_ok=True)
         for name in self.names:
@@ -206,11 +206,11 @@ class _Recording:
 
     def paths(self, camera, k):
         """(image, labels, features) of a camera's frame; images are gone when the videos are made."""
-        name = self.names[camera]
+        name, number = self.names[camera], f"{k:0{self.digits}d}"
         return (
-            self.folder / "frames" / name / f"{k:04d}.png",
-            self.folder / "semantic_class" / name / f"semantic_class_{k:04d}.png",
-            self.folder / "rgb_feature_langseg" / f"{name}_{k:04d}_fmap_CxHxW.pt",
+            self.folder / "frames" / name / f"{number}.png",
+            self.folder / "semantic_class" / name / f"semantic_class_{number}.png",
+            self.folder / "rgb_feature_langseg" / f"{name}_{number}_fmap_CxHxW.pt",
         )
 
     def film(self, progress):
