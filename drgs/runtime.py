@@ -25,6 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
+from drgs import machine
 from drgs.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
 
 if TYPE_CHECKING:
@@ -261,10 +262,10 @@ def info() -> dict:
 
     report: dict[str, Any] = {
         "drgs": drgs.__version__,
-        "commit": _commit(),
+        "commit": machine.commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "cpu": _cpu_model(),
+        "cpu": machine.cpu_model(),
         "cores": {"usable": _usable_cores(), "machine": os.cpu_count()},
         "packages": {package: version(package) for package in _PACKAGES},
     }
@@ -293,7 +294,7 @@ def info() -> dict:
         except ImportError as problem:
             usable, reason = False, f"drjit cannot be imported ({problem})"
         report[key] = {"available": usable, "reason": reason}
-    report["cuda"]["device"] = _gpu_name() if report["cuda"]["available"] else None
+    report["cuda"]["device"] = machine.gpu_name() if report["cuda"]["available"] else None
     return report
 
 
@@ -362,45 +363,3 @@ def _usable_cores() -> int:
         return min(cores, max(1, -(-int(quota) // int(period))))
     except (OSError, ValueError):  # no cgroup v2, or no quota ("max")
         return cores
-
-
-def _cpu_model() -> str:
-    import platform
-
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:  # not Linux
-        pass
-    brand = _output("sysctl", "-n", "machdep.cpu.brand_string") if sys.platform == "darwin" else None
-    return brand or platform.processor() or platform.machine()
-
-
-def _commit() -> str | None:
-    """Commit of the checkout that this package lies in, `-dirty` appended if its code has changed since.
-
-    None when installed. Results that a study has added to the checkout are no change of what it computes.
-    """
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
-        return None
-    git = "git", "-C", str(root)
-    commit = _output(*git, "describe", "--always", "--exclude=*")
-    is_dirty = commit and _output(*git, "status", "--porcelain", "--untracked-files=no", "--", "*.py", "*.toml")
-    return f"{commit}-dirty" if is_dirty else commit
-
-
-def _gpu_name() -> str | None:
-    return _output("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
-
-
-def _output(*command: str) -> str | None:
-    """First line that a command prints, or None when it fails or is not there."""
-    import subprocess
-
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return next(iter(done.stdout.splitlines()), None)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from drgs import libllvm, runtime
+from drgs import libllvm, machine, runtime
 
 ROOT = Path(__file__).resolve().parent.parent
 MULTIARCH = libllvm._MULTIARCH
@@ -370,16 +370,16 @@ def test_info_is_json():
 
 def test_commit_is_dirty_by_code_alone(tmp_path, monkeypatch):
     """Rows that a study appends leave the commit as it is; a change of code shows."""
-    for name in ("drgs/runtime.py", "rows.jsonl"):
+    for name in ("drgs/machine.py", "rows.jsonl"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("")
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
     for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "all"]):
         subprocess.run([*git, *command], check=True)
-    monkeypatch.setattr(runtime, "__file__", str(tmp_path / "drgs/runtime.py"))
-    clean = runtime._commit()
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "drgs/machine.py"))
+    clean = machine.commit()
     (tmp_path / "rows.jsonl").write_text("{}")
-    assert clean == runtime._commit()
-    (tmp_path / "drgs/runtime.py").write_text("x = 1")
-    assert runtime._commit() == f"{clean}-dirty"
+    assert clean == machine.commit()
+    (tmp_path / "drgs/machine.py").write_text("x = 1")
+    assert machine.commit() == f"{clean}-dirty"
     assert re.fullmatch("[0-9a-f]{7,}", clean)

@@ -31,7 +31,7 @@ from drgs.train import fit
 
 __all__ = ["Cell", "Metric", "Study", "append_row", "cell_of", "distinct_seeds", "read_study", "run_cell", "run_cells"]
 
-Unit = tuple[str, tuple[int, int] | str, Start, "Protocol", int]
+_Unit = tuple[str, tuple[int, int] | str, Start, "Protocol", int]
 Protocol = Literal["blind", "paper"]
 """`blind`: nothing of a view is read before it is picked. `paper`: initial points of the whole data set (pool_leak)."""
 
@@ -131,7 +131,7 @@ class Study:
     reference: str
     comparisons: tuple[tuple[str, str], ...] = ()
 
-    def cells(self, units: Iterable[Unit]) -> list[Cell]:
+    def cells(self, units: Iterable[_Unit]) -> list[Cell]:
         """The cells of units (scene, split or camera held out, start, protocol, seed), units outermost: what is there
         at any time is a complete study of fewer units, one unit aside for each process.
         """

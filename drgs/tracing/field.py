@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Field", "wrapped"]
 
-Tensors = dict[str, torch.Tensor]
+_Tensors = dict[str, torch.Tensor]
 
 
 class Field:
@@ -46,7 +46,7 @@ class Field:
         fixed: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
         self.scene, self.time, self.names, self.shift, self.fixed = scene, time, tuple(names), shift, dict(fixed or {})
-        self.seen: Tensors = {}  # the fields, once they are computed: a call's parameters are constant
+        self.seen: _Tensors = {}  # the fields, once they are computed: a call's parameters are constant
 
     def __call__(self, parameters: dict) -> dict:
         """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes, by those that it is enabled of."""
@@ -55,7 +55,7 @@ class Field:
         still = {name: x.torch() for name, x in parameters.items() if name not in moving}
         return wrapped(lambda some: self.values({**still, **some}), self.seen)(moving)
 
-    def values(self, parameters: Tensors) -> Tensors:
+    def values(self, parameters: _Tensors) -> _Tensors:
         """The same in torch; `time` among the parameters is that of the view, as a scalar."""
         given = {**self.fixed, **parameters}
         fields = self.scene.deform(given, given.pop("time", self.time)).parameters()
@@ -64,7 +64,7 @@ class Field:
         return {name: fields[name] for name in self.names}
 
 
-def wrapped(function: Callable[[Tensors], Tensors], seen: Tensors | None = None) -> Callable[[dict], dict]:
+def wrapped(function: Callable[[_Tensors], _Tensors], seen: _Tensors | None = None) -> Callable[[dict], dict]:
     """A torch function of tensors by name as a function of Dr.Jit tensors by name, by `dr.wrap`.
 
     Args:
@@ -75,7 +75,7 @@ def wrapped(function: Callable[[Tensors], Tensors], seen: Tensors | None = None)
     """
     seen = {} if seen is None else seen
 
-    def kept(inputs: Tensors) -> Tensors:
+    def kept(inputs: _Tensors) -> _Tensors:
         if any(torch.autograd.forward_ad.unpack_dual(x).tangent is not None for x in inputs.values()):
             return {name: _dual(x) for name, x in function(inputs).items()}
         with torch.enable_grad():  # `dr.wrap` calls it as the thread is, and differentiates it later
@@ -96,7 +96,7 @@ class _Kept(torch.autograd.Function):
     """A function whose graph stays, so that it can be differentiated again; each time by itself."""
 
     @staticmethod
-    def forward(ctx: Any, function: Callable, seen: Tensors, names: tuple, *values: torch.Tensor) -> tuple:
+    def forward(ctx: Any, function: Callable, seen: _Tensors, names: tuple, *values: torch.Tensor) -> tuple:
         if not seen:
             seen.update(function(dict(zip(names, values, strict=True))))
         ctx.function, ctx.names, ctx.values, ctx.graph = function, names, values, None
