@@ -71,14 +71,16 @@ def test_fisher_of_what_moves(place, tmp_path, capsys):
 def test_select_among_cameras_and_times(place, tmp_path, capsys):
     """Choosing by a field's information from the command line: its parts, its score's name, the candidates' times."""
     scene, views = place
-    line = "select scene.ply --train known.json --candidates cameras.json --probes 2 -k 2 --quiet -o picks.json"
+    line = "select scene.ply --train known.json --candidates cameras.json --probes 2 -k 2 -o picks.json"
     assert cli.main([*line.split(), "--network", "trace"]) == 0, capsys.readouterr().err
+    assert "deformation: z" in capsys.readouterr().out
     report = json.loads((tmp_path / "picks.json").read_text())
     assert report["network"] == {"score": "trace", "probes": 2}
     assert report["combine"] == "zscore"
     assert {"geometry.means", "deformation.grid", "deformation.mlp"} <= set(report["picks"][0]["parts"])
     assert [row["time"] for row in report["candidates"]] == [view.time for view in views[2:]]
     assert cli.main([*line.split(), "--blocks", "deformation"]) == 0, capsys.readouterr().err
+    assert "grid %" in capsys.readouterr().out
     report = json.loads((tmp_path / "picks.json").read_text())
     assert list(report["picks"][0]["parts"]) == ["grid", "mlp"]
     assert report["picks"][0]["camera"]["time"] in (0.0, 0.5, 1.0)

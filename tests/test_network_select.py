@@ -9,6 +9,7 @@ from scenes_random import camera, gaussians
 from test_network_information import swarm
 
 from drgs import fisher
+from drgs.fitting.config import ActiveConfig
 from drgs.gain import Prior, information_gain
 from drgs.information.combine import asked_of
 from drgs.information.semantics import SemanticMetric
@@ -192,15 +193,21 @@ def test_rows_of_the_image_are_those_of_the_other_blocks():
             {"blocks": ("geometry", "deformation"), "network": "trace", "combine": "sum"},
             "combine must be zscore with network trace beside other blocks, got sum",
         ),
+        (
+            {"network": "trace", "combine": "sum"},
+            "combine must be zscore with network trace beside other blocks, got sum",
+        ),
         ({"network": "hessian"}, "network must be one of ratio, trace, paper, got 'hessian'"),
         ({"combine": "rank"}, "combine must be one of sum, zscore, got 'rank'"),
         ({"probes": 0}, "probes must be a whole number >= 1, got 0"),
     ],
 )
 def test_refusals(fields, message):
-    """In one line."""
+    """In one line, and of a fit before its first step."""
     with pytest.raises(ValueError, match=f"^select: .*{message}"):
         Scoring(**fields)
+    with pytest.raises(ValueError, match=rf"^active: .*{message.split(', got')[0].replace('>= 1', '.*')}"):
+        ActiveConfig(**fields)
 
 
 def test_still_scenes_have_no_such_block(views):

@@ -101,14 +101,18 @@ def run(args: Select) -> None:
 def print_picks(report: dict, selection: Selection, output: Path) -> None:
     """The picks with each group's part of the score, and what to know about them, on stdout."""
     title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
-    groups, rows = list(selection.picks[0].parts), []
+    compared, rows = selection.combine == "zscore", []
+    groups = selection.blocks if compared else list(selection.picks[0].parts)
     for pick in selection.picks:
         margin = "-" if pick.margin is None else f"{pick.margin:.3g}"
-        parts = (f"{100 * pick.parts[name] / pick.score:.1f}" if pick.score else "-" for name in groups)
+        if compared:
+            parts = [f"{sum(x for name, x in pick.parts.items() if name.startswith(f'{b}.')):.2f}" for b in groups]
+        else:
+            parts = [f"{100 * pick.parts[name] / pick.score:.1f}" if pick.score else "-" for name in groups]
         rows.append((pick.name, f"{pick.score:.4g}", margin, *parts))
     tables.show(
         f"{title}: {len(selection.picks)} of {len(report['candidates'])} views, {report['source']}",
-        ("view", "score", "margin", *(f"{_SHORT.get(name, name)} %" for name in groups)),
+        ("view", "score", "margin", *(f"{name}: z" if compared else f"{_SHORT.get(name, name)} %" for name in groups)),
         rows,
     )
     for note in selection.notes:

@@ -7,7 +7,16 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from drgs.guards.arguments import check_fields, must_be
-from drgs.information.choices import Block, Combine, Criterion, Method, NetworkScore, Policy, checked_blocks
+from drgs.information.choices import (
+    Block,
+    Combine,
+    Criterion,
+    Method,
+    NetworkScore,
+    Policy,
+    check_combined,
+    checked_blocks,
+)
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -276,6 +285,7 @@ class ActiveConfig:
         count = (1, 10**9)
         ranges = dict.fromkeys(("initial", "add", "every", "info_pixels", "probes"), count)
         check_fields("active", self, ranges)
+        check_combined("active", self.blocks, self.criterion, self.network, self.combine)
         Prior(value=self.prior)
 
     def scoring(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:

@@ -21,6 +21,7 @@ __all__ = [
     "NetworkScore",
     "NetworkEstimate",
     "Policy",
+    "check_combined",
     "checked_blocks",
 ]
 
@@ -81,3 +82,18 @@ Combine = Literal["sum", "zscore"]
 """How the scores of several blocks become one."""
 
 COMBINES: tuple[Combine, ...] = typing.get_args(Combine)
+
+
+def check_combined(where: str, blocks: Sequence[str] | None, criterion: str, network: str, combine: str | None) -> None:
+    """Raise ValueError if these blocks (None: all there are) cannot be scored so, or not together."""
+    if "deformation" in (blocks or ()) and criterion == "block_logdet":
+        raise ValueError(
+            f"{where}: blocks must be geometry or semantic with criterion block_logdet, got deformation; a network has "
+            "no blocks of single Gaussians, use eig"
+        )
+    beside = blocks is None or ("deformation" in blocks and len(blocks) > 1)
+    if network != NETWORK_SCORES[0] and combine == "sum" and beside:
+        raise ValueError(
+            f"{where}: combine must be zscore with network {network} beside other blocks, got sum; a trace has another "
+            "unit than their ratios"
+        )

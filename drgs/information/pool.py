@@ -12,7 +12,15 @@ from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
 from drgs.information.cache import Cache
-from drgs.information.choices import COMBINES, NETWORK_SCORES, Block, Combine, NetworkScore, checked_blocks
+from drgs.information.choices import (
+    COMBINES,
+    NETWORK_SCORES,
+    Block,
+    Combine,
+    NetworkScore,
+    check_combined,
+    checked_blocks,
+)
 from drgs.information.network_groups import network_groups
 from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
@@ -74,12 +82,7 @@ class Scoring:
             object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
         if self.blocks is not None:
             object.__setattr__(self, "blocks", checked_blocks("select", self.blocks, self.method))
-            if self.criterion == "block_logdet" and "deformation" in self.blocks:
-                raise ValueError(
-                    "select: blocks must be geometry or semantic with criterion block_logdet, got deformation; a "
-                    "network has no blocks of single Gaussians, use eig"
-                )
-            self.combined_of(self.blocks)
+        check_combined("select", self.blocks, self.criterion, self.network, self.combine)
         if not (isinstance(self.probes, int) and self.probes >= 1):
             raise ValueError(f"select: probes must be a whole number >= 1, got {self.probes!r}; try 16")
         if self.semantics is not None:
@@ -115,21 +118,10 @@ class Scoring:
                 )
         return self.blocks
 
-    def combined_of(self, blocks: tuple[Block, ...], where: str = "select") -> Combine:
-        """How the scores of these blocks become one.
-
-        Raises:
-            ValueError: If they cannot be added up as they are asked to be.
-        """
+    def combined_of(self, blocks: tuple[Block, ...]) -> Combine:
+        """How the scores of these blocks become one."""
         traced = "deformation" in blocks and self.network != "ratio"
-        if len(blocks) < 2:
-            return "sum"
-        if traced and self.combine == "sum":
-            raise ValueError(
-                f"{where}: combine must be zscore with network {self.network} beside other blocks, got sum; a trace "
-                "has another unit than their ratios"
-            )
-        return self.combine or ("zscore" if traced else "sum")
+        return "sum" if len(blocks) < 2 else self.combine or ("zscore" if traced else "sum")
 
 
 @dataclasses.dataclass(frozen=True)
