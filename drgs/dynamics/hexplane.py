@@ -17,7 +17,7 @@ import torch
 __all__ = ["SPACE_PAIRS", "TIME_AXES", "HexPlane", "features"]
 
 SPACE_PAIRS = ((0, 1), (0, 2), (1, 2))  # columns and rows of the planes of space
-TIME_AXES = (0, 1, 2)  # columns of the planes whose rows are times
+TIME_AXES = 3  # planes with a time, a column along each axis
 
 
 class HexPlane(torch.nn.ParameterList):
@@ -57,7 +57,7 @@ class HexPlane(torch.nn.ParameterList):
         planes = []
         for r in resolutions:
             planes += [torch.empty(r, r, channels).uniform_(0.5, 1.5) for _ in SPACE_PAIRS]
-            planes += [torch.ones(time_resolution, r, channels) for _ in TIME_AXES]
+            planes += [torch.ones(time_resolution, r, channels) for _ in range(TIME_AXES)]
         super().__init__(planes)
         self.register_buffer("bounds", bounds.to(torch.float64))
         self.register_buffer("span", span.to(torch.float64))
@@ -90,12 +90,11 @@ def features(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.T
     for space, times in levels(planes):
         cells = [_between(places[:, axis], space[0].shape[0], space[0].dtype) for axis in range(3)]
         below, part = _between(time, times[0].shape[0], times[0].dtype)
-        found = [_bilinear(plane, cells[a], cells[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
         both = torch.stack([1 - part, part])[:, None, None]
-        for plane, axis in zip(times, TIME_AXES, strict=True):
+        found = [_bilinear(plane, cells[a], cells[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
+        for plane, (first, s) in zip(times, cells, strict=True):
             line = (plane.narrow(0, int(below), 2) * both).sum(0)
-            index, s = cells[axis]
-            found.append(_Gather.apply(line, _ends(index, 1), torch.stack([1 - s, s], 1)))
+            found.append(_Lookup.apply(line, _ends(first, 1), s[:, None]))
         product = found[0]
         for factor in found[1:]:
             product = product * factor
@@ -121,16 +120,17 @@ def _bilinear(plane: torch.Tensor, column: tuple, row: tuple) -> torch.Tensor:
     """(N, C) of cells and parts along the second and the first axis of a plane."""
     (a, s), (b, t) = column, row
     corners = _ends(_ends(b * plane.shape[1] + a, 1), plane.shape[1]).flatten(1)
-    along, across = torch.stack([1 - s, s], 1), torch.stack([1 - t, t], 1)
-    return _Gather.apply(plane.reshape(-1, plane.shape[2]), corners, (along[:, :, None] * across[:, None]).flatten(1))
+    return _Lookup.apply(plane.reshape(-1, plane.shape[2]), corners, torch.stack([s, t], 1))
 
 
-class _Gather(torch.autograd.Function):
-    """(R, C) rows, (N, J) indices and weights -> (N, C) weighted sums of rows, without the N J rows between."""
+class _Lookup(torch.autograd.Function):
+    """Linear in each of A axes, without the rows of all corners between: (R, C) rows, (N, 2^A) which of them are the
+    corners of a cell, and (N, A) parts of the way through the cell along each axis -> (N, C).
+    """
 
     @staticmethod
-    def forward(rows: torch.Tensor, index: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.embedding_bag(index, rows, mode="sum", per_sample_weights=weights)
+    def forward(rows: torch.Tensor, corners: torch.Tensor, parts: torch.Tensor) -> torch.Tensor:
+        return _bag(rows, corners, _weights(parts))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
@@ -139,16 +139,35 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, slope: torch.Tensor) -> tuple:  # type: ignore[override]
-        rows, index, weights = ctx.saved_tensors
-        by_rows = by_weights = None
+        rows, corners, parts = ctx.saved_tensors
+        by_rows = by_parts = None
         if ctx.needs_input_grad[0]:
-            each = slope[:, None] * weights[..., None]
-            by_rows = torch.zeros_like(rows).index_put_((index.flatten(),), each.flatten(0, 1), accumulate=True)
+            each = slope[:, None] * _weights(parts)[..., None]
+            by_rows = torch.zeros_like(rows).index_put_((corners.flatten(),), each.flatten(0, 1), accumulate=True)
         if ctx.needs_input_grad[2]:
-            by_weights = (torch.nn.functional.embedding(index, rows) @ slope[..., None])[..., 0]
-        return by_rows, None, by_weights
+            moved = [_bag(rows, corners, _weights(parts, axis)) for axis in range(parts.shape[1])]
+            by_parts = torch.stack([(slope * x).sum(1) for x in moved], 1)
+        return by_rows, None, by_parts
 
     @staticmethod
-    def jvp(ctx: Any, by_rows: torch.Tensor, _: None, by_weights: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
-        rows, index, weights = ctx.saved_tensors
-        return _Gather.apply(by_rows, index, weights) + _Gather.apply(rows, index, by_weights)
+    def jvp(ctx: Any, by_rows: torch.Tensor, _: None, by_parts: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        rows, corners, parts = ctx.saved_tensors
+        along = torch.stack([_weights(parts, axis) * by_parts[:, axis, None] for axis in range(parts.shape[1])]).sum(0)
+        # Not by `_bag`, which knows no derivative of its own by weights that other modes look at.
+        pick = torch.nn.functional.embedding
+        return (_weights(parts)[:, None] @ pick(corners, by_rows) + along[:, None] @ pick(corners, rows))[:, 0]
+
+
+def _bag(rows: torch.Tensor, corners: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.embedding_bag(corners, rows, mode="sum", per_sample_weights=weights)
+
+
+def _weights(parts: torch.Tensor, derivative: int | None = None) -> torch.Tensor:
+    """(N, 2^A) of the corners, or their derivative by one of the parts; as `_ends` orders them."""
+    made = torch.ones_like(parts[:, :1])
+    for axis in range(parts.shape[1]):
+        part = parts[:, axis]
+        one = torch.ones_like(part)
+        ends = torch.stack([-one, one] if axis == derivative else [1 - part, part], 1)
+        made = (made[:, :, None] * ends[:, None]).flatten(1)
+    return made
