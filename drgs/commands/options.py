@@ -357,12 +357,10 @@ class Demo(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene(Common):
-    """Make a data set by path tracing: a kitchen in motion or a furnished room, both with labels and teacher features,
-    or a still life."""
+    """Make a data set by path tracing: a room or a kitchen in motion, with labels and a teacher, or a still life."""
 
     name: Positional[Literal["room", "kitchen", "still_life"]]
-    """What to make: room and kitchen have classes, sparse points and features of a simulated teacher; the kitchen is
-    filmed by several cameras."""
+    """What to make; room and kitchen have classes, points and a simulated teacher, the kitchen is filmed in motion."""
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str | None = None
