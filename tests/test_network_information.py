@@ -138,6 +138,18 @@ def test_probes_are_what_they_are_said_to_be(seen, estimate, mode):
         close(found[group], want[group])
 
 
+def test_only_what_moves_tells_about_the_field(seen):
+    """With a gate for each Gaussian, in between for some: that of the dense Jacobian, where half are still."""
+    scene, cam, _ = seen
+    gated = swarm(scene.gaussians, motion=torch.tensor([4.0, -4.0, 0.3, -0.3] * 2))
+    J = dense(gated, cam)
+    u = signs(torch.Generator().manual_seed(0), cam.width * cam.height, 3)
+    found = fisher.network(gated, cam, EXACT, probes=1)
+    for group, x in J.items():
+        close(found[group], torch.einsum("pc,pck->k", u, x).square())
+        assert float(x.abs().max()) > 1e-3
+
+
 def spread(rows):
     """Variance of |rows z|^2 over random signs z, rows (m, n): 2 (|A|^2 - |diag A|^2) of A = rows^T rows."""
     gram = rows @ rows.T if len(rows) < rows.shape[1] else rows.T @ rows
