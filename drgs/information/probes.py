@@ -107,7 +107,7 @@ class Pullback:
         # The graph is used again by the next cotangent.
         dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
         # Copies: what Dr.Jit and torch share is reset for the next cotangent.
-        slopes = {name: dr.grad(self.inputs[name]).torch().double().cpu().clone() for name in self.names}
+        slopes = {name: dr.grad(self.inputs[name]).torch().to("cpu", torch.float64, copy=True) for name in self.names}
         for name in self.names:
             dr.set_grad(self.inputs[name], 0)
         return slopes
