@@ -136,9 +136,9 @@ def report(result: dict) -> str:
     still = result["steps"]["still"]
     lines = [
         f"Made by `python benchmarks/dynamic.py` on {result['machine']}, {result['date']}, commit {result['commit']},",
-        f"on a loaded machine: CPU time, {result['gaussians']:,} Gaussians ({result['scene']}), "
-        f"{result['size'][0]}x{result['size'][1]}, {TIMES} times, field `neu3d`, medians of {result['turns']} turns of "
-        f"{STEPS} steps.",
+        f"while {result['load']:.0f} programs wanted its {result['cores']} cores: CPU time, {result['gaussians']:,} "
+        f"Gaussians ({result['scene']}), {result['size'][0]}x{result['size'][1]}, {TIMES} times, field `neu3d`,",
+        f"medians of {result['turns']} turns of {STEPS} steps.",
         "",
         "| Gaussians that move | a step | share of the deformation |",
         "|---|---|---|",
@@ -180,6 +180,8 @@ def main() -> None:
     made = {"still": trainer(g, shown, None)} | {name: trainer(g, shown, gates) for name, gates in shares.items()}
     result = {
         **ran(),
+        "load": os.getloadavg()[0],
+        "cores": os.cpu_count(),
         "scene": "a fitted run" if args.run else "a random cube",
         "gaussians": len(g),
         "size": size,
