@@ -125,7 +125,8 @@ def feature_map(labels, points, names, size, seed, view, confusions=ROOM):
     shares = np.zeros((height, width, count), np.float32)
     y, x = np.nonzero(labels)
     shares[y, x, labels[y, x].astype(int) - 1] = 1
-    shares = cv2.resize(shares, (w, h), interpolation=cv2.INTER_AREA).reshape(h, w, count)
+    # One class at a time: by a factor that is not whole OpenCV averages at most four channels.
+    shares = np.stack([cv2.resize(shares[..., k], (w, h), interpolation=cv2.INTER_AREA) for k in range(count)], -1)
     y, x = np.mgrid[:h, :w].astype(np.float32)
     moved = np.clip(0.7 * _smooth(rng, h, w, 1.5, 2), -2, 2)
     at_x, at_y = (

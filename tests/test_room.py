@@ -188,6 +188,13 @@ def test_teacher_errs_as_stated(built):
     assert right[edge].mean() < right[~edge].mean() - 0.1
 
 
+def test_maps_of_any_size(rng):
+    """A map's size need not divide the image's."""
+    labels = rng.integers(0, len(room.CLASSES) + 1, (48, 64))
+    feature = teacher.feature_map(labels, None, room.CLASSES, (60, 45), 0, 0)
+    assert feature.shape == (512, 45, 60)
+
+
 def test_seeds(built, made, tmp_path, monkeypatch):
     """The same seed gives the same parts and files to the bit; another gives another room."""
     first, again, other = (list(room.parts(seed)) for seed in (0, 0, 1))
