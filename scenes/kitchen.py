@@ -314,8 +314,8 @@ def generate(
     """Makes the data set, unless `out_dir` already holds it; an interrupted call is continued.
 
     Noise of a pixel at the defaults (standard deviation of the sRGB value in [0, 1], five views, two seeds of the light
-    paths): 0.019 RMS, 34.6 dB. Time at the defaults: 1.1 seconds of processor a frame, of 600. 1.7 GB, nearly all of it
-    the teacher's features.
+    paths): 0.019 RMS, 34.6 dB. Time at the defaults: 0.95 seconds of processor a frame, of 600. 1.7 GB, nearly all of
+    it the teacher's features.
 
     Args:
         out_dir: Folder to make. Everything appears in it when it is complete; a kill loses the frame that is being
