@@ -314,7 +314,7 @@ def generate(
     """Makes the data set, unless `out_dir` already holds it; an interrupted call is continued.
 
     Noise of a pixel at the defaults (standard deviation of the sRGB value in [0, 1], five views, two seeds of the light
-    paths): 0.019 RMS, 34.6 dB. Time at the defaults: 0.95 seconds of processor a frame, of 600. 1.7 GB, nearly all of
+    paths): 0.019 RMS, 34.6 dB. Time at the defaults: 1.0 seconds of processor a frame, of 600. 1.7 GB, nearly all of
     it the teacher's features.
 
     Args:
