@@ -191,7 +191,7 @@ class FitConfig:
     field_preset: FieldPreset = "neu3d"
     grid_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     field_rate: tuple[float, float] = (1.6e-4, 1.6e-5)
-    motion_rate: float = 60.0
+    motion_rate: float = 120.0
     motion_weight: float = 0.03
     smooth_weight: float = 1e-3
     plane_weight: float = 2e-4

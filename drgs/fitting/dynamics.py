@@ -2,9 +2,9 @@
 
 Which Gaussians move is learned. Each has a gate, `motion` in the rows. While it is open the Gaussian moves as the
 field says, times a factor between 0 and 1; the loss has `motion_weight` times the mean gate in it, so that a gate stays
-open only if photographs need what it lets through. Once it is closed nothing is computed for the Gaussian. In one step
-out of ten all closed gates are ajar: those whose photographs would be shown better by a little of the field's motion
-open again, and the field hears of places where nothing moved.
+open only if photographs need what it lets through. Once it is closed nothing is computed for the Gaussian. In the first
+fifth of the stage gates stay open, as the field must learn what it can do; at three fifths all open again for a
+twentieth, so that what was closed before a field or a photograph could tell moves after all.
 
 A gate is optimized in units of what its penalty weighs (Adam's epsilon is the penalty's own gradient): a Gaussian whose
 motion the photographs hardly tell about is not moved by the noise of that, as it would be where only signs count.
@@ -46,10 +46,10 @@ _STATIC_BUDGET = 0.5  # of the Gaussians there may be
 _WARM_UP = 0.2  # of the dynamic stage, in which all gates stay open: the field must have learned something
 _OPEN = 2.0  # logit of a gate at the start, which lets 0.76 of a motion through
 _CLOSED = -1.0  # logit below which a gate has no penalty: it must be able to come back
-_PROBE_EVERY = 10  # steps
+_AGAIN = 0.6  # of the dynamic stage: when all gates open again, those of what stood still as at the start
+_LOOK = 0.05  # of the dynamic stage, in which they then stay open
 _NOISE = 0.3  # gradients of a gate below this part of its penalty's weight are taken for what they are, not for signs
-_FASTEST = 0.2  # change of a logit in a step
-_AJAR = 0.2  # logit of a closed gate in such a step: it lets 0.1 of a motion through
+_FASTEST = 0.5  # change of a logit in a step
 _OUTSIDE = 0.005  # part of the Gaussians that may lie below the bounds of the field along an axis, and above
 _MARGIN = 0.1  # of the field's size
 _REPEATS = 5  # of a measured time
@@ -64,13 +64,15 @@ class Motion:
         times: All that views of the data set have, sorted; at least two.
     Attributes:
         field: None in the static stage.
+        step: The one that is fitted.
     """
 
     def __init__(self, config: FitConfig, times: Sequence[float]) -> None:
         self.config, self.times = config, tuple(times)
         self.first_step = round(config.static_share * config.max_steps)
         self.field: DeformationField | None = None
-        self._step = 0
+        self.step = 0
+        self._again = self.first_step + round(_AGAIN * (config.max_steps - self.first_step))
 
     def has_begun(self, rows: GaussianRows) -> bool:
         """Whether the dynamic stage has."""
@@ -117,19 +119,20 @@ class Motion:
         return {"motion": torch.full((count,), _OPEN)} if self.has_begun(rows) else {}
 
     def fitted(self, rows: GaussianRows, step: int) -> DynamicGaussians:
-        """What a step renders; every tenth, closed gates are ajar, with the gradient of an open one."""
+        """What a step renders; at the step where all gates open again, they do."""
         assert self.field is not None
-        self._step, gates = step, rows.tensors["motion"]
+        self.step, gates = step, rows.tensors["motion"]
         group = next(group for group in rows.optimizer.param_groups if group["name"] == "motion")
         group["eps"] = max(_NOISE * self.config.motion_weight / max(len(rows), 1), 1e-15)
-        if (step - self.first_step) % _PROBE_EVERY == 0:
-            fixed = gates.detach()  # the difference is added as a constant
-            gates = gates + (fixed.clamp(min=_AJAR) - fixed)
+        if self.field is not None and step == self._again:
+            with torch.no_grad():  # leaves are changed in place
+                rows.overwrite(torch.arange(len(rows)), {"motion": gates.clamp(min=_OPEN)})
         return DynamicGaussians(rows.gaussians(), self.field, gates)
 
-    def is_warm(self) -> bool:
-        """Whether gates have their penalty in the current step."""
-        return self._step - self.first_step >= _WARM_UP * (self.config.max_steps - self.first_step)
+    def is_held_open(self, step: int) -> bool:
+        """Whether gates stay as they are in a step, without a penalty, for the field to learn what it can do."""
+        length = self.config.max_steps - self.first_step
+        return step < self.first_step + _WARM_UP * length or self._again <= step < self._again + _LOOK * length
 
     def header(self) -> dict:
         """What a checkpoint's header says beside the rest."""
@@ -190,11 +193,13 @@ class Motion:
             terms.append(Rest(self, rows, config.motion_weight))
         steps = max(config.max_steps - self.first_step, 1)
         gates = min(config.motion_rate / steps, _FASTEST)
-        warm = begin + (1 - begin) * _WARM_UP
         return dataclasses.replace(
             parts,
             terms=terms,
-            rates={**parts.rates, "motion": lambda part: gates if part >= warm else 0.0},
+            rates={
+                **parts.rates,
+                "motion": lambda part: 0.0 if self.is_held_open(round(part * config.max_steps)) else gates,
+            },
             networks=[*parts.networks, *networks],
             scene=lambda rows: DynamicGaussians(rows.gaussians(), field, rows.tensors["motion"]),
         )
@@ -231,8 +236,8 @@ class Rest:
     outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
-        """See `LossTerm`; None while the field is new."""
-        if not self.motion.is_warm():
+        """See `LossTerm`; None while gates stay open."""
+        if self.motion.is_held_open(self.motion.step):
             return None
         return self.weight * self.rows.tensors["motion"].clamp(min=_CLOSED).sigmoid().mean()
 
