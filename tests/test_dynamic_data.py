@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import struct
 
 import cv2
 import numpy as np
@@ -98,7 +99,8 @@ def test_frames_are_spread_over_the_whole_video(neu3d, times, numbers):
     data = load(neu3d, times=times)
     assert data.frames == numbers
     assert [view.frame.index for view in data.views[: len(numbers)]] == list(numbers)
-    assert data.times == tuple(k / max(len(numbers) - 1, 1) for k in range(len(numbers)))
+    # Frame 2 of 0 ... 5 is at 2/5 of the video, not at 1/3, though it is the second of four.
+    assert data.times == tuple(number / 5 for number in numbers)
     assert data.is_dynamic == (times > 1)
     assert data.split_rule() == "camera cam00 held out at all times"
 
@@ -306,6 +308,13 @@ def test_transforms_of_synchronous_cameras(tmp_path):
     assert data.camera_names == ("cam00", "cam01", "cam02")
     assert data.split_rule() == "camera cam00 held out at all times"
     assert {view.camera_name for view in load(tmp_path, test_cameras=("cam02",)).split()[1]} == {"cam02"}
+    for k in range(3):
+        for i in range(2):
+            label = tmp_path / "semantic_class" / f"cam{k:02d}" / f"semantic_class_{i:04d}.png"
+            label.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(label), np.full((HEIGHT, WIDTH), 1 + k + 3 * i, np.uint8))
+    for view in load(tmp_path).views:
+        assert int(view.labels()[0, 0]) == 1 + int(view.camera_name[3:]) + 3 * int(view.name[-1])
     still = [{key: value for key, value in frame.items() if key != "time"} for frame in frames]
     (tmp_path / "transforms.json").write_text(json.dumps(top | {"frames": still}))
     assert load(tmp_path).camera_names == ()
@@ -387,6 +396,37 @@ def test_folders_of_frames(tmp_path, place, name):
     assert load(tmp_path, points=False, times=3).frames == (0, 2, 5)
 
 
+def test_cameras_that_move(tmp_path):
+    """Where a model has other poses for later frames of a camera, the first one is not taken for all of them."""
+    write_frames(tmp_path, count=2, numbers=(0, 1))
+    names = [f"cam{k:02d}/frame_{i:05d}.png" for k in range(2) for i in range(2)]
+    views = cameras(2)
+    write_model(tmp_path / "sparse", [views[0], views[0], views[1], views[1]], names)
+    assert len(load(tmp_path).views) == 4
+    shutil.rmtree(tmp_path / "sparse")
+    write_model(tmp_path / "sparse", cameras(), names)
+    told = "cam00 has other poses in cam00/frame_00000.png and cam00/frame_00001.png; move the folders into images/"
+    assert told in refused(tmp_path)
+    for name in ("cam00", "cam01"):
+        (tmp_path / "images").mkdir(exist_ok=True)
+        (tmp_path / name).rename(tmp_path / "images" / name)
+    for view, camera in zip(load(tmp_path).views, cameras(), strict=True):
+        np.testing.assert_allclose(view.camera.w2c, camera.w2c, atol=1e-12)
+
+
+def test_numbers_of_frames_may_be_times_of_a_clock(tmp_path):
+    """Nanoseconds are told apart by all of their digits; names without a number at their end are refused."""
+    views, stamps = cameras(2), (1_699_999_999_900_000_000, 1_700_000_000_000_000_000, 1_700_000_000_400_000_000)
+    write_frames(tmp_path, count=2, numbers=stamps)
+    write_model(tmp_path / "sparse", views, ["cam00.png", "cam01.png"])
+    data = load(tmp_path)
+    assert data.frames == stamps
+    np.testing.assert_allclose(data.times, (0, 0.2, 1))
+    for file in sorted(tmp_path.glob("cam*/*.png")):
+        file.rename(file.with_stem(f"{file.stem}_left"))
+    assert "cam00: must hold frames whose names end in their number" in refused(tmp_path)
+
+
 def write_train_meta(folder, views, times=FRAMES, name="train_meta.json", first=0, **changed):
     """Dynamic 3D Gaussians' layout; `first` is the number of the first camera."""
     rows = [[f"{first + k}/{i:06d}.png" for k in range(len(views))] for i in range(times)]
@@ -418,7 +458,7 @@ def test_train_meta(tmp_path):
     data = load(tmp_path, times=3)
     assert data.format == "train_meta"
     assert [view.name for view in data.views] == [f"{k}/{i:04d}" for k in range(3) for i in (0, 2, 5)]
-    assert data.times == (0.0, 0.5, 1.0)
+    assert data.times == (0.0, 0.4, 1.0)
     assert data.split_rule() == "camera 0 held out at all times"
     assert decoded(data.views[4].image()) == (1, 2)
     np.testing.assert_allclose(data.views[4].camera.w2c, views[1].w2c, atol=1e-12)
@@ -593,6 +633,33 @@ def test_poses_for_another_number_of_cameras(copied, caplog):
     assert "camera.avi: must be a video" in refused(copied)
 
 
+def test_names_of_other_systems(copied, tmp_path):
+    """Letters of either case, spaces, accents and links; a name that no file can have is that of a missing one."""
+    for k in range(4):
+        (copied / f"cam{k:02d}.mp4").rename(copied / f"Cam {k} \u00e9.MP4")
+    (copied / "Cam 1 \u00e9.MP4").rename(tmp_path / "x.mp4")
+    (copied / "Cam 1 \u00e9.MP4").symlink_to(tmp_path / "x.mp4")
+    data = load(copied, test_cameras=("Cam 2 \u00e9",))
+    assert data.split_rule() == "camera Cam 2 \u00e9 held out at all times"
+    assert decoded(data.views[FRAMES + 1].image()) == (1, 1)
+    names = [["a" * 1000 + ".png", "1/000000.png", "2/000000.png", "3/000000.png"]]
+    write_train_meta(tmp_path, cameras(), times=1, fn=names)
+    assert [view.name for view in load(tmp_path).absent] == ["0/0000"]
+
+
+def test_a_video_that_is_turned(copied):
+    """Phones state a quarter turn in the header: the size is that of the frames as they are shown."""
+    path = copied / "cam02.mp4"
+    data = bytearray(path.read_bytes())
+    start = data.index(b"tkhd") + 4 + 40
+    assert data[start : start + 4] == (1 << 16).to_bytes(4, "big")
+    data[start : start + 20] = struct.pack(">5i", 0, 1 << 16, 0, -(1 << 16), 0)
+    path.write_bytes(data)
+    assert (read_video(path).width, read_video(path).height) == (HEIGHT, WIDTH)
+    assert VideoFrame(path, 1).read().shape == (WIDTH, HEIGHT, 3)
+    assert "must have the shape of its camera (32x24), got 24x32" in refused(copied)
+
+
 def test_videos_of_different_length(copied, caplog):
     """What all of them show is used, and told; `strict` refuses."""
     write_video(copied / "cam02.mp4", [coded(i, 2) for i in range(4)])
@@ -745,6 +812,7 @@ def test_frames_that_are_missing(tmp_path, caplog):
         ({"w": 10**9}, "camera 0"),
         ({"h": -4}, "camera 0"),
         ({"fn": 3}, "fn must be a list"),
+        ({key: [[], []] for key in ("k", "w2c", "fn", "cam_id")}, "must list at least one camera"),
     ],
 )
 def test_lists_that_cannot_be(tmp_path, changed, told):

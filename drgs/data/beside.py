@@ -17,7 +17,7 @@ _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _IMAGE_FOLDERS = ("images", "rgb")
 _NEAR = 3  # folders above an image among which one may be named so
 _NUMBERED = re.compile(r"rgb_(\d+)")
-_FRAME = re.compile(r"(?P<prefix>.*?)(?P<number>\d{1,9})")
+_FRAME = re.compile(r"(?P<prefix>.*?)(?P<number>\d{1,20})")
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,8 @@ def matched(views: list[View], folder: Path, files: dict[str, Path]) -> list[tup
     for view in views:
         if view.camera_name:
             path = files.get(str(PurePosixPath(view.camera_name) / view.stem))
-            path = path or frames.get((view.camera_name, int(PurePosixPath(view.name).name)))
+            if path is None and (number := _FRAME.fullmatch(view.name)):
+                path = frames.get((view.camera_name, int(number["number"])))
             if path is not None:
                 found.append((view, path))
             continue

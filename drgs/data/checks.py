@@ -27,6 +27,7 @@ __all__ = [
     "IMAGE_SUFFIXES",
     "image_size",
     "inverse_pose",
+    "is_file",
     "list_images",
     "native_stderr",
     "read_image",
@@ -54,6 +55,14 @@ _log = logging.getLogger(__name__)
 def list_images(folder: Path) -> list[Path]:
     """Image files directly in a folder, by name; hidden files are left out."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; there is none of a name that no file can have, as one of 1,000 letters."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def read_text(path: Path, what: str, largest: int) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,7 +23,7 @@ from drgs.data.views import Dataset
 
 __all__ = ["add_model_points", "find_camera_folders", "frame_folders", "frames_of", "load_cameras"]
 
-_NUMBER = re.compile(r"(\d{1,9})$")
+_NUMBER = re.compile(r"(?<!\d)(\d{1,20})$")  # at the end of a name
 _MODEL = "sparse_"  # where 4DGaussians has it
 _SAME_POSE = 1e-2  # of the cameras' extent, and between the axes
 
@@ -62,11 +62,14 @@ def load_cameras(
 
     Raises:
         FileNotFoundError: too few of the frames are there, or with `strict` a camera without a pose.
-        ValueError: a damaged model, none of whose images is named by a camera, or two frames of one number.
+        ValueError: a damaged model, none of whose images is named by a camera, cameras that move, or two frames of one
+            number.
     """
     model, folders = _model(path), find_camera_folders(path)
     reconstruction = read_model(model, points)
-    posed = _posed(reconstruction, model, [folder.name for folder in folders])
+    images = _images_of(reconstruction, model, [folder.name for folder in folders])
+    posed = {name: found[0] for name, found in images.items()}
+    _check_still(model, reconstruction, images)
     if not posed:
         raise ValueError(
             f"{model}: must have images named by their cameras, as {folders[0].name}.png or {folders[0].name}/..., has "
@@ -79,10 +82,10 @@ def load_cameras(
         _log.warning("%s; going on without them", told)
     numbers, frames = frames_of([folder for folder in folders if folder.name in posed], times)
     recordings = []
-    for name, images in frames.items():
+    for name, files in frames.items():
         image_id, camera = posed[name]
         where = f"{model}: image {reconstruction.images[image_id].name}"
-        recordings.append(Recording(name, dict.fromkeys(numbers, camera), images, where))
+        recordings.append(Recording(name, dict.fromkeys(numbers, camera), files, where))
     held_out = tuple(frames)[:1] if len(frames) > 1 else None
     dataset = Dataset(path, "cameras", [], test_cameras=held_out)
     synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
@@ -95,6 +98,10 @@ def frames_of(folders: Sequence[Path], times: int) -> tuple[tuple[int, ...], dic
     """The numbers of the frames that are used, and the file of each by the name of the camera; some may not exist."""
     found = {folder: _numbered(_frame_folder(folder)) for folder in folders}
     numbers = evenly_spaced(sorted(set().union(*found.values())), times)
+    if not numbers:
+        raise ValueError(
+            f"{folders[0]}: must hold frames whose names end in their number, as frame_00000.png, has none; rename them"
+        )
     # A frame that one camera lacks would be named there as it is in the camera that has it.
     names = {n: next(frames[n].name for frames in found.values() if n in frames) for n in numbers}
     return numbers, {
@@ -118,17 +125,39 @@ def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras:
     if model is None:
         return
     reconstruction = read_model(model)
-    posed = _posed(reconstruction, model, list(cameras))
+    posed = {name: found[0] for name, found in _images_of(reconstruction, model, list(cameras)).items()}
     if not posed:
         return
-    extent = np.ptp([camera.center for camera in cameras.values()], axis=0).max()
+    extent = _extent(cameras.values())
     for name, (_, camera) in posed.items():
-        moved = np.linalg.norm(camera.center - cameras[name].center)
-        turned = np.abs(camera.c2w[:3, :3] - cameras[name].c2w[:3, :3]).max()
-        if moved > _SAME_POSE * extent or turned > _SAME_POSE:
+        if not _same_pose(camera, cameras[name], extent):
             _log.warning("%s: has another pose of %s than the data set; its points are left out", model, name)
             return
     _add_points(dataset, reconstruction, model, posed, test_cameras)
+
+
+def _extent(cameras: Iterable[Camera]) -> float:
+    """Of the cameras' places, along the axis where it is largest."""
+    return float(np.ptp([camera.center for camera in cameras], axis=0).max())
+
+
+def _same_pose(a: Camera, b: Camera, extent: float) -> bool:
+    """Whether two cameras, of several that are spread over `extent`, have one pose, but for errors of its estimate."""
+    moved = np.linalg.norm(a.center - b.center)
+    return moved <= _SAME_POSE * extent and np.abs(a.c2w[:3, :3] - b.c2w[:3, :3]).max() <= _SAME_POSE
+
+
+def _check_still(model: Path, reconstruction: Any, images: dict[str, list[tuple[int, Camera]]]) -> None:
+    """Raise ValueError if a camera of which the model has several images has moved between them."""
+    extent = _extent([camera for found in images.values() for _, camera in found]) if images else 0.0
+    for name, ((first, camera), *others) in images.items():
+        for other, again in others:
+            if not _same_pose(camera, again, extent):
+                raise ValueError(
+                    f"{model}: cameras of folders of frames must stand still, {name} has other poses in "
+                    f"{reconstruction.images[first].name} and {reconstruction.images[other].name}; move the folders "
+                    "into images/ to have every image read with its own pose"
+                )
 
 
 def _add_points(
@@ -160,9 +189,9 @@ def _frame_folder(camera: Path) -> Path:
     return camera / "images" if (camera / "images").is_dir() else camera
 
 
-def _posed(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[str, tuple[int, Camera]]:
-    """Name of a camera -> the first image of it in the model, by name, and the camera of that."""
-    by_number, found = defaultdict(list), {}
+def _images_of(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[str, list[tuple[int, Camera]]]:
+    """Name of a camera -> the images of it in the model, by name, and the camera of each; without those of none."""
+    by_number, found = defaultdict(list), defaultdict(list)
     for name in names:
         if number := _NUMBER.search(name):
             by_number[int(number[1])].append(name)
@@ -173,8 +202,8 @@ def _posed(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[str, 
         if owner is None and (number := _NUMBER.search(parts[-1])):
             same = by_number[int(number[1])]
             owner = same[0] if len(same) == 1 and len(parts) == 1 else None
-        if owner and owner not in found:
-            found[owner] = image_id, model_camera(reconstruction, image, f"{model}: image {image.name}")
+        if owner:
+            found[owner].append((image_id, model_camera(reconstruction, image, f"{model}: image {image.name}")))
     return {name: found[name] for name in names if name in found}
 
 

@@ -28,7 +28,7 @@ def find_videos(path: Path) -> list[Path]:
     """The videos of a folder that has poses for them, by name; empty if it has none."""
     if not (path / POSES_BOUNDS).is_file():
         return []
-    return [video for video in list_videos(path) if video.stem.startswith("cam")]
+    return [video for video in list_videos(path) if video.stem.lower().startswith("cam")]
 
 
 def find_posed_frames(path: Path) -> list[Path]:

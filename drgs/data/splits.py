@@ -99,6 +99,6 @@ def _check_cameras(listed: Sequence[View], cameras: tuple[str, ...]) -> None:
             "use test_every"
         )
     if missing := [name for name in cameras if name not in known]:
-        raise ValueError(f"split: test_cameras must be among {', '.join(known)}, got {missing[0]}; correct it")
+        raise ValueError(f"split: test_cameras must be among {', '.join(known)}, got {missing[0]!r}; correct it")
     if set(known) <= set(cameras):
         raise ValueError(f"split: test_cameras must leave a camera to be fitted to, got all {len(known)}; name fewer")

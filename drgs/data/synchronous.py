@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size
-from drgs.data.videos import VideoFrame
+from drgs.data.checks import image_size, is_file
+from drgs.data.videos import VideoFile, VideoFrame
 from drgs.data.view_checks import fit_to_image, go_on_without, resized_to
 from drgs.data.views import Dataset, View
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from drgs.cameras import Camera
-    from drgs.data.videos import VideoFile
 
 __all__ = ["CAMERA_NAME", "Recording", "evenly_spaced", "synchronous"]
 
@@ -64,7 +63,8 @@ def synchronous(
 ) -> Dataset:
     """Fill a data set with a view for every camera and frame.
 
-    Frame k of K is at time k / (K - 1); one alone is at 0.
+    Its time goes by the number of the frame, from 0 at the first to 1 at the last of `numbers`: what moves evenly in
+    the video does so in the data set, though frames that are spread over it need not be equally far apart.
 
     Args:
         dataset: Without views.
@@ -77,10 +77,10 @@ def synchronous(
         FileNotFoundError: Too few of the images are there.
         ValueError: Images of another shape than their camera's, or of several sizes in one camera.
     """
-    digits = max(4, len(str(numbers[-1])))
+    digits, first, length = max(4, len(str(numbers[-1]))), numbers[0], max(numbers[-1] - numbers[0], 1)
     for recording in recordings:
         size = None
-        for index, number in enumerate(numbers):
+        for number in numbers:
             if number not in recording.cameras:
                 continue
             view = View(
@@ -95,8 +95,7 @@ def synchronous(
             (dataset.views if there else dataset.absent).append(view)
             if not there:
                 continue
-            time = index / (len(numbers) - 1) if len(numbers) > 1 else 0.0
-            view.camera = dataclasses.replace(view.camera, name=view.name, time=time)
+            view.camera = dataclasses.replace(view.camera, name=view.name, time=(number - first) / length)
             if view.image_path is None or lazy:
                 continue
             found = image_size(view.image_path)
@@ -113,13 +112,13 @@ def synchronous(
 def _found(view: View, recording: Recording, number: int, lazy: bool) -> bool:
     """Give a view its camera and its image, or say that there is none."""
     where = f"{recording.where}: camera {recording.name}"
-    if isinstance(recording.source, dict):
-        view.image_path = recording.source[number]
-        if not view.image_path.is_file():
-            return False
-        view.camera = fit_to_image(recording.cameras[number], view.image_path, where, lazy)
+    camera, source = recording.cameras[number], recording.source
+    if isinstance(source, VideoFile):
+        view.frame, view.is_checked = VideoFrame(source.path, number), True
+        view.camera = resized_to(camera, (source.width, source.height), source.path, where)
         return True
-    video = recording.source
-    view.frame, view.is_checked = VideoFrame(video.path, number), True
-    view.camera = resized_to(recording.cameras[number], (video.width, video.height), video.path, where)
+    view.image_path = source[number]
+    if not is_file(view.image_path):
+        return False
+    view.camera = fit_to_image(camera, view.image_path, where, lazy)
     return True

@@ -106,6 +106,8 @@ def _cameras(file: Path) -> tuple[dict[int, dict[int, _Shot]], int]:
             if name.startswith("/") or ".." in parts or not parts:
                 raise ValueError(f"{where}: fn must name an image inside {_IMAGES}, got {name!r}; rename it")
             found[camera][time] = _Shot(_camera(where, data, k, w2c), name)
+    if not found:
+        raise ValueError(f"{file}: must list at least one camera, lists none; {_ADVICE}")
     return dict(sorted(found.items())), count
 
 

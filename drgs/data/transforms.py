@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, repaired_pose
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, is_file, repaired_pose
 from drgs.data.points import read_point_ply
 from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
@@ -294,20 +294,13 @@ def _number(where: str, values: dict, key: str, default: float | None = None) ->
 def _image_file(folder: Path, name: str) -> Path | None:
     """The image that a file_path names; Blender leaves the suffix out."""
     path = folder / name
-    if _is_file(path):
+    if is_file(path):
         return path
     for suffix in (*IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
         candidate = path.with_name(path.name + suffix)
-        if _is_file(candidate):
+        if is_file(candidate):
             return candidate
     return None
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that no file can have
-        return False
 
 
 def _optional_file(folder: Path, where: str, frame: dict, key: str) -> Path | None:
@@ -315,7 +308,7 @@ def _optional_file(folder: Path, where: str, frame: dict, key: str) -> Path | No
         return None
     check_json(where, frame, {key: str}, "correct it, or remove the key")
     path = folder / frame[key]
-    if not _is_file(path):
+    if not is_file(path):
         raise FileNotFoundError(f"{where}: {key} names {path}, found no such file; restore it or remove the key")
     return path
 

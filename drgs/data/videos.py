@@ -109,8 +109,9 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
     import cv2
 
     is_mp4 = _check_kind(path)
-    raw = _opened(path, [cv2.CAP_PROP_FORMAT, -1])  # packets, undecoded
-    width, height = int(raw.get(cv2.CAP_PROP_FRAME_WIDTH)), int(raw.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    raw, shown = _opened(path, [cv2.CAP_PROP_FORMAT, -1]), _opened(path, [])  # packets, undecoded; frames
+    # Of frames as they are shown: phones turn them by a matrix in the header.
+    width, height = int(shown.get(cv2.CAP_PROP_FRAME_WIDTH)), int(shown.get(cv2.CAP_PROP_FRAME_HEIGHT))
     claimed = raw.get(cv2.CAP_PROP_FRAME_COUNT)
     if not 1 <= width * height <= _MAX_PIXELS:
         raise ValueError(f"{path}: a video must have 1 to 2^31 pixels, its header says {width}x{height}; {_COPY}")
@@ -126,7 +127,7 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
             f"{path}: must hold the {claimed:.0f} frames that its header claims, holds {len(stamps)}; {_COPY}"
         )
     stamps.sort()  # packets come in the order of decoding
-    if not _is_ascending(stamps) or not _ends_agree(path, stamps):
+    if not _is_ascending(stamps) or not _ends_agree(shown, stamps):
         stamps = _decoded(path, len(stamps))
     if not stamps:
         raise ValueError(f"{path}: must hold at least one frame, none can be read; {_COPY}")
@@ -137,11 +138,10 @@ def _is_ascending(stamps: list[float]) -> bool:
     return len(stamps) == 1 or bool(stamps and min(np.diff(stamps)) >= _SAME)
 
 
-def _ends_agree(path: Path, stamps: list[float]) -> bool:
+def _ends_agree(capture: Any, stamps: list[float]) -> bool:
     """Whether the first and the last frame are decoded with their time stamps, and nothing comes after them."""
     import cv2
 
-    capture = _opened(path, [])
     with native_stderr():
         for index in sorted({0, len(stamps) - 1}):
             if index and not capture.set(cv2.CAP_PROP_POS_FRAMES, index):
