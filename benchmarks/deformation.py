@@ -180,7 +180,7 @@ def report(r: dict) -> str:
     for K in COUNTS:
         kinds = (f"ratio, same {K}", f"ratio, own {K}", f"trace, same {K}", f"forward {K}", f"paper {K}")
         cells = [
-            f"{e[x][0]:.3g}, {100 * e[x][1]:.2g} %, {e[x][2]:.2f}, {100 * e[x][3]:.2g} %" if x in e else ""
+            f"{e[x][0]:.2f}, {100 * e[x][1]:.0f} %, {e[x][2]:.2f}, {100 * e[x][3]:.0f} %" if x in e else ""
             for x in kinds
         ]
         lines.append(f"| {K} | " + " | ".join(cells) + " |")
