@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
-from drgs.data import initial_points, load, videos
+from drgs.data import initial_points, load, transforms, videos
 from drgs.data.videos import VideoFrame, read_video
 from drgs.fitting.config import FitConfig
 
@@ -290,8 +290,10 @@ def test_dnerf(tmp_path):
     assert "4 cameras" in initial_points(train, max_points=50)[2]
 
 
-def test_transforms_of_synchronous_cameras(tmp_path):
-    """Frames with times in folders named as cameras are those of cameras, of which the first is held out."""
+def test_transforms_of_synchronous_cameras(tmp_path, monkeypatch):
+    """Frames with times in folders named as cameras are those of cameras, of which the first is held out; of these no
+    image is opened, where one is for its size.
+    """
     views = write_frames(tmp_path, count=3, numbers=(0, 1))
     frames = [
         {
@@ -315,6 +317,13 @@ def test_transforms_of_synchronous_cameras(tmp_path):
             cv2.imwrite(str(label), np.full((HEIGHT, WIDTH), 1 + k + 3 * i, np.uint8))
     for view in load(tmp_path).views:
         assert int(view.labels()[0, 0]) == 1 + int(view.camera_name[3:]) + 3 * int(view.name[-1])
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    for options, first in (({}, "cam01"), ({"test_cameras": ("cam01", "cam00")}, "cam02")):
+        with monkeypatch.context() as patch:
+            opened = []
+            patch.setattr(transforms, "image_size", lambda path, opened=opened: opened.append(path) or (WIDTH, HEIGHT))
+            load(tmp_path, lazy=True, semantics=False, **options)
+        assert opened == [tmp_path / first / "frame_00000.png"]
     still = [{key: value for key, value in frame.items() if key != "time"} for frame in frames]
     (tmp_path / "transforms.json").write_text(json.dumps(top | {"frames": still}))
     assert load(tmp_path).camera_names == ()

@@ -86,11 +86,10 @@ def load_cameras(
         image_id, camera = posed[name]
         where = f"{model}: image {reconstruction.images[image_id].name}"
         recordings.append(Recording(name, dict.fromkeys(numbers, camera), files, where))
-    held_out = tuple(frames)[:1] if len(frames) > 1 else None
-    dataset = Dataset(path, "cameras", [], test_cameras=held_out)
+    dataset = Dataset(path, "cameras", [])
     synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
     if points:
-        _add_points(dataset, reconstruction, model, posed, held_out if test_cameras is None else test_cameras)
+        _add_points(dataset, reconstruction, model, posed, test_cameras)
     return dataset
 
 
@@ -118,7 +117,7 @@ def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras:
     Args:
         dataset: Without points.
         cameras: Name -> camera.
-        test_cameras: Names of those that are held out.
+        test_cameras: Names of those that are held out; None: those of the data set.
     """
     path = dataset.path / "frame0"
     model = (_model(path) if path.is_dir() else None) or _model(dataset.path)
@@ -165,10 +164,11 @@ def _add_points(
     reconstruction: Any,
     model: Path,
     posed: dict[str, tuple[int, Camera]],
-    left_out: tuple[str, ...] | None,
+    test_cameras: tuple[str, ...] | None,
 ) -> None:
-    """Give a data set the points of its model that two cameras show which are not left out."""
-    kept = {image_id for name, (image_id, _) in posed.items() if name not in (left_out or ())}
+    """Give a data set the points of its model that two cameras show which are not held out."""
+    held_out = dataset.test_cameras if test_cameras is None else test_cameras
+    kept = {image_id for name, (image_id, _) in posed.items() if name not in (held_out or ())}
     xyz, colors = model_points(reconstruction, model, kept)
     if len(xyz):
         dataset.points, dataset.colors = xyz, colors

@@ -63,35 +63,40 @@ def load_neu3d(
     """
     videos, rows = find_videos(path), pose_rows(path / POSES_BOUNDS)
     files = videos or find_posed_frames(path)
-    if len(files) != len(rows):
-        found = f"videos (cam*{', cam*'.join(VIDEO_SUFFIXES)})" if videos else "folders of frames (cam00, ...)"
-        raise ValueError(
-            f"{path / POSES_BOUNDS}: must have one row a camera, in the order of their names, got {len(rows)} rows and "
-            f"{len(files)} {found}; restore the missing ones, or drop their rows"
-        )
-    stems = [file.stem for file in files]
-    if stems != (ordered := sorted(stems, key=lambda stem: [int(x) for x in re.findall(r"\d{1,9}", stem)])):
-        _log.warning(
-            "%s: rows are those of %s, ..., in the order of the letters of their names; if they should be those of %s, "
-            "..., rename them with as many digits each",
-            path / POSES_BOUNDS,
-            ", ".join(stems[:3]),
-            ", ".join(ordered[:3]),
-        )
-    if twice := [stem for stem in stems if stems.count(stem) > 1]:
-        raise ValueError(f"{path}: must hold one video a camera, {twice[0]} is there twice; remove one")
+    _check_rows(path / POSES_BOUNDS, len(rows), files, bool(videos))
     numbers, sources = _videos(path, videos, times, strict) if videos else frames_of(files, times)
     recordings = []
     for index, (row, file) in enumerate(zip(rows, files, strict=True)):
         where = f"{path / POSES_BOUNDS}: row {index}"
         camera = row_camera(f"{where} ({file.name})", row, file.stem)
         recordings.append(Recording(file.stem, dict.fromkeys(numbers, camera), sources[file.stem], where))
-    dataset = Dataset(path, "neu3d", [], test_cameras=tuple(stems[:1]) if len(stems) > 1 else None)
+    dataset = Dataset(path, "neu3d", [])
     synchronous(dataset, recordings, numbers, where=path, background=background, lazy=lazy, strict=strict)
     if points:
         seen = {recording.name: recording.cameras[numbers[0]] for recording in recordings}
-        add_model_points(dataset, seen, dataset.test_cameras if test_cameras is None else test_cameras)
+        add_model_points(dataset, seen, test_cameras)
     return dataset
+
+
+def _check_rows(poses: Path, rows: int, files: list[Path], are_videos: bool) -> None:
+    """Raise ValueError unless every camera has a row, and one file; warn where names sort otherwise than numbers."""
+    if len(files) != rows:
+        found = f"videos (cam*{', cam*'.join(VIDEO_SUFFIXES)})" if are_videos else "folders of frames (cam00, ...)"
+        raise ValueError(
+            f"{poses}: must have one row a camera, in the order of their names, got {rows} rows and {len(files)} "
+            f"{found}; restore the missing ones, or drop their rows"
+        )
+    stems = [file.stem for file in files]
+    if stems != (ordered := sorted(stems, key=lambda stem: [int(x) for x in re.findall(r"\d{1,9}", stem)])):
+        _log.warning(
+            "%s: rows are those of %s, ..., in the order of the letters of their names; if they should be those of %s, "
+            "..., rename them with as many digits each",
+            poses,
+            ", ".join(stems[:3]),
+            ", ".join(ordered[:3]),
+        )
+    if twice := [stem for stem in stems if stems.count(stem) > 1]:
+        raise ValueError(f"{poses.parent}: must hold one video a camera, {twice[0]} is there twice; remove one")
 
 
 def _videos(path: Path, files: list[Path], times: int, strict: bool) -> tuple[tuple[int, ...], dict[str, VideoFile]]:

@@ -61,7 +61,8 @@ def synchronous(
     lazy: bool,
     strict: bool,
 ) -> Dataset:
-    """Fill a data set with a view for every camera and frame.
+    """Fill a data set with a view for every camera and frame; the first camera is held out, if there are several and
+    their files do not say what they are for.
 
     Its time goes by the number of the frame, from 0 at the first to 1 at the last of `numbers`: what moves evenly in
     the video does so in the data set, though frames that are spread over it need not be equally far apart.
@@ -106,6 +107,8 @@ def synchronous(
                 )
     go_on_without(where, [view.image_path for view in dataset.absent], len(dataset.views), strict)
     dataset.frames = tuple(numbers)
+    if len(recordings) > 1 and not any(recording.split for recording in recordings):
+        dataset.test_cameras = (recordings[0].name,)
     return dataset
 
 

@@ -70,10 +70,8 @@ def load_train_meta(
             used = {n: frames[n] for n in numbers if n in frames}
             images = {n: folder / _IMAGES / shot.image for n, shot in used.items()}
             recordings.append(Recording(str(name), {n: s.camera for n, s in used.items()}, images, f"{meta}", split))
-    held_out = (str(next(iter(taken))),) if len(taken) > 1 and not stated else None
-    dataset = Dataset(path, "train_meta", [], xyz, colors, test_cameras=held_out)
-    if xyz is not None:
-        dataset.point_source = f"{_POINTS}, {len(xyz)} points"
+    source = "" if xyz is None else f"{_POINTS}, {len(xyz)} points"
+    dataset = Dataset(path, "train_meta", [], xyz, colors, source)
     return synchronous(dataset, recordings, numbers, where=file, background=background, lazy=lazy, strict=strict)
 
 

@@ -50,6 +50,7 @@ def load_transforms(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
+    test_cameras: tuple[str, ...] | None = None,
     **_,
 ) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
@@ -62,7 +63,7 @@ def load_transforms(
     Args:
         path: the folder, or one JSON file.
         background: color that images with alpha are composited on.
-        test_every, test_offset, lazy, points, strict: see `drgs.data.load`.
+        test_every, test_offset, lazy, points, strict, test_cameras: see `drgs.data.load`.
 
     Raises:
         FileNotFoundError: no such file, too few of the images that it names, or a mask or depth map is missing.
@@ -79,7 +80,8 @@ def load_transforms(
     dataset = Dataset(path, "transforms", [])
     rows = _listed(read, dataset)
     go_on_without(path, [view.image_path for view in dataset.absent], len(dataset.views), strict)
-    first = _FirstImage(dataset, test_every, test_offset) if lazy else None
+    _name_cameras(dataset, [frame.get("time") for data in read.values() for frame in data["frames"]])
+    first = _FirstImage(dataset, test_every, test_offset, test_cameras) if lazy else None
     for file, data in read.items():
         sizes: dict[tuple[int, int], int] = {}
         for index, frame in enumerate(data["frames"]):
@@ -102,17 +104,17 @@ def load_transforms(
             xyz, colors = read_point_ply(ply)
             source = f"{ply.name}, {len(xyz)} points"
     dataset.points, dataset.colors, dataset.point_source = xyz, colors, source
-    _name_cameras(dataset)
     return dataset
 
 
-def _name_cameras(dataset: Dataset) -> None:
+def _name_cameras(dataset: Dataset, times: list[Any]) -> None:
     """Where frames have times and lie in folders named as cameras, note whose they are, and hold out the first camera
     unless the files state a split.
     """
     folders = {view.name: PurePosixPath(view.name).parent.name for view in (*dataset.views, *dataset.absent)}
     names = sorted(set(folders.values()))
-    if len(dataset.times) < 2 or len(names) < 2 or not all(CAMERA_NAME.fullmatch(name) for name in names):
+    is_dynamic = len({str(time) for time in times} - {"None"}) >= 2
+    if not is_dynamic or len(names) < 2 or not all(CAMERA_NAME.fullmatch(name) for name in names):
         return
     for view in (*dataset.views, *dataset.absent):
         view.camera_name = folders[view.name]
@@ -162,8 +164,9 @@ def _splits(file: Path, data: dict) -> list[str]:
 class _FirstImage:
     """Size of the first training image, read when it is first asked for."""
 
-    def __init__(self, dataset: Dataset, test_every: int, test_offset: int) -> None:
-        self.dataset, self._held_out, self._size = dataset, (test_every, test_offset), None
+    def __init__(self, dataset: Dataset, *held_out: Any) -> None:
+        """`held_out`: arguments of `Dataset.split`."""
+        self.dataset, self._held_out, self._size = dataset, held_out, None
 
     def size(self) -> tuple[int, int]:
         if self._size is None:
