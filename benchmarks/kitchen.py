@@ -1,6 +1,6 @@
 """One camera at each later time of a kitchen where things move, by every policy: color and labels of a held-out camera.
 
-    python benchmarks/kitchen.py [--scale small] [--seeds 3] [--shard K/N]     fits, rows as they come
+    python benchmarks/kitchen.py [--scale small] [--seeds 6] [--shard K/N]     fits, rows as they come
     python benchmarks/kitchen.py --page [--merge ROWS.jsonl ...]               the tables of docs/dynamic.md
 
 The paper's dynamic loop (arXiv 2512.22771): a static stage on the first time of all cameras but the one that is held
@@ -95,6 +95,8 @@ SCALES = {
             feature_width=32,
             feature_rate=5e-3,
             decoder_rate=5e-4,
+            grid_rate=(8e-3, 8e-4),
+            field_rate=(8e-4, 8e-5),
         ),
         cameras=10,
         times=14,
@@ -161,6 +163,7 @@ def main() -> int:
         units_of,
         planned=lambda seeds: min(seeds, len(UNITS)) * len(POLICIES),
         report=report,
+        seeds=len(UNITS),
     )
 
 

@@ -195,7 +195,7 @@ def test_units_of_held_out_cameras(filmed, faked, tmp_path):
     cells = study.cells([("film", camera, "first", "blind", 0) for camera in ("cam01", "cam02")])
     assert [cell.name for cell in cells[::2]] == [f"film-{name}-first0-blind-farthest" for name in ("cam01", "cam02")]
     data = study.dataset(cells[2])
-    assert data.times == (0.0, 0.5, 1.0)
+    assert data.times == (0.0, 0.4, 1.0)
     assert {view.camera_name for view in data.split()[1]} == {"cam02"}
     with pytest.raises(ValueError, match="cam9"):
         study.dataset(dataclasses.replace(cells[0], camera="cam9"))
