@@ -16,7 +16,7 @@ from scenes.output import DEPTH_UNIT, write_depth, write_png
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",
     "box", "material", "shape", "dome", "sensor", "aim", "z_depth", "first_hits", "encode_srgb", "strata",
-    "write_views",
+    "write_views", "axes",
 ]  # fmt: skip
 
 
@@ -258,6 +258,13 @@ def first_hits(scene, K, c2w, width, height):
     return np.where(np.isfinite(t), t, 0).reshape(height, width), number.reshape(height, width)
 
 
+def axes(forward):
+    """Axes (3, 3) of a camera, in columns right, down, forward: level, along a unit vector, with +z up."""
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], 1)
+
+
 def dome(views, seed, center, distance, arc, elevations):
     """Jittered camera-to-world matrices (views, 4, 4) on a dome, looking at its center.
 
@@ -280,9 +287,7 @@ def dome(views, seed, center, distance, arc, elevations):
         eye *= distance * (1 + 0.07 * jitter[2])
         forward = center + 0.03 * distance * jitter[3:6] - eye
         forward /= np.linalg.norm(forward)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        down, roll = np.cross(forward, right), np.radians(3.0 * jitter[6])
+        (right, down, _), roll = axes(forward).T, np.radians(3.0 * jitter[6])
         poses[i, :3, 0] = np.cos(roll) * right + np.sin(roll) * down
         poses[i, :3, 1] = np.cos(roll) * down - np.sin(roll) * right
         poses[i, :3, 2], poses[i, :3, 3] = forward, eye

@@ -30,7 +30,7 @@ import numpy as np
 
 import scenes
 from drgs import runtime
-from scenes import fabrics, moving, output, tabletop, teacher, videos
+from scenes import fabrics, labelled, moving, output, tabletop, teacher, videos
 from scenes.colmap import SparsePoints, back_project, sparse_points, write_model
 from scenes.moving import MOVING, Mover
 
@@ -109,27 +109,13 @@ class Stage:
 
     def __init__(self, seed):
         mi = runtime.mitsuba()
-        import drjit as dr
-
-        content, names, kept, materials, self.movers = {"type": "scene"}, {}, [], {}, {}
+        placed, self.movers = [], {}
         for k, part in enumerate(parts(seed)):
-            key = f"part{k:03d}"
             if isinstance(part, Mover):
-                self.movers[key] = part
+                self.movers[f"part{k:03d}"] = part
                 part = part.name, part.at(0.0), part.bsdf, part.paint, part.two_sided
-            name, mesh, bsdf, paint, *rest = part
-            kept.append(paint)  # what is kept has an id of its own
-            plain = np.ndim(paint) == 1
-            which = bsdf["type"], bsdf.get("alpha"), tuple(paint) if plain else id(paint), bool(rest and rest[0])
-            if which not in materials:
-                materials[which] = scenes.material(bsdf, paint, *rest[:1])
-            content[key], names[key] = scenes.shape(name, mesh, materials[which], paint, *rest), name
-        content |= _lights(mi)
-        self.scene = mi.load_dict(content)
-        shapes = [shape for shape in self.scene.shapes() if shape.id() in names]
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        self.table = np.zeros(max(numbers) + 2, np.uint8)
-        self.table[numbers] = [CLASSES.index(names[shape.id()]) + 1 for shape in shapes]
+            placed.append(part)
+        self.scene, self.table = labelled.build(placed, CLASSES, _lights(mi))
         self._parameters = mi.traverse(self.scene)
 
     def set(self, time):
@@ -161,8 +147,7 @@ def _lights(mi):
 # -------------------------------------------------------------------------------- cameras
 def intrinsics(width, height):
     """K (3, 3) in pixels."""
-    focal = 0.5 * width / np.tan(np.radians(_FOV_X) / 2)
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return labelled.intrinsics(width, height, _FOV_X)
 
 
 def arc(cameras, seed):
@@ -179,9 +164,7 @@ def arc(cameras, seed):
         eye = np.array(_TARGET) + _DISTANCE * (1 + 0.04 * jitter[2]) * way
         forward = np.array(_TARGET) + 0.015 * jitter[3:6] - eye
         forward /= np.linalg.norm(forward)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose[:3, :3], pose[:3, 3] = np.stack([right, np.cross(forward, right), forward], 1), eye
+        pose[:3, :3], pose[:3, 3] = scenes.axes(forward), eye
     return poses
 
 
@@ -270,9 +253,8 @@ class _Recording:
         for name in self.names:
             frames = (cv2.imread(str(path)) for path in sorted((folder / "frames" / name).iterdir()))
             videos.write(folder / f"{name}.mp4", frames)
-        classes = {"unlabelled": 0, "classes": [{"id": k + 1, "name": name} for k, name in enumerate(CLASSES)]}
         for name, content in (
-            ("classes", classes),
+            ("classes", labelled.class_file(CLASSES)),
             ("moving_classes", MOVING),
             ("teacher", {"pixel_accuracy": right, "views": len(some)}),
         ):

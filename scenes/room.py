@@ -24,8 +24,7 @@ from pathlib import Path
 import numpy as np
 
 import scenes
-from drgs import runtime
-from scenes import fabrics, furniture, output, teacher
+from scenes import fabrics, furniture, labelled, output, teacher
 from scenes.colmap import back_project, sparse_points, write_model
 from scenes.furniture import MATTE, SATIN, moved, moved_parts, slab
 
@@ -169,24 +168,7 @@ def _shell(layout):
 
 def scene(seed):
     """(Mitsuba scene, class of each of its shapes by Dr.Jit's number)."""
-    mi = runtime.mitsuba()
-    import drjit as dr
-
-    content, names = {"type": "scene"}, []
-    kept, materials = [], {}  # what is kept has an id of its own
-    for k, (name, mesh, bsdf, paint, *rest) in enumerate(parts(seed)):
-        kept.append(paint)
-        key = bsdf["type"], bsdf.get("alpha"), paint if isinstance(paint, tuple) else id(paint), bool(rest and rest[0])
-        if key not in materials:
-            materials[key] = scenes.material(bsdf, paint, *rest[:1])
-        content[f"part{k:03d}"] = scenes.shape(name, mesh, materials[key], paint, *rest)
-        names.append(name)
-    built = mi.load_dict(content)
-    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in built.shapes()]
-    ids = [names[int(shape.id()[4:])] for shape in built.shapes()]
-    table = np.zeros(max(numbers) + 1, np.uint8)
-    table[numbers] = [CLASSES.index(name) + 1 for name in ids]
-    return built, table
+    return labelled.build(list(parts(seed)), CLASSES)
 
 
 def trajectory(layout, views, seed):
@@ -202,9 +184,7 @@ def trajectory(layout, views, seed):
         yaw = angle + np.pi + np.radians(38) * np.sin(10 * np.pi * t)
         pitch = np.radians(-9 + 10 * np.sin(2 * np.pi * 5.3 * t))
         forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        poses[k, :3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        poses[k, :3, :3] = scenes.axes(forward)
         poses[k, :3, 3] = eye
     return poses
 
@@ -232,8 +212,7 @@ def _clear(built, poses):
 
 def _intrinsics(width, height):
     """K (3, 3) in pixels."""
-    focal = 0.5 * width / np.tan(np.radians(_FOV_X) / 2)
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return labelled.intrinsics(width, height, _FOV_X)
 
 
 class _Views:
@@ -294,8 +273,7 @@ class _Views:
         vectors = teacher.embeddings(CLASSES, self.seed)
         np.save(folder / "text_embeddings.npy", vectors)
         right = teacher.accuracy(((teacher.load(self.paths(k)[3]), self.read(k)[2]) for k in range(count)), vectors)
-        classes = {"unlabelled": 0, "classes": [{"id": k + 1, "name": name} for k, name in enumerate(CLASSES)]}
-        (folder / "classes.json").write_text(json.dumps(classes, indent=1) + "\n")
+        (folder / "classes.json").write_text(json.dumps(labelled.class_file(CLASSES), indent=1) + "\n")
         (folder / "teacher.json").write_text(json.dumps({"pixel_accuracy": right, "views": count}) + "\n")
         (folder / "test_views.txt").write_text("".join(name + "\n" for name in names[::test_every]))
 
