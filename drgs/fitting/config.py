@@ -132,6 +132,8 @@ class FitConfig:
         field_preset: Size of the deformation field, as in [2] for videos of several cameras (`neu3d`) or for one camera
             around an object (`dnerf`).
         grid_rate, field_rate: First and last learning rate of the field's planes and of its MLP, log-linear between.
+            Ten times those of [2], which are for 14,000 steps: in some hundred or thousand, motion must be found
+            before what is in the wrong place has become transparent.
         motion_rate: How far the logit of a gate, one a Gaussian, that says what moves can go in the dynamic stage: its
             learning rate is that divided by the steps.
         motion_weight: Of the mean of all gates: what no photograph shows to move comes to a rest, and is not deformed.
@@ -189,8 +191,8 @@ class FitConfig:
     dynamics: Dynamics = "auto"
     static_share: float = 3 / 17
     field_preset: FieldPreset = "neu3d"
-    grid_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
-    field_rate: tuple[float, float] = (1.6e-4, 1.6e-5)
+    grid_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
+    field_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     motion_rate: float = 120.0
     motion_weight: float = 0.03
     smooth_weight: float = 1e-3
