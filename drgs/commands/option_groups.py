@@ -108,7 +108,7 @@ class Timed(Data):
     """Options of commands that load data sets of one time or of several."""
 
     times: int | None = None
-    """Of videos, how many synchronous frames of each are used, evenly over their length; default as a run, else 40."""
+    """How many frames of each synchronous camera are used, evenly over its video; default as the run, else 40."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,7 @@ class Views(Timed):
     """Options of commands that take some of the views of a data set."""
 
     test_cameras: Annotated[tuple[str, ...] | None, _CAMERAS] = None
-    """Cameras of videos that are held out at all times (cam00,cam05), or none; default as a run, else the first."""
+    """Synchronous cameras that are held out at all times (cam00,cam05), or none; default as the run, else the first."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -228,9 +228,9 @@ class Moving:
     """Options of a fit to what moves."""
 
     times: int = FitConfig.times
-    """Synchronous frames that are taken of videos, evenly spaced."""
+    """How many frames of each synchronous camera are used, evenly over its video, the first and the last included."""
     test_cameras: Annotated[tuple[str, ...] | None, _CAMERAS] = FitConfig.test_cameras
-    """Cameras of videos that are held out, e.g. cam00,cam07."""
+    """Synchronous cameras that are held out at all times, e.g. cam00,cam07; none leaves it to --test-every."""
     dynamics: Dynamics = FitConfig.dynamics
     """Fit what moves where the views have several times (auto), or what stands still to all of them (ignore)."""
     static_share: float = FitConfig.static_share

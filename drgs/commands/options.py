@@ -360,11 +360,11 @@ class Scene(Common):
     """Make a data set by path tracing: a room or a kitchen in motion, with labels and a teacher, or a still life."""
 
     name: Positional[Literal["room", "kitchen", "still_life"]]
-    """What to make; room and kitchen have classes, points and a simulated teacher, the kitchen is filmed in motion."""
+    """What to make. Room and kitchen have classes, points and a simulated teacher; in the kitchen, things move."""
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str | None = None
-    """WIDTHxHEIGHT of the images in pixels; default 320x240, 240x180 (kitchen)."""
+    """WIDTHxHEIGHT of the images in pixels; default 320x240, of the kitchen 240x180."""
     views: int | None = None
     """How many images; default 75 (room) or 32 (still_life)."""
     cameras: int | None = None
@@ -378,4 +378,4 @@ class Scene(Common):
     teacher_size: str | None = None
     """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
     test_every: int | None = None
-    """Every how many views one is for testing (room); default 5, 3 gives 25 of 75."""
+    """One in how many views is for testing (room); default 5, which is 15 of 75 views."""

@@ -38,7 +38,8 @@ def load(
     times: int = 40,
     test_cameras: tuple[str, ...] | None = None,
 ) -> Dataset:
-    """Load a data set; its format is found out from its files. No image is decoded.
+    """Load a data set; its format is found out from its files. No image is decoded, but the first and the last frame of
+    each video, to check its time stamps.
 
     Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json`` (D-NeRF's too); videos
     ``cam*.mp4`` beside ``poses_bounds.npy`` (Neural 3D Video); ``train_meta.json`` (Dynamic 3D Gaussians); folders of
@@ -48,9 +49,9 @@ def load(
 
     Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
-    (``cam03/0007``), and their times are 0 at the first frame that is used and 1 at the last. A frame of a video is
-    decoded when its image is asked for. The first camera is held out at all times, unless ``test_meta.json`` says
-    which are.
+    (``cam03/0007``), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
+    frame's number. A frame of a video is decoded when its image is asked for. The first camera is held out at all
+    times, unless ``test_meta.json`` says which are.
 
     Args:
         path: folder or file.
