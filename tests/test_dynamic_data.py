@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.data import initial_points, load, transforms, videos
 from drgs.data.videos import VideoFrame, read_video
@@ -841,6 +842,7 @@ def test_points_that_are_none(tmp_path):
         lambda: np.savez(path, other=np.zeros((3, 7))),
         lambda: np.savez(path, data=np.zeros(7)),
         lambda: np.savez(path, data=np.array([{}])),
+        lambda: np.savez(path, data=np.full((3, 7), np.nan)),
     ):
         write()
         assert "init_pt_cld.npz" in refused(tmp_path)
@@ -861,3 +863,26 @@ def test_what_is_almost_a_data_set(neu3d, tmp_path):
     assert "found frames of 2 cameras (cam00, ...) without; run COLMAP" in refused(
         tmp_path / "frames", FileNotFoundError
     )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "told"),
+    [
+        (lambda p: write_video(p / "cam02.mp4", [coded(0)] * 2), "--strict", "videos must be of one length"),
+        (lambda p: (p / "cam02.mp4").write_bytes((p / "cam02.mp4").read_bytes()[:600]), "", "cam02.mp4: must be"),
+        (lambda p: write_poses(p, cameras(5)), "", "got 5 rows and 4 videos"),
+        (lambda p: write_dnerf(p, {"train": (0.0, float("nan"), 1.0)}), "", "time must be a finite number"),
+        (lambda p: write_dnerf(p, {"train": (0.0, None, 1.0)}), "", "must have a time, 1 have none"),
+        (lambda p: None, "--times 0", "times must be a whole number"),
+        (lambda p: None, "--test-cameras cam00,cam9", "must be among cam00, cam01, cam02, cam03, got 'cam9'"),
+    ],
+)
+def test_fit_refuses(copied, spoil, options, told, capsys):
+    """One line on stderr, exit code 2, and nothing written."""
+    spoil(copied)
+    before = sorted(copied.parent.rglob("*"))
+    assert cli.main(["fit", str(copied), "-o", str(copied.parent / "run"), "--quiet", *options.split()]) == 2
+    text = capsys.readouterr().err
+    assert told in text
+    assert text.count("\n") == 1
+    assert sorted(copied.parent.rglob("*")) == before

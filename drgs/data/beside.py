@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from drgs.data.views import Dataset, View
 
-__all__ = ["LABEL_FOLDERS", "bases", "explain", "label_images", "maps", "matched"]
+__all__ = ["LABEL_FOLDERS", "feature_maps", "label_images", "match_views", "report_unmatched", "search_folders"]
 
 LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
@@ -22,18 +22,18 @@ _FRAME = re.compile(r"(?P<prefix>.*?)(?P<number>\d{1,20})")
 _log = logging.getLogger(__name__)
 
 
-def bases(dataset: Dataset) -> list[Path]:
+def search_folders(dataset: Dataset) -> list[Path]:
     """Where the folders may be: in the data set, and beside its folder of images."""
     path = dataset.path
-    bases = [path if path.is_dir() else path.parent]
+    folders = [path if path.is_dir() else path.parent]
     image = next((view.image_path for view in dataset.views if view.image_path), None)
     if image is not None:
         near = list(image.parents)[:_NEAR]
-        bases += [folder.parent for folder in near if folder.name in _IMAGE_FOLDERS][:1]
-    return list(dict.fromkeys(bases))
+        folders += [folder.parent for folder in near if folder.name in _IMAGE_FOLDERS][:1]
+    return list(dict.fromkeys(folders))
 
 
-def maps(folder: Path) -> dict[str, Path]:
+def feature_maps(folder: Path) -> dict[str, Path]:
     """Stem of the image, with its subfolder -> map."""
     from drgs.features.teacher import map_name
 
@@ -53,30 +53,17 @@ def label_images(folder: Path) -> dict[str, Path]:
     }
 
 
-def matched(views: list[View], folder: Path, files: dict[str, Path]) -> list[tuple[View, Path]]:
-    """The views that have a file, and which; ValueError if two have the same."""
-    found: list[tuple[View, Path]] = []
-    owners: dict[Path, View] = {}
+def match_views(views: list[View], folder: Path, files: dict[str, Path]) -> list[tuple[View, Path]]:
+    """The views that have a file, and which; ValueError if two photographs have the same."""
     cameras = {view.camera_name for view in views} - {""}
     frames = _by_camera(files, cameras, folder.name) if cameras else {}
+    found: list[tuple[View, Path]] = []
+    owners: dict[Path, View] = {}
     for view in views:
-        if view.camera_name:
-            path = files.get(str(PurePosixPath(view.camera_name) / view.stem))
-            if path is None and (number := _FRAME.fullmatch(view.name)):
-                path = frames.get((view.camera_name, int(number["number"])))
-            if path is not None:
-                found.append((view, path))
-            continue
-        if view.image_path is None:
-            continue
-        stems = list(dict.fromkeys((view.image_path.stem, view.image_path.name.split(".")[0])))
-        if number := _NUMBERED.fullmatch(stems[0]):
-            stems += [f"{name}_{number[1]}" for name in dict.fromkeys((folder.name, LABEL_FOLDERS[0]))]
-        below = PurePosixPath(view.name).parent
-        path = next((files[key] for key in (*(str(below / stem) for stem in stems), *stems) if key in files), None)
+        path = _of_frame(view, files, frames) if view.camera_name else _of_photograph(view, folder, files)
         if path is None:
             continue
-        if path in owners:
+        if path in owners and not view.camera_name:
             raise ValueError(
                 f"{path}: must belong to one image, {owners[path].image_path} and {view.image_path} are both named so; "
                 "put them into subfolders as the images"
@@ -84,6 +71,24 @@ def matched(views: list[View], folder: Path, files: dict[str, Path]) -> list[tup
         owners[path] = view
         found.append((view, path))
     return found
+
+
+def _of_frame(view: View, files: dict[str, Path], frames: dict[tuple[str, int], Path]) -> Path | None:
+    """The file of a synchronous camera's frame: by the name of its image, else by its number."""
+    number = _FRAME.fullmatch(view.name)
+    by_name = files.get(str(PurePosixPath(view.camera_name) / view.stem))
+    return by_name or (frames.get((view.camera_name, int(number["number"]))) if number else None)
+
+
+def _of_photograph(view: View, folder: Path, files: dict[str, Path]) -> Path | None:
+    """The file of a photograph: by its name, in a subfolder as it is, or in `folder` itself."""
+    if view.image_path is None:
+        return None
+    stems = list(dict.fromkeys((view.image_path.stem, view.image_path.name.split(".")[0])))
+    if number := _NUMBERED.fullmatch(stems[0]):
+        stems += [f"{name}_{number[1]}" for name in dict.fromkeys((folder.name, LABEL_FOLDERS[0]))]
+    below = PurePosixPath(view.name).parent
+    return next((files[key] for key in (*(str(below / stem) for stem in stems), *stems) if key in files), None)
 
 
 def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[tuple[str, int], Path]:
@@ -114,7 +119,7 @@ def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[t
     return found
 
 
-def explain(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:
+def report_unmatched(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:
     """Say that a folder has no file for any view; maps of other images are refused."""
     image = next((view.name if view.camera_name else view.stem for view in views if view.has_image), "NAME")
     if kind == "teacher" and files:

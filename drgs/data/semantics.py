@@ -27,8 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data import beside
-from drgs.data.beside import LABEL_FOLDERS
+from drgs.data.beside import LABEL_FOLDERS, feature_maps, label_images, match_views, report_unmatched, search_folders
 from drgs.data.checks import read_image, read_npy
 from drgs.data.class_names import CLASS_FILES, read_class_names
 from drgs.display.progress import Bar
@@ -241,19 +240,19 @@ def attach(dataset: Dataset, lazy: bool) -> None:
         FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
     """
     found: dict[str, Path] = {}
-    bases = beside.bases(dataset)
+    bases = search_folders(dataset)
     labels = (*LABEL_FOLDERS, _SEGMENTS) if dataset.format == "train_meta" else LABEL_FOLDERS
     for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", labels)):
         folders = [base / name for name in names for base in bases if (base / name).is_dir()]
         for folder in folders:
-            files = beside.maps(folder) if kind == "teacher" else beside.label_images(folder)
-            matched = beside.matched(dataset.views, folder, files)
+            files = feature_maps(folder) if kind == "teacher" else label_images(folder)
+            matched = match_views(dataset.views, folder, files)
             if matched:
                 found[kind] = folder
                 for view, path in matched:
                     setattr(view, f"{kind.removesuffix('s')}_path", path)
                 break
-            beside.explain(kind, folder, files, dataset.views)
+            report_unmatched(kind, folder, files, dataset.views)
     if not found:
         return
     classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]

@@ -135,6 +135,8 @@ def _points(file: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{file}: data must be rows of x, y, z, r, g, b, got shape {rows.shape} of {rows.dtype}; remove the file"
         )
     rows = rows[np.isfinite(rows[:, :6]).all(axis=1)]
+    if not len(rows):
+        raise ValueError(f"{file}: data must have a row of finite numbers, has none; remove the file")
     return rows[:, :3].astype(np.float64), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)
 
 
