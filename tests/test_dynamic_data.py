@@ -43,9 +43,9 @@ def decoded(image):
     return divmod(int((stripes > 128) @ 2 ** np.arange(8)), 8)
 
 
-def write_video(path, images, code="mp4v"):
+def write_video(path, images, code="mp4v", rate=30):
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 30, images[0].shape[1::-1])
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), rate, images[0].shape[1::-1])
     for image in images:
         writer.write(image)
     writer.release()
@@ -678,6 +678,15 @@ def test_videos_of_different_length(copied, caplog):
     assert data.times[-1] == 1.0
     assert "different length (cam02.mp4 has 4 frames, cam00.mp4 6); frames from 4 on are left out" in caplog.text
     assert "videos must be of one length" in refused(copied, strict=True)
+
+
+def test_videos_of_different_rates(copied, caplog):
+    """Frames of one number would not be of one time: this is told."""
+    load(copied)
+    assert not caplog.text
+    write_video(copied / "cam02.mp4", [coded(i, 2) for i in range(FRAMES)], rate=60)
+    load(copied)
+    assert "videos must have one frame rate, 6 frames take 83 ms in cam02.mp4 and 167 ms in cam00.mp4" in caplog.text
 
 
 def test_a_video_of_another_shape(copied):

@@ -118,4 +118,18 @@ def _videos(path: Path, files: list[Path], times: int, strict: bool) -> tuple[tu
         _log.warning(
             "%s: videos are of different length (%s); frames from %d on are left out", path, text, shortest.count
         )
+    # Synchronous frames of one number are shown at one time, but for the moment at which a camera was started.
+    lengths = {v.path.name: v.stamps[shortest.count - 1] - v.stamps[0] for v in videos if v.stamps}
+    fast, slow = (choose(lengths, key=lengths.get, default="") for choose in (min, max))
+    if lengths and (lengths[slow] - lengths[fast]) * (shortest.count - 1) > lengths[slow]:
+        _log.warning(
+            "%s: videos must have one frame rate, %d frames take %.0f ms in %s and %.0f ms in %s; frames of one number "
+            "are taken to be of one time",
+            path,
+            shortest.count,
+            lengths[fast],
+            fast,
+            lengths[slow],
+            slow,
+        )
     return evenly_spaced(range(shortest.count), times), {video.path.stem: video for video in videos}
