@@ -304,7 +304,7 @@ def generate(
             traced. One made here with other parameters is replaced; anything else that is not empty is refused.
         cameras: On the arc.
         times: Frames of each camera.
-        width, height: Of the frames in pixels.
+        width, height: Of the frames in pixels, even numbers.
         spp: Light paths a pixel.
         seed: Of the things, their motions, the cameras, the light paths, the sparse points and the teacher's errors.
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the frames are.
@@ -320,6 +320,8 @@ def generate(
     values = {"cameras": cameras, "times": times, "width": width, "height": height, "spp": spp, "seed": seed}
     values |= {"teacher_width": teacher_width, "teacher_height": teacher_height}
     output.check_numbers(values, where)
+    if width % 2 or height % 2:
+        raise ValueError(f"{where}: width and height must be even, as videos have them, got {width}x{height}; add 1")
     parameters = {"scene": "kitchen", "version": _VERSION, **values}
 
     def fill(folder):

@@ -321,6 +321,7 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
     ("words", "says"),
     [
         (["--size", "4x4"], "width must be an integer from 8"),
+        (["--size", "24x17"], "width and height must be even, as videos have them, got 24x17"),
         (["--cameras", "0"], "cameras must be an integer from 1"),
         (["--times", "0"], "times must be an integer from 1"),
         (["--seed", "-1"], "--seed must be in [0, 2147483647]"),
