@@ -72,6 +72,7 @@ class Motion:
         self.first_step = round(config.static_share * config.max_steps)
         self.field: DeformationField | None = None
         self.step = 0
+        self._length = 1.0  # the field's unit of length: the extent of the scene or of its Gaussians, whichever is less
         self._again = self.first_step + round(_AGAIN * (config.max_steps - self.first_step))
 
     def has_begun(self, rows: GaussianRows) -> bool:
@@ -108,11 +109,15 @@ class Motion:
         bounds = torch.quantile(means, ends, dim=0)
         margin = _MARGIN * (bounds[1] - bounds[0])
         rows.add_tensor("motion", torch.full((len(rows),), _OPEN))
-        return self._extended(rows, parts, extent, torch.stack([bounds[0] - margin, bounds[1] + margin]))
+        # Cameras may stand far from what they film, and what they film may reach to the horizon.
+        self._length = min(extent, float((bounds[1] - bounds[0]).max()) or extent)
+        return self._extended(rows, parts, torch.stack([bounds[0] - margin, bounds[1] + margin]))
 
-    def restored(self, rows: GaussianRows, parts: Parts, extent: float) -> Parts:
+    def restored(self, rows: GaussianRows, parts: Parts, header: dict, where: str) -> Parts:
         """As `begin`, for the rows of a checkpoint of the dynamic stage, whose networks are restored afterwards."""
-        return self._extended(rows, parts, extent, torch.tensor([[0.0] * 3, [1.0] * 3]))
+        check_json(where, header, {"field_length": float}, _ADVICE)
+        self._length = header["field_length"]
+        return self._extended(rows, parts, torch.tensor([[0.0] * 3, [1.0] * 3]))
 
     def new_gates(self, count: int, rows: GaussianRows) -> dict[str, torch.Tensor]:
         """Gates of Gaussians that are added from points."""
@@ -136,7 +141,9 @@ class Motion:
 
     def header(self) -> dict:
         """What a checkpoint's header says beside the rest."""
-        return {} if self.field is None else {"field": dataclasses.asdict(self.field.config)}
+        if self.field is None:
+            return {}
+        return {"field": dataclasses.asdict(self.field.config), "field_length": self._length}
 
     def share(self, rows: GaussianRows) -> float | None:
         """Part of the Gaussians that move; None in the static stage."""
@@ -171,7 +178,7 @@ class Motion:
         share = moving / max(len(rows), 1)
         return {"moving": moving, "share": share, "seconds": seconds, "seconds_all": everything}
 
-    def _extended(self, rows: GaussianRows, parts: Parts, extent: float, bounds: torch.Tensor) -> Parts:
+    def _extended(self, rows: GaussianRows, parts: Parts, bounds: torch.Tensor) -> Parts:
         """The parts of the dynamic stage, around a new field."""
         config = self.config
         sizes = FieldConfig.preset(config.field_preset, times=len(self.times))
@@ -182,8 +189,8 @@ class Motion:
             share = min(max((part - begin) / (1 - begin), 0.0), 1.0)
             return ends[0] * (ends[1] / ends[0]) ** share
 
-        # Adam's steps have the rate's length: what makes lengths of features steps in units of the extent.
-        lengths = dict.fromkeys(("means.3.weight", "means.3.bias"), extent)
+        # Adam's steps have the rate's length: what makes lengths of features has them in units of what it moves.
+        lengths = dict.fromkeys(("means.3.weight", "means.3.bias"), self._length)
         networks = [
             Network(FIELD[0], field.grid, lambda part: rate(config.grid_rate, part), fused=True),
             Network(FIELD[1], field.mlp, lambda part: rate(config.field_rate, part), lengths, fused=True),

@@ -232,7 +232,7 @@ class Trainer:
         rows, extent = GaussianRows.from_state(tensors), header["extent"]
         parts = parts_of(config, extent) if parts is None else parts
         if motion is not None and motion.has_begun(rows):
-            parts = motion.restored(rows, parts, extent)
+            parts = motion.restored(rows, parts, header, where)
         trainer = cls(config, frames, rows, extent, parts, motion)
         was, now = header.get("networks", []), [network.name for network in trainer.parts.networks]
         if was != now:
