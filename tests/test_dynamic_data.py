@@ -600,6 +600,11 @@ def test_points_of_a_model_of_the_first_frame(neu3d, tmp_path, caplog):
     assert load(tmp_path, points=False).points is None
     assert not caplog.text
     shutil.rmtree(tmp_path / "frame0")
+    one = shutil.copytree(neu3d, tmp_path / "one", ignore=shutil.ignore_patterns("cam0[123]*"))
+    write_poses(one, cameras()[:1])
+    write_model(one / "sparse", cameras()[:1], names[:1])
+    load(one)
+    assert "another pose" not in caplog.text
     write_model(tmp_path / "sparse" / "0", cameras()[::-1], names, tracks)
     assert load(tmp_path).points is None
     assert "sparse/0: has another pose of cam00 than the data set; its points are left out" in caplog.text
