@@ -32,14 +32,15 @@ def write(path, frames):
         writer.write(frame)
         count, last = count + 1, frame
     writer.release()
-    reader, found = cv2.VideoCapture(str(hidden)), []
-    found = [reader.read() for _ in range(count)]
-    if not found[-1][0] or not np.array_equal(found[-1][1], last):
+    reader, again = cv2.VideoCapture(str(hidden)), None
+    for _ in range(count):
+        again = reader.read()[1]
+    reader.release()
+    if not np.array_equal(again, last):
         hidden.unlink(missing_ok=True)
         raise OSError(
             f"scenes: {path} must be writable as FFV1, OpenCV could not; install opencv-contrib-python-headless"
         )
-    reader.release()
     os.replace(hidden, path)
 
 

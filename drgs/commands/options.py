@@ -364,7 +364,7 @@ class Scene(Common):
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str | None = None
-    """WIDTHxHEIGHT of the images in pixels; default 320x240, of the kitchen 240x180."""
+    """WIDTHxHEIGHT of the images in pixels; default 320x240, of the kitchen 240x180 (even numbers)."""
     views: int | None = None
     """How many images; default 75 (room) or 32 (still_life)."""
     cameras: int | None = None

@@ -197,7 +197,7 @@ def _decoded(path: Path, packets: int) -> list[float]:
             f"{path}: frame {len(stamps)} of {packets} must be decoded, could not be ({complaints[0].strip()[:100]}); "
             f"{_COPY}"
         )
-    if len(stamps) < packets:
+    if 0 < len(stamps) < packets:
         _log.warning("%s: shows %d of the %d frames that it holds; these are used", path, len(stamps), packets)
     return stamps
 
