@@ -1,4 +1,4 @@
-"""Gaussians from photographs with known cameras (static scenes, color).
+"""Gaussians from photographs with known cameras, and what a teacher says or what moves in them.
 
 The loop around `drgs.fitting.trainer`: run folder, checkpoints, progress, previews, and metrics of held-out views at
 the end.
@@ -275,7 +275,8 @@ class _Loop:
                 bar.update(done, text=f"{shown}{len(trainer.rows)} Gaussians")
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
-                if done % config.save_every == 0 and done < config.max_steps:
+                # What a step has spoiled shows in the next one: good checkpoints stay until losses are finite again.
+                if done % config.save_every == 0 and done < config.max_steps and trainer.is_sound:
                     self.save()
             self.save()
 

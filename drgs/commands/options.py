@@ -73,8 +73,8 @@ class Render(Settings, Around, Views, Moments):
 
     scene: Positional[Path]
     """A 3DGS point_cloud.ply or a run folder."""
-    cameras: str = "orbit"
-    """A data set, a run (its photographs' cameras), a cameras.json, or orbit."""
+    cameras: str | None = None
+    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default orbit, or with --view the run."""
     output: OutputPath = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None

@@ -56,16 +56,17 @@ def run(args: Render) -> None:
     _check_numbers(args)
     if args.moving and "ply" not in formats:
         raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
-    movie = "turntable.webm" if args.cameras == "orbit" else "video.webm"
+    views = args.cameras or (str(args.scene) if args.view and args.scene.is_dir() else "orbit")
+    movie = "turntable.webm" if views == "orbit" else "video.webm"
     kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
     movies = [movie, *(_movie_of(movie, kind) for kind in kinds)] if "webm" in formats else []
     fixed = ["render.json", "cameras.json", *movies]
-    output = claim(args.output, "render", fixed, inputs=[args.scene, args.cameras])
+    output = claim(args.output, "render", fixed, inputs=[args.scene, views])
     given = Given.of(args)
     paint = painters(kinds, given, args.scene)
     gaussians, settings = given.gaussians if paint else given.colors, given.settings(args.preset)
     size = args.width, args.height
-    cameras, source = drawn_views(args, args.cameras, given, args.frames, size, returns=True)
+    cameras, source = drawn_views(args, views, given, args.frames, size, returns=True)
     cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras]
     if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):

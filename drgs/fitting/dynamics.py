@@ -129,7 +129,7 @@ class Motion:
         self.step, gates = step, rows.tensors["motion"]
         group = next(group for group in rows.optimizer.param_groups if group["name"] == "motion")
         group["eps"] = max(_NOISE * self.config.motion_weight / max(len(rows), 1), 1e-15)
-        if self.field is not None and step == self._again:
+        if step == self._again:
             with torch.no_grad():  # leaves are changed in place
                 rows.overwrite(torch.arange(len(rows)), {"motion": gates.clamp(min=_OPEN)})
         return DynamicGaussians(rows.gaussians(), self.field, gates)

@@ -168,6 +168,11 @@ class Trainer:
         """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
         return next((network.module for network in self.parts.networks if network.name == name), None)
 
+    @property
+    def is_sound(self) -> bool:
+        """Whether the last step had a finite loss and gradients."""
+        return not self._bad_in_a_row
+
     def gaussians(self) -> Gaussians:
         """The Gaussians of the rows as they are, without a graph: those of a scene that moves are at rest."""
         return self.rows.gaussians().detach()
