@@ -30,8 +30,9 @@ def named_view(cameras: list[Camera], name: str | None, where: str) -> list[Came
         return cameras
     found = [camera for camera in cameras if camera.name == name or camera.name.startswith(f"{name}/")]
     if not found:
-        shown = ", ".join(camera.name for camera in cameras[:3])
-        raise ValueError(f"--view must name one of the {len(cameras)} views of {where} ({shown}, ...), got {name!r}")
+        known = list(dict.fromkeys(camera.name.rpartition("/")[0] or camera.name for camera in cameras))
+        shown = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
+        raise ValueError(f"--view must name one of the {len(cameras)} views of {where}: {shown}; got {name!r}")
     return found[:1]
 
 

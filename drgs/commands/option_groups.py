@@ -216,9 +216,9 @@ class Moments:
     """Options of commands that draw a scene that moves."""
 
     time: str | None = None
-    """Of a scene that moves: one time, or a range as 0..1 over all frames; default the views' own, else all times."""
+    """Of a scene that moves: one time, or a range (0..1) over all views; default the views' own, else all times."""
     view: str | None = None
-    """Only this one of the cameras, by its name; with a range of --time, --frames frames of it."""
+    """Only the view, or the camera, of this name; with a range of --time, --frames pictures of it."""
     moving: bool = False
     """Into ply files only what moves."""
 
@@ -232,9 +232,9 @@ class Moving:
     test_cameras: Annotated[tuple[str, ...] | None, _CAMERAS] = FitConfig.test_cameras
     """Synchronous cameras that are held out at all times, e.g. cam00,cam07; none leaves it to --test-every."""
     dynamics: Dynamics = FitConfig.dynamics
-    """Fit what moves where the views have several times (auto), or what stands still to all of them (ignore)."""
+    """Fit a deformation field where the views have several times (auto), or static Gaussians to all times (ignore)."""
     static_share: float = FitConfig.static_share
-    """Part of the steps that fit the first time alone, before anything moves."""
+    """Fraction of the steps that fit static Gaussians to the first time, before the deformation field is added."""
     field_preset: FieldPreset = FitConfig.field_preset
     """Size of the deformation field: for videos of several cameras (neu3d), or one camera around an object (dnerf)."""
     grid_rate: tuple[float, float] = FitConfig.grid_rate
@@ -242,12 +242,12 @@ class Moving:
     field_rate: tuple[float, float] = FitConfig.field_rate
     """First and last learning rate of the field's MLP."""
     motion_rate: float = FitConfig.motion_rate
-    """How far a gate that says whether a Gaussian moves can go in the dynamic stage, a logit."""
+    """Learning rate of the gates (a logit each Gaussian: does it move?), times the steps of the dynamic stage."""
     motion_weight: float = FitConfig.motion_weight
-    """Weight of the mean gate in the loss: the larger, the fewer Gaussians move."""
+    """Weight in the loss of the mean of all gates: the larger, the fewer Gaussians move."""
     smooth_weight: float = FitConfig.smooth_weight
     """Weight of the field's smoothness along time."""
     plane_weight: float = FitConfig.plane_weight
-    """Weight of the smoothness of its planes of space."""
+    """Weight of the smoothness of the field's planes of space (x and y, x and z, y and z)."""
     l1_time_weight: float = FitConfig.l1_time_weight
-    """Weight of what its planes of space and time do at all."""
+    """Weight of the L1 distance of the field's planes of time from 1, at which they change nothing."""

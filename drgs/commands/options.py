@@ -82,7 +82,7 @@ class Render(Settings, Around, Views, Moments):
     height: int | None = None
     """Image height in pixels; default the camera's."""
     frames: int = 60
-    """Views of an orbit."""
+    """Views of an orbit, or of one camera over a range of --time."""
     fov: float | None = None
     """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     format: str = "png"

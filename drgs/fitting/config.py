@@ -51,7 +51,7 @@ FieldPreset = Literal["neu3d", "dnerf"]
 
 _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
-    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every", "times"), _COUNT),
+    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
     "test_every": (0, 10**9),
     "test_offset": (0, 10**9),
     "seed": (0, 2**31 - 1),  # what COLMAP takes
