@@ -221,7 +221,8 @@ def test_closed_gates_open_again():
         (68, 12, True),
         (69, 12, False),
     ):
-        scene = motion.fitted(rows, step)
+        motion.prepare(rows, step)
+        scene = parts.scene(rows)
         assert int(scene.moving.sum()) == moving
         (grad,) = torch.autograd.grad(scene.at(0.5).means.sum(), rows.tensors["motion"])
         assert bool((grad[:6] != 0).all()) == (moving == 12)

@@ -6,8 +6,8 @@ open only if photographs need what it lets through. Once it is closed nothing is
 fifth of the stage gates stay open, as the field must learn what it can do; at three fifths all open again for a
 twentieth, so that what was closed before a field or a photograph could tell moves after all.
 
-A gate is optimized in units of what its penalty weighs (Adam's epsilon is the penalty's own gradient): a Gaussian whose
-motion the photographs hardly tell about is not moved by the noise of that, as it would be where only signs count.
+Adam alone moves a gate as far by a tiny gradient as by a large one. Here its epsilon is of the size of the penalty's
+own gradient: where photographs hardly tell whether a Gaussian moves, their noise does not decide about its gate.
 
 Reference:
     Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code: the two stages,
@@ -48,7 +48,7 @@ _OPEN = 2.0  # logit of a gate at the start, which lets 0.76 of a motion through
 _CLOSED = -1.0  # logit below which a gate has no penalty: it must be able to come back
 _AGAIN = 0.6  # of the dynamic stage: when all gates open again, those of what stood still as at the start
 _LOOK = 0.05  # of the dynamic stage, in which they then stay open
-_NOISE = 0.3  # gradients of a gate below this part of its penalty's weight are taken for what they are, not for signs
+_NOISE = 0.3  # epsilon of a gate's Adam, in weights of its penalty: below, a gate moves in proportion to its gradient
 _FASTEST = 0.5  # change of a logit in a step
 _OUTSIDE = 0.005  # part of the Gaussians that may lie below the bounds of the field along an axis, and above
 _MARGIN = 0.1  # of the field's size
@@ -123,16 +123,14 @@ class Motion:
         """Gates of Gaussians that are added from points."""
         return {"motion": torch.full((count,), _OPEN)} if self.has_begun(rows) else {}
 
-    def fitted(self, rows: GaussianRows, step: int) -> DynamicGaussians:
-        """What a step renders; at the step where all gates open again, they do."""
-        assert self.field is not None
+    def prepare(self, rows: GaussianRows, step: int) -> None:
+        """Before a step of the dynamic stage: gates get the epsilon of their optimizer and, once, all open again."""
         self.step, gates = step, rows.tensors["motion"]
         group = next(group for group in rows.optimizer.param_groups if group["name"] == "motion")
         group["eps"] = max(_NOISE * self.config.motion_weight / max(len(rows), 1), 1e-15)
         if step == self._again:
             with torch.no_grad():  # leaves are changed in place
                 rows.overwrite(torch.arange(len(rows)), {"motion": gates.clamp(min=_OPEN)})
-        return DynamicGaussians(rows.gaussians(), self.field, gates)
 
     def is_held_open(self, step: int) -> bool:
         """Whether gates stay as they are in a step, without a penalty, for the field to learn what it can do."""
@@ -153,7 +151,7 @@ class Motion:
         return float((rows.tensors["motion"].detach() >= 0).float().mean()) if len(rows) else 0.0
 
     def report(self, rows: GaussianRows) -> dict | None:
-        """How many Gaussians move, and what not deforming the others saves: medians of 5 runs there and back.
+        """How many Gaussians move, and what not deforming the others saves: medians of 5 runs forward and backward.
 
         Returns:
             JSON-serializable: `moving`, `share`, `seconds` of deforming them and `seconds_all` of deforming all, a

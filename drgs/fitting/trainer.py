@@ -300,9 +300,9 @@ class Trainer:
 
     def _fitted_scene(self) -> Scene:
         """What a step renders and differentiates."""
-        if self.motion is None or not self.motion.has_begun(self.rows):
-            return self.parts.scene(self.rows)
-        return self.motion.fitted(self.rows, self.step_index)
+        if self.motion is not None and self.motion.has_begun(self.rows):
+            self.motion.prepare(self.rows, self.step_index)
+        return self.parts.scene(self.rows)
 
     def _next_view(self) -> int:
         """Index of a photograph, each once an epoch; in a static stage, those of the first time alone."""
