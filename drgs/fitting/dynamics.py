@@ -10,8 +10,8 @@ Adam alone moves a gate as far by a tiny gradient as by a large one. Here its ep
 own gradient: where photographs hardly tell whether a Gaussian moves, their noise does not decide about its gate.
 
 Reference:
-    Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code: the two stages,
-    rates and regularizers. Gates, and planes of space that are smooth along both axes, are not from there.
+    Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code: the two stages
+    and the regularizers. Gates, planes of space that are smooth along both axes, and rates are not from there.
 """
 
 from __future__ import annotations
