@@ -162,10 +162,10 @@ def test_a_split_is_the_runs_offset_included(place, tmp_path):
     config = json.loads(path.read_text())
     config["fit"]["test_offset"] = 2
     path.write_text(json.dumps(config))
-    _, its = given(tmp_path)
+    args, its = given(tmp_path)
     for text in (place / "data", tmp_path / "run"):
         source = Source.of("--cameras", str(text))
-        assert [view.name for view in source.split(source.dataset(False), "test", its)] == ["2", "5", "8"]
+        assert [view.name for view in source.split(source.dataset(args, its), "test", its)] == ["2", "5", "8"]
 
 
 def test_a_run_whose_data_set_was_moved_says_so(place, tmp_path, capsys):
