@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+from pathlib import Path
 
 import pytest
 from test_train import config, dataset  # noqa: F401 (a fixture)
@@ -130,6 +131,15 @@ def test_checkpoint_of_a_backup(dataset, run):  # noqa: F811
     shutil.copy(run.path / PREVIOUS, run.state)
     (run.path / PREVIOUS).unlink()
     assert again(dataset, run.path).metrics["step"] == 6
+
+
+@pytest.mark.parametrize("through_link", [False, True])
+def test_folder_by_any_path(dataset, run, monkeypatch, tmp_path, through_link):  # noqa: F811
+    """A run is gone on with by a path from the working directory, and by one through a link."""
+    (tmp_path / "link").symlink_to(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert (run.path / PREVIOUS).is_file()
+    assert again(dataset, Path("link/run" if through_link else "run")).metrics["step"] == 6
 
 
 def test_edited_gaussians_stay(dataset, run):  # noqa: F811

@@ -88,7 +88,7 @@ class Claim:
             return all(self.is_made(child, by) for child in path.iterdir())
         if not path.is_symlink() and not path.is_file():
             return False
-        made = self._made.get(path.relative_to(self.path).as_posix())
+        made = self._made.get(self._name_of(path))
         command = made.get(fingerprint(path)) if made else None
         if command is None and path.suffix == ".json":
             command = author_of(path)
@@ -96,6 +96,10 @@ class Claim:
         if command is None and path.suffix == ".jsonl" and is_log(path):
             command = self.command
         return command is not None and (by is None or command in by)
+
+    def _name_of(self, path: Path) -> str:
+        """Of a path in the folder, however it leads there: from the working directory, or through a link."""
+        return (path.parent.resolve() / path.name).relative_to(self.path).as_posix()
 
     def record(self, name: str, content: str | os.PathLike, command: str | None = None) -> None:
         """Write down that a command is about to put a file into the folder.
@@ -137,7 +141,7 @@ class Claim:
         """
         if not os.path.lexists(path):
             return
-        self.check([path.relative_to(self.path).as_posix()])
+        self.check([self._name_of(path)])
         if path.is_dir() and not path.is_symlink():
             for input_path in self._inputs:
                 if path in (input_path, *input_path.parents):
