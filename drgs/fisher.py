@@ -22,26 +22,28 @@ What views say about a network that moves the Gaussians is in information/networ
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import DeformableScene, Gaussians, Scene
+from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_any_scene, check_scene, check_view, gaussians_at
-from drgs.information.groups import GROUPS, Group, Information, groups_of, scene_groups
+from drgs.information.columns import by_columns, jacobian_columns
+from drgs.information.groups import GROUPS, Group, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
-from drgs.information.network import network, network_variance_map
 from drgs.information.probes import by_probes
 from drgs.information.replay import Replay
 from drgs.information.semantics import SemanticMetric
-from drgs.integrator import render_jvp
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
 from drgs.splats import SplatScene, SplatTensors, scene_of
+
+if TYPE_CHECKING:
+    from drgs.information.network import network, network_variance_map
 
 __all__ = [
     "BLOCK",
@@ -61,7 +63,15 @@ __all__ = [
 ]
 
 BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
-_BATCH = 16  # tangents of one traversal
+
+
+def __getattr__(name: str) -> Any:
+    """What is about networks is loaded at first access (PEP 562): scenes that do not move have none."""
+    if name not in ("network", "network_variance_map"):
+        raise AttributeError(f"module 'drgs.fisher' has no attribute {name!r}")
+    from drgs.information import network as module
+
+    return getattr(module, name)
 
 
 @alone
@@ -137,8 +147,8 @@ def diagonal(
         network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
         part: dict[str, torch.Tensor] = {}
         if method == "columns":
-            part |= _by_columns(seen, camera, settings, theirs, weights, semantics)
-            part |= _by_columns(seen, camera, settings, own, weights, semantics, network)
+            part |= by_columns(seen, camera, settings, theirs, weights, semantics)
+            part |= by_columns(seen, camera, settings, own, weights, semantics, network)
         elif method == "probes":
             draw = (probes, seed + number)
             part |= by_probes(seen, camera, settings, theirs, weights, *draw, semantics)
@@ -264,56 +274,6 @@ def variance_map(
     return Replay(seen, camera, settings, semantics=semantics).variance(weights, _weights(channel_weights))
 
 
-def jacobian_columns(
-    gaussians: Scene,
-    camera: Camera,
-    index: Mapping[str, Any],
-    settings: RenderSettings | None = None,
-    batch: int = _BATCH,
-) -> torch.Tensor:
-    """Columns of the Jacobian by forward mode: how the image changes with single parameters.
-
-    Args:
-        gaussians, camera, settings: As for `render`.
-        index: Group -> integers. (M, 1 + axes) rows (gaussian, component...), (M,) for logit_opacities; `features` rows
-            are (gaussian, channel); `camera` (M,) of 0..5, the world-frame twist, rotation first. Of a
-            `drgs.ellipsoids.DeformableScene` the groups are its own tensors, by the names of its `parameters()`, and
-            rows are places in them.
-        batch: Columns carried through one traversal.
-    Returns:
-        (columns, H, W, 3), float32, in the order of `index`; with features (columns, H, W, 3 + D).
-    Raises:
-        ValueError: If a group or an index is unknown.
-    """
-    seen = gaussians_at("fisher.jacobian_columns", gaussians, camera)
-    check_view("fisher.jacobian_columns", seen, camera, settings)
-    must_be("fisher.jacobian_columns", "index", index, Mapping, 'e.g. {"camera": range(6)}')
-    chosen = []
-    for name, rows in index.items():
-        shape = _tangent_shape(seen, name, gaussians)
-        rows = np.asarray(rows, np.int64)
-        rows = rows[:, None] if rows.ndim == 1 else rows
-        if rows.ndim != 2 or rows.shape[1] != len(shape) or (rows < 0).any() or (rows >= shape).any():
-            raise ValueError(
-                f"fisher.jacobian_columns: index of {name} must be rows of {len(shape)} integers below {shape}, got "
-                f"shape {rows.shape}" + (f" up to {rows.max(0).tolist()}" if rows.size else "")
-            )
-        chosen += [(name, tuple(row)) for row in rows.tolist()]
-    images = []
-    for start in range(0, len(chosen), batch):
-        part = chosen[start : start + batch]
-        tangents: dict[str, torch.Tensor] = {}
-        for k, (name, at) in enumerate(part):
-            shape = _tangent_shape(seen, name, gaussians)
-            tangents.setdefault(name, torch.zeros(len(part), *shape, dtype=torch.float64))[(k, *at)] = 1
-        out = render_jvp(gaussians, camera, tangents, settings, outputs=())
-        images.append(out.rgb if out.features is None else torch.cat([out.rgb, out.features], -1))
-    if images:
-        return torch.cat(images)
-    width = 3 + (0 if seen.features is None else seen.features.shape[1])
-    return torch.zeros(0, camera.height, camera.width, width)
-
-
 def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings | None = None) -> torch.Tensor:
     """(6, 6) float64: what a view says about its own pose.
 
@@ -358,43 +318,3 @@ def _weights(channel_weights: Sequence[float]) -> list[float]:
     if len(weights) != 3 or not all(np.isfinite(weights)) or min(weights) < 0:
         raise ValueError(f"fisher: channel_weights must be 3 finite numbers >= 0, got {channel_weights}")
     return weights
-
-
-def _tangent_shape(gaussians: Gaussians, name: str, scene: Scene) -> tuple[int, ...]:
-    """Of a group's tangent, or the pose's."""
-    if name == "camera":
-        return (6,)
-    known = scene_groups(scene) or groups_of(gaussians)
-    if name not in known:
-        raise ValueError(f"fisher: a parameter group must be one of {', '.join(known)} or camera, got {name!r}")
-    return known[name].tangent(gaussians)
-
-
-def _by_columns(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RenderSettings,
-    wanted: Mapping[str, Group],
-    weights: Sequence[float],
-    semantics: SemanticMetric | None,
-    scene: Scene | None = None,
-) -> Information:
-    """From every column of the Jacobian, of Gaussians or of the scene that they come from."""
-    result = {}
-    scale = torch.tensor(weights, dtype=torch.float64)
-    for name, group in wanted.items():
-        shape, squares = group.tangent(gaussians), []
-        rows = np.argwhere(np.ones(shape))
-        for start in range(0, len(rows), _BATCH):
-            index = {name: rows[start : start + _BATCH]}
-            columns = jacobian_columns(scene or gaussians, camera, index, settings).double()
-            told = torch.zeros(len(columns), dtype=torch.float64)
-            if group.outputs == (0, 3):
-                told += (columns[..., :3].square() * scale).sum((1, 2, 3))
-            if semantics is not None:
-                told += semantics.squares(columns[..., 3:]).sum((1, 2))
-            elif group.outputs != (0, 3):
-                told += columns[..., 3:].square().sum((1, 2, 3))
-            squares.append(told)
-        result[name] = group.merge(torch.cat(squares).reshape(shape).cpu())
-    return result
