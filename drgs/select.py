@@ -32,7 +32,7 @@ from drgs.guards.arguments import must_be
 from drgs.guards.doors import camera_list, check_any_scene
 from drgs.information.cache import Cache
 from drgs.information.combine import Asked, Combination, asked_of
-from drgs.information.greedy import ViewInformation, greedy
+from drgs.information.greedy import InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pick, Pool, Scoring, Selection
 from drgs.information.semantics import SemanticMetric
 from drgs.information.spacetime import by_number, farthest_in_time, has_times, uniform_in_time
@@ -182,15 +182,19 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
     """
     settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
 
-    def compute(camera: Camera) -> Information:
-        found: dict[str, torch.Tensor] = {}
-        for one in asked:
-            found |= one(pool.scene, camera, settings)
-        return found
+    def by(asked: Sequence[Asked]) -> InformationSource:
+        def compute(camera: Camera) -> Information:
+            found: dict[str, torch.Tensor] = {}
+            for one in asked:
+                found |= one(pool.scene, camera, settings)
+            return found
+
+        return compute, (settings, *asked)
 
     if pool.information:
-        return greedy(pool, ViewInformation(pool, pool.information, (pool.information, settings)), combination)
-    return greedy(pool, ViewInformation(pool, compute, (settings, *asked)), combination)
+        return greedy(pool, ViewInformation(pool, (pool.information, (pool.information, settings))), combination)
+    known = None if all(one.known for one in asked) else by([one for one in asked if one.known])
+    return greedy(pool, ViewInformation(pool, by(asked), known), combination)
 
 
 def _scored(pool: Pool, **fields: Any) -> Pool:

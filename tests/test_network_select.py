@@ -117,6 +117,27 @@ def test_a_trace_needs_nothing_known(views, cache, network):
     assert sorted(found.scores)[-2:] == [x.score for x in reversed(found.picks)]
 
 
+@pytest.mark.parametrize("blocks", [("deformation",), ("geometry", "deformation")])
+def test_a_trace_does_not_ask_known_views(views, monkeypatch, blocks):
+    """Probes of the network are pulled back at the candidates alone; other blocks ask known views as ever."""
+    scene, cams = views
+    asked = {"network": [], "diagonal": []}
+    for name, names in asked.items():
+        plain = getattr(fisher, name)
+
+        def spy(scene, camera, *rest, plain=plain, names=names, **options):
+            names.append(camera.name)
+            return plain(scene, camera, *rest, **options)
+
+        monkeypatch.setattr(fisher, name, spy)
+    pick(scene, cams[2:4], cams[:2], 2, blocks=blocks, network="trace")
+    assert asked["network"] == [x.name for x in cams[2:4]]
+    assert asked["diagonal"] == ([x.name for x in cams[:4]] if "geometry" in blocks else [])
+    asked["network"].clear()
+    pick(scene, cams[2:4], cams[:2], 2, blocks=blocks)  # a ratio needs what is known
+    assert asked["network"] == [x.name for x in cams[:4]]
+
+
 @pytest.mark.parametrize("network", ["ratio", "trace"])
 def test_zscores_over_the_candidates(views, cache, network):
     """Each block is scored by its own information, less the mean over the standard deviation of the candidates."""

@@ -43,6 +43,7 @@ class Asked:
         options: Of the function, besides scene, camera and settings.
         block: What names of groups begin with; "" where all are scored together.
         groups: Of those of a network, the ones that count; None: all.
+        known: Whether views that are known are asked, too: a trace has no use for what they say.
     """
 
     function: str
@@ -50,6 +51,7 @@ class Asked:
     options: tuple[tuple[str, Hashable], ...] = ()
     block: str = ""
     groups: tuple[str, ...] | None = None
+    known: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, settings: RenderSettings) -> Information:
         """What one view says."""
@@ -194,8 +196,8 @@ def asked_of(
         rows = _rows(tuple(x for x in blocks if x != "deformation"), metric)
         estimate = "diagonal" if scoring.network == "ratio" else scoring.network
         options = {"estimate": estimate, "probes": scoring.probes, **rows}
-        made.append(Asked("network", (), tuple(sorted(options.items())), "deformation" if apart else "",
-                          tuple(network) or None))  # fmt: skip
+        name = "deformation" if apart else ""
+        made.append(Asked("network", (), tuple(sorted(options.items())), name, tuple(network) or None, not traced))
     asked = [one for one in made if one is not None]
     if not asked:
         raise ValueError(

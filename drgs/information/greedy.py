@@ -25,7 +25,10 @@ from drgs.information.combine import Combination
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.pool import Pool, Selection
 
-__all__ = ["ViewInformation", "greedy"]
+__all__ = ["InformationSource", "ViewInformation", "greedy"]
+
+InformationSource = tuple[Callable[[Camera], Information], Hashable]
+"""Camera -> Information, and the key of the cache: what that depends on besides scene and camera."""
 
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
 
@@ -38,24 +41,24 @@ class ViewInformation:
         told: Group of a network -> whether any view so far says something about it.
     """
 
-    def __init__(self, pool: Pool, compute: Callable[[Camera], Information], key: Hashable):
+    def __init__(self, pool: Pool, source: InformationSource, known: InformationSource | None = None):
         """
         Args:
             pool: Whose cache is asked, and whose `progress` is called after each view.
-            compute: Camera -> Information.
-            key: Of the cache: what `compute` depends on besides scene and camera.
+            source: What information is computed by.
+            known: The same of views that are known, where less is needed of them.
         """
-        self.pool, self.compute, self.key = pool, compute, key
+        self.pool, self.source, self.known = pool, source, known or source
         self.computed = self.done = 0
         self.told: dict[str, bool] = {}
 
-    def __call__(self, what: str, camera: Camera) -> Information:
+    def __call__(self, what: str, camera: Camera, is_known: bool = False) -> Information:
         """Of one view; `what` it is, for messages."""
-        pool = self.pool
+        pool, (compute, key) = self.pool, self.known if is_known else self.source
         if pool.cache is None:
-            found = self._new(what, camera)
+            found = self._new(what, camera, compute)
         else:
-            found = pool.cache.get(pool.scene, (self.key, camera_key(camera)), lambda: self._new(what, camera))
+            found = pool.cache.get(pool.scene, (key, camera_key(camera)), lambda: self._new(what, camera, compute))
         for name, x in found.items():
             if name.rpartition(".")[2] in NETWORK_GROUPS:
                 self.told[name] = self.told.get(name, False) or bool(x.any())
@@ -64,8 +67,8 @@ class ViewInformation:
             pool.progress(self.done, len(pool.train) + len(pool.candidates))
         return found
 
-    def _new(self, what: str, camera: Camera) -> Information:
-        found = {name: x.to(torch.float32) for name, x in self.compute(camera).items()}
+    def _new(self, what: str, camera: Camera, compute: Callable[[Camera], Information]) -> Information:
+        found = {name: x.to(torch.float32) for name, x in compute(camera).items()}
         self.computed += 1
         check(f"select: {what}", found, self.pool.scoring.criterion)
         return found
@@ -120,13 +123,13 @@ def _first_round(
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
     for i, camera in enumerate(pool.train):
-        part = information(f"training view {i} ({camera.name})", camera)
+        part = information(f"training view {i} ({camera.name})", camera, is_known=True)
         H = H or _nothing(part)
         _add(H, part)
     for i, camera in enumerate(pool.candidates):
         part = information(f"candidate {i} ({camera.name})", camera)
         if i == 0:
-            H = H or _nothing(part)
+            H = _nothing(part) | H  # also of what known views were not asked
             score = combination.scorer(H)
         gains.append(score(part))
         if pool.k > 1:
