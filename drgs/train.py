@@ -150,7 +150,10 @@ def _fit(
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
-    moved = None if motion is None else motion.report(trainer.rows)
+    moved = None
+    if motion is not None:
+        with Bar("timing the deformation") as bar:
+            moved = motion.report(trainer.rows, bar.update)
     segmentation = _segmentation(trainer, taught, run, held_out)
     result = metrics.evaluate(
         scene,

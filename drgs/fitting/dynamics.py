@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -150,9 +150,11 @@ class Motion:
         # Told, not optimized.
         return float((rows.tensors["motion"].detach() >= 0).float().mean()) if len(rows) else 0.0
 
-    def report(self, rows: GaussianRows) -> dict | None:
+    def report(self, rows: GaussianRows, progress: Callable[[int, int], object] | None = None) -> dict | None:
         """How many Gaussians move, and what not deforming the others saves: medians of 5 runs forward and backward.
 
+        Args:
+            progress: Called with the runs done and those there are.
         Returns:
             JSON-serializable: `moving`, `share`, `seconds` of deforming them and `seconds_all` of deforming all, a
             step; None in the static stage.
@@ -163,7 +165,7 @@ class Motion:
         scenes = [DynamicGaussians(rows.gaussians(), self.field, motion) for motion in (gates, gates.abs() + 1)]
         took: list[list[float]] = [[], []]
         moment = self.times[len(self.times) // 2]
-        for _ in range(_REPEATS):
+        for repeat in range(_REPEATS):
             for scene, spent in zip(scenes, took, strict=True):
                 began = time.perf_counter()
                 parameters = [x for x in scene.parameters().values() if x.requires_grad]
@@ -171,6 +173,8 @@ class Motion:
                 total = seen.means.sum() + seen.quats.sum() + seen.log_scales.sum()
                 torch.autograd.grad(total, parameters, allow_unused=True, retain_graph=True)
                 spent.append(time.perf_counter() - began)
+            if progress:
+                progress(repeat + 1, _REPEATS)
         seconds, everything = (sorted(spent)[_REPEATS // 2] for spent in took)
         moving = int(scenes[0].moving.sum())
         share = moving / max(len(rows), 1)
