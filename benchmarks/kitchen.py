@@ -80,8 +80,8 @@ METRICS = (
     Metric("psnr_moving", "PSNR, moving pixels", 2),
     Metric("ssim", "SSIM"),
     Metric("flip", "FLIP", larger=False),
-    Metric("pixel_accuracy", "pixel accuracy", path=("segmentation", "run", "pixel_accuracy")),
-    Metric("miou", "mIoU", path=("segmentation", "run", "miou")),
+    studies.segmentation("pixel_accuracy", "pixel accuracy"),
+    studies.segmentation("miou", "mIoU"),
 )
 UNITS = tuple((f"kitchen-{seed}", camera) for camera in ("cam00", "cam03") for seed in (1, 2, 3))
 """In the order in which --seeds takes them: cam00 is in the middle of the arc, cam01, ... go from left to right."""

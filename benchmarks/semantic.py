@@ -57,18 +57,13 @@ COMPARISONS = (
 )
 
 
-def of_run(key: str, title: str) -> Metric:
-    """A number of the segmentation of all test views, against the data set's labels."""
-    return Metric(key, title, path=("segmentation", "run", key))
-
-
 METRICS = (
     Metric("ssim", "SSIM"),
     Metric("psnr", "PSNR", 2),
     Metric("flip", "FLIP", larger=False),
-    of_run("pixel_accuracy", "pixel accuracy"),
-    of_run("class_accuracy", "class-mean accuracy"),
-    of_run("miou", "mIoU"),
+    studies.segmentation("pixel_accuracy", "pixel accuracy"),
+    studies.segmentation("class_accuracy", "class-mean accuracy"),
+    studies.segmentation("miou", "mIoU"),
 )
 SPLITS = (("room-1", (3, 0)), ("statue", (3, 0)), ("room-2", (3, 0)), ("statue", (3, 1)))
 

@@ -28,7 +28,7 @@ from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
-from drgs.lab.study import Study, append_row, read_study, run_cells  # noqa: E402
+from drgs.lab.study import Metric, Study, append_row, read_study, run_cells  # noqa: E402
 from drgs.lab.study_report import fill_between  # noqa: E402
 
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     "folder",
     "rank_correlation",
     "read_rows",
+    "segmentation",
     "stamp",
     "write_rows",
 ]
@@ -116,6 +117,11 @@ def rank_correlation(a, b, kind: str = "spearman") -> float:
     from scipy import stats
 
     return float((stats.spearmanr if kind == "spearman" else stats.kendalltau)(a, b).statistic)
+
+
+def segmentation(key: str, title: str) -> Metric:
+    """A number of the segmentation of all test views, against the data set's labels."""
+    return Metric(key, title, path=("segmentation", "run", key))
 
 
 def stamp(script: str) -> str:
