@@ -261,6 +261,10 @@ class _Loop:
             while trainer.step_index < config.max_steps:
                 if is_interrupted():
                     self.run_folder.log("interrupted", step=trainer.step_index)
+                    if not trainer.is_sound:
+                        raise interrupts.interruption(
+                            "not saved, the last step was not finite; --resume goes on at the last checkpoint"
+                        )
                     self.save()
                     raise interrupts.interruption(f"saved at step {trainer.step_index}, --resume goes on")
                 while self.plan and self.plan.is_due(trainer.step_index):

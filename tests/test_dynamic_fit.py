@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import shutil
+import signal
 import sys
 
 import numpy as np
@@ -161,6 +162,24 @@ def test_what_is_not_finite_is_named(dataset, tmp_path, monkeypatch):
     assert [e["reason"] for e in run.events() if e["event"] == "skipped"] == [
         "gradient of deformation.mlp.quats.3.weight not finite"
     ] * 9  # the tenth is the error
+
+
+def test_an_interrupted_streak_of_bad_steps_is_not_saved(dataset, tmp_path, monkeypatch):
+    """Ctrl-C while losses are not finite: the checkpoint before these stays, and the message says so."""
+    step = Trainer.step
+
+    def broken(self):
+        found = step(self)
+        if self.step_index == 5:
+            self._bad_in_a_row = 1
+            signal.raise_signal(signal.SIGINT)
+        return found
+
+    monkeypatch.setattr(Trainer, "step", broken)
+    how = config(max_steps=8, save_every=3)
+    with pytest.raises(KeyboardInterrupt, match="not saved, the last step was not finite; --resume goes on"):
+        fit(dataset, tmp_path / "run", how, progress=False)
+    assert load_state(Run(tmp_path / "run").state)[1]["step"] == 3
 
 
 def test_nothing_of_it_where_nothing_can_move(dataset, tmp_path, monkeypatch):
