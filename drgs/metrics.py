@@ -37,6 +37,7 @@ __all__ = [
     "psnr",
     "ssim",
     "through_viewers",
+    "uncovered",
     "write_metrics",
 ]
 
@@ -46,6 +47,7 @@ DEFINITIONS = {
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
+    "uncovered": "share of the pixels with an opacity below 0.5, of those inside the mask, lower is better",
 }
 METRICS = tuple(DEFINITIONS)
 MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
@@ -54,6 +56,7 @@ VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
 _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
+_COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11
 _VIEWERS = "gsplat"  # the model that viewers of PLY files draw with
@@ -80,6 +83,17 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
     """Structural similarity of (H, W, 3) images in [0, 1], at least 11x11 pixels, see `DEFINITIONS`."""
     return float(_ssim_map(image, target)[5:-5, 5:-5].mean())
+
+
+def uncovered(alpha: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Share of the pixels that Gaussians cover less than half, see `DEFINITIONS`.
+
+    Args:
+        alpha: (H, W) opacities.
+        mask: (H, W) weights in [0, 1], not all of them 0, or None.
+    """
+    bare = (alpha < _COVERED).double()
+    return float(bare.mean() if mask is None else (bare * mask).sum() / mask.double().sum())
 
 
 def flip(image: torch.Tensor, target: torch.Tensor) -> float:
@@ -181,8 +195,9 @@ def evaluate(
         segmentation: As `drgs.fitting.segments.segmentation_of` makes it; in words: why there is none.
         moving: Numbers of the classes that move; if there are any, views have `psnr_moving`, too.
     Returns:
-        JSON-serializable: `views` (a list of name, size and metrics), `mean`, `variants`, `reasons` of what is None; of
-        a run with features `segmentation` (`Segmentation.result`), whose views have `pixel_accuracy` and `miou`, too.
+        JSON-serializable: `views` (a list of name, size and metrics), `mean` and `median` over them, `variants`,
+        `reasons` of what is None; of a run with features `segmentation` (`Segmentation.result`), whose views have
+        `pixel_accuracy` and `miou`, too.
     """
     with Bar("measuring views", len(frames)) as bar:
         result = _evaluated(g, frames, settings, lpips, pictures, segmentation, moving, bar)
@@ -220,6 +235,7 @@ def _evaluated(
         row["psnr"] = psnr(image, frame.image(), frame.mask)
         if moving:
             row["psnr_moving"] = _moving_psnr(image, frame, moving)
+        row["uncovered"] = uncovered(out.alpha.cpu(), frame.mask)
         row["ssim_padded"] = float(_ssim_map(shown, target).mean())
         row["flip"] = flip(shown, target)
         if min(height, width) >= _SSIM_MIN_SIDE:
@@ -239,21 +255,21 @@ def _evaluated(
             error = (4 * (shown - target).abs()).clamp(0, 1)
             write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
         bar.advance()
-    mean = {}
-    for name in METRICS:
-        values = [row[name] for row in views if row[name] is not None]
-        mean[name] = sum(values) / len(values) if values and len(values) == len(views) else None
-        if not views:
-            reasons[name] = "no view is held out"
     variants = DEFINITIONS | (MOVING if moving else {})
-    if moving:
-        values = [row["psnr_moving"] for row in views if row["psnr_moving"] is not None]
-        mean["psnr_moving"] = sum(values) / len(values) if values else None
-        if not values:
-            reasons["psnr_moving"] = "no view shows anything with the label of a class that moves"
+    mean: dict[str, float | None] = {}
+    median: dict[str, float | None] = {}
+    for name in variants:
+        values = [row[name] for row in views if row[name] is not None]
+        # Not every view shows what moves; else a number that one view lacks has no average.
+        there = values and (name in MOVING or len(values) == len(views))
+        mean[name], median[name] = (sum(values) / len(values), float(np.median(values))) if there else (None, None)
+        if not views and name in DEFINITIONS:
+            reasons[name] = "no view is held out"
+    if moving and mean["psnr_moving"] is None:
+        reasons["psnr_moving"] = "no view shows anything with the label of a class that moves"
     if lpips is not None:
         variants["lpips"] += f", {lpips.backbone} backbone"
-    return {"views": views, "mean": mean, "variants": variants, "reasons": reasons}
+    return {"views": views, "mean": mean, "median": median, "variants": variants, "reasons": reasons}
 
 
 def _moving_psnr(image: torch.Tensor, frame: Frame, moving: frozenset[int]) -> float | None:

@@ -118,6 +118,8 @@ def _fit(
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     plan = ActiveViews(active, train, config, motion is not None) if active else None
+    if active and active.measure and not test:
+        raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
     # Parts of a caller's own say themselves what is fitted to what.
     begun = [plan.views[i] for i in plan.chosen] if plan else train
     taught = SemanticRecord.of(dataset, config, begun) if parts is None else None
@@ -146,7 +148,15 @@ def _fit(
     if plan:
         plan.write(run)  # forgets picks that no checkpoint knows of
     run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.rows))
-    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught)
+    moving = moving_labels(dataset) if motion else frozenset()
+
+    def measured(pictures: Path | None = None) -> dict:
+        shown = _segmentation(trainer, taught, run, held_out)
+        return metrics.evaluate(
+            trainer.scene(), held_out, config.settings, pictures=pictures, segmentation=shown, moving=moving
+        )
+
+    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured)
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
@@ -154,15 +164,7 @@ def _fit(
     if motion is not None:
         with Bar("timing the deformation") as bar:
             moved = motion.report(trainer.rows, bar.update)
-    segmentation = _segmentation(trainer, taught, run, held_out)
-    result = metrics.evaluate(
-        scene,
-        held_out,
-        config.settings,
-        pictures=run.renders / "test",
-        segmentation=segmentation,
-        moving=moving_labels(dataset) if motion else frozenset(),
-    )
+    result = measured(run.renders / "test")
     written = metrics.write_metrics(
         run,
         "test",
@@ -243,9 +245,10 @@ class _Loop:
         seconds: float,
         plan: ActiveViews | None,
         taught: SemanticRecord | None,
+        measured: Callable[[], dict],
     ) -> None:
         self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
-        self.seconds, self.plan, self.taught = seconds, plan, taught
+        self.seconds, self.plan, self.taught, self._measured = seconds, plan, taught, measured
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
@@ -268,8 +271,10 @@ class _Loop:
                     self.save()
                     raise interrupts.interruption(f"saved at step {trainer.step_index}, --resume goes on")
                 while self.plan and self.plan.is_due(trainer.step_index):
-                    self.save()  # choosing may take minutes, and can be interrupted anywhere
+                    self.save()  # measuring and choosing may take minutes, and can be interrupted anywhere
                     with interrupts.at_once():
+                        if self.plan.is_to_be_measured:
+                            self.plan.add_measured(trainer.step_index, self._measured())
                         self._pick(self.plan, bar)
                 began = time.perf_counter()
                 step = trainer.step()

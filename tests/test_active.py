@@ -13,12 +13,13 @@ import torch
 from test_data import HEIGHT, WIDTH, gradient, poses, save, write_colmap, write_image, write_llff, write_transforms
 
 import drgs
-from drgs import cli
+from drgs import cli, metrics
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig
+from drgs.fitting.frames import load_frames
 from drgs.fitting.records import fitted_views
 from drgs.fitting.timetable import initial_views
 from drgs.train import FitConfig, Trainer, fit
@@ -361,6 +362,42 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
     assert set(result.run.config()["pool"]) >= set(names)
 
 
+def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
+    """At the numbers of views that are asked for, just before the next pick: as drgs.metrics measures that model; the
+    fit is the same to the bit, and one that is killed between measuring and saving ends alike.
+    """
+    how, pick, left, own = config(deterministic=True), ActiveViews.pick, [2], []
+    plain = fit(lazily(still), tmp_path / "plain", how, active=plan(), progress=False)
+    held_out = load_frames(lazily(still).split(how.test_every)[1], how.max_pixels, how.mask)
+
+    def measuring(self, scene, *rest):
+        own.append(metrics.evaluate(scene, held_out, how.settings)["mean"])
+        return pick(self, scene, *rest)
+
+    monkeypatch.setattr(ActiveViews, "pick", measuring)
+    found = fit(lazily(still), tmp_path / "run", how, active=plan(measure=(2, 3)), progress=False)
+    assert plain.run.point_cloud.read_bytes() == found.run.point_cloud.read_bytes()
+    assert plain.metrics["mean"] == found.metrics["mean"]
+    measured = json.loads((tmp_path / "run/selection.json").read_text())["measured"]
+    assert [(x["views"], x["step"]) for x in measured] == [(2, 4), (3, 8)]
+    assert set(measured[0]["mean"]) == set(measured[0]["median"]) == set(metrics.METRICS)
+    assert [x["mean"] for x in measured] == own
+
+    def killed(self, *arguments):
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+        return pick(self, *arguments)
+
+    monkeypatch.setattr(ActiveViews, "pick", killed)
+    with pytest.raises(KeyboardInterrupt):
+        fit(lazily(still), tmp_path / "killed", how, active=plan(measure=(2, 3)), progress=False)
+    monkeypatch.setattr(ActiveViews, "pick", pick)
+    again = fit(lazily(still), tmp_path / "killed", how, active=plan(measure=(2, 3)), resume=True, progress=False)
+    assert json.loads((tmp_path / "killed/selection.json").read_text())["measured"] == measured
+    assert again.metrics["mean"] == found.metrics["mean"]
+
+
 def test_picked_view_brings_points_where_nothing_is(still):
     """An even share of the budget, inside the mask; none where Gaussians cover the view, or when not wanted."""
     train = lazily(still).split(4)[0]
@@ -500,6 +537,11 @@ def test_command(still, tmp_path, capsys):
         ("--views active --add 4 --every 5", "must be there before step 20, the last one would come at 20"),
         ("--views active --prior -1", "lambda (value) must be in [0, inf), got -1"),
         ("--views active --info-pixels 0", "info_pixels must be a whole number in [1, 1000000000], or None, got 0"),
+        (
+            "--views active --add 2 --every 4 --measure 2 4",
+            "--measure must be numbers of views that one more is added to",
+        ),
+        ("--views active --add 2 --every 4 --measure 2 --test-every 0", "--measure must have held-out views, got none"),
         ("--policy random", "--policy must have --views active, got --views all"),
         ("--views active --policy best", "--policy"),
     ],

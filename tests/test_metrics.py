@@ -81,12 +81,13 @@ def lpips_packages():
 class Rendered:
     """Stands for an `Output`."""
 
-    def __init__(self, rgb):
-        self.rgb = rgb
+    def __init__(self, rgb, alpha):
+        self.rgb, self.alpha = rgb, alpha
 
 
-def evaluate(monkeypatch, image, frames, **options):
-    monkeypatch.setattr("drgs.metrics.render", lambda g, camera, settings: Rendered(image))
+def evaluate(monkeypatch, image, frames, alpha=None, **options):
+    alpha = torch.ones(image.shape[:2]) if alpha is None and image is not None else alpha
+    monkeypatch.setattr("drgs.metrics.render", lambda g, camera, settings: Rendered(image, alpha))
     return metrics.evaluate(None, frames, RenderSettings.preset("fast"), **options)
 
 
@@ -104,7 +105,28 @@ def test_evaluation_is_per_view_and_mean_with_pictures(rng, monkeypatch, tmp_pat
     assert result["mean"]["psnr"] == pytest.approx((psnr + 100) / 2)
     assert result["mean"]["lpips"] is None
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a_b_1.png", "c.png"]
-    assert set(result["variants"]) == set(metrics.METRICS) == set(result["mean"])
+    assert set(result["variants"]) == set(metrics.METRICS) == set(result["mean"]) == set(result["median"])
+
+
+def test_medians_stand_beside_means(rng, monkeypatch):
+    """One bad view of three pulls the mean and leaves the median; what a view lacks has neither."""
+    a, b = images(rng)
+    near = 0.9 * a + 0.1 * b
+    result = evaluate(monkeypatch, a, [frame(near), frame(b), frame(near)])
+    values = [row["psnr"] for row in result["views"]]
+    assert result["median"]["psnr"] == values[0] == values[2] > result["mean"]["psnr"]
+    assert result["median"]["lpips"] is None
+
+
+def test_uncovered_is_a_share_of_the_mask(rng, monkeypatch):
+    """Pixels with an opacity below 0.5, of those that count."""
+    a, b = images(rng)
+    alpha = torch.full((40, 50), 0.5)
+    alpha[:10] = 0.49
+    mask = torch.zeros(40, 50)
+    mask[5:15] = 1
+    shares = [row["uncovered"] for row in evaluate(monkeypatch, b, [frame(a), frame(a, mask)], alpha)["views"]]
+    assert shares == [0.25, 0.5]
 
 
 @pytest.mark.parametrize(

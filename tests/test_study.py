@@ -315,6 +315,7 @@ def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
 def test_a_killed_cell_goes_on(still, tmp_path, monkeypatch):
     """A fit that is killed after a pick is resumed from its checkpoint and ends as one that was not."""
     study = small(still, deterministic=True)
+    study = dataclasses.replace(study, active=dataclasses.replace(study.active, measure=(2, 3)))
     cell = study.cells(units((3,)))[1]
     whole = run_cell(study, cell, tmp_path / "whole")
 
@@ -343,6 +344,10 @@ def test_a_killed_cell_goes_on(still, tmp_path, monkeypatch):
     assert {key: row[key] for key in same} == {key: whole[key] for key in same}
     assert len(row["picks"]) == 2
     assert row["metrics"]["psnr"] > 5.0
+    assert row["medians"]["psnr"] > 5.0
+    assert list(row["curve"]) == ["2", "3"]
+    assert row["curve"]["3"].keys() == row["metrics"].keys()
+    assert row["curve"]["3"]["steps"] == 6
 
 
 # ---- statistics

@@ -151,6 +151,8 @@ class Fit(Choosing, Data, Taught, Moving):
     """Steps before the first of them, and between two; default 200, or at times the same part of 17,000."""
     pick_points: PickPoints = ActiveConfig.pick_points
     """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
+    measure: tuple[int, ...] = ActiveConfig.measure
+    """Measure the held-out views also when there are so many views, just before the next one is chosen."""
 
     def settings(self) -> RenderSettings:
         """As for every command, with the background that the photographs are composited on."""

@@ -54,6 +54,7 @@ class ActiveViews:
         timetable: When one is picked, and among which.
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
+        measured: One record for each number of views at which the held-out views were measured on the way.
         pool_leak: Whether initial points have seen views that were not picked.
     """
 
@@ -70,8 +71,16 @@ class ActiveViews:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
         self.active, self.views, self._config = active, list(views), config
         self.timetable = Timetable.of(active, self.views, config, moves)
+        first, last = len(self.timetable.start), len(self.timetable.start) + self.timetable.add - 1
+        for count in active.measure:
+            if not first <= count <= last:
+                raise ValueError(
+                    f"active: --measure must be numbers of views that one more is added to, {first} to {last}, got "
+                    f"{count}; drop it (with all views the end of the fit is measured)"
+                )
         self.chosen = list(self.timetable.start)
         self.picks: list[dict] = []
+        self.measured: list[dict] = []
         self.pool_leak = config.init_points == "all"
         # Photographs of another time do not say where things are at this one.
         wanted = not self.pool_leak and self.timetable.schedule == "views"
@@ -169,6 +178,24 @@ class ActiveViews:
         """Whether a view is to be added before step `step` (from 0)."""
         return len(self.picks) < self.timetable.due(step)
 
+    @property
+    def is_to_be_measured(self) -> bool:
+        """Whether the held-out views are wanted now, before the next pick."""
+        count = len(self.chosen)
+        return count in self.active.measure and all(record["views"] != count for record in self.measured)
+
+    def add_measured(self, step: int, result: dict) -> None:
+        """Record what `drgs.metrics.evaluate` found, without single views.
+
+        Args:
+            step: Steps done.
+            result: Its.
+        """
+        labels = (result.get("segmentation") or {}).get("run") or {}
+        record = {"views": len(self.chosen), "step": step, "mean": result["mean"], "median": result["median"]}
+        numbers = {name: x for name, x in labels.items() if isinstance(x, float)}
+        self.measured.append(record | ({"segmentation": {"run": numbers}} if numbers else {}))
+
     def pick(self, scene: Scene, frames: list[Frame], step: int, decoder: Decoder | None = None) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
@@ -252,6 +279,7 @@ class ActiveViews:
             "pool": [view.name for view in self.views],
             "start": [{"index": i, "name": self.views[i].name, **self._where(i)} for i in initial],
             "picks": self.picks,
+            "measured": self.measured,
         }
 
     def write(self, run: Run) -> None:
@@ -261,6 +289,7 @@ class ActiveViews:
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header that a checkpoint adds to the trainer's."""
         header = {"config": self.active.to_json(), "pool": [view.name for view in self.views], "picks": self.picks}
+        header |= {"measured": self.measured}
         return {"policy_rng": self._generator.get_state()}, {"active": header}
 
     def restore(self, tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
@@ -283,7 +312,7 @@ class ActiveViews:
                 f"{where}: --resume must have the same training views, the data set, --test-every or --test-offset has "
                 "changed; repeat the options or choose another folder"
             )
-        self.picks = old["picks"]
+        self.picks, self.measured = old["picks"], old.get("measured", [])
         self.chosen = self.chosen[: len(self.timetable.start)] + [pick["index"] for pick in self.picks]
         self._generator.set_state(tensors["policy_rng"])
 

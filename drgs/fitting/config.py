@@ -258,6 +258,8 @@ class ActiveConfig:
             initial points of the whole data set and at later times, else `uncovered`.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
             None: all that the fit has.
+        measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
+            picked; selection.json has the averages. What all picks lead to is in metrics.json as ever.
     """
 
     policy: Policy = "fisher"
@@ -276,6 +278,7 @@ class ActiveConfig:
     network: NetworkScore = "ratio"
     combine: Combine | None = None
     probes: int = 16
+    measure: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         from drgs.gain import Prior
@@ -285,7 +288,7 @@ class ActiveConfig:
         if self.blocks is not None:
             object.__setattr__(self, "blocks", checked_blocks("active", self.blocks, self.method))
         count = (1, 10**9)
-        ranges = dict.fromkeys(("initial", "add", "every", "info_pixels", "probes"), count)
+        ranges = dict.fromkeys(("initial", "add", "every", "info_pixels", "probes", "measure"), count)
         check_fields("active", self, ranges)
         check_combined("active", self.blocks, self.criterion, self.network, self.combine)
         Prior(value=self.prior)

@@ -357,17 +357,21 @@ def _row(study: Study, cell: Cell, run: Run) -> dict:
             f"run `drgs eval {run.path}`"
         )
     env = read_json(run.path / "env.json", "where a run ran", advice)
+    measured: list[dict] = []
     if study.policies[cell.policy] is None:
         start, picks, leak = run.config()["train"], [], cell.protocol == "paper"
     else:
         chosen = read_json(run.path / SELECTION, "the record of the chosen views", advice)
         start, picks, leak = [view["name"] for view in chosen["start"]], chosen["picks"], chosen["pool_leak"]
+        measured = chosen.get("measured", [])
     return {
         "study": study.name,
         **cell.to_json(),
         "initial": start,
         "picks": [pick["name"] for pick in picks],
         "metrics": {metric.key: metric.read(metrics) for metric in study.metrics},
+        "medians": {metric.key: metrics.get("median", {}).get(metric.key) for metric in study.metrics},
+        "curve": {str(x["views"]): {metric.key: metric.read(x) for metric in study.metrics} for x in measured},
         "views": metrics["count"],
         "gaussians": metrics.get("gaussians"),
         "seconds": metrics.get("seconds"),
