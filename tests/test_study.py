@@ -22,8 +22,9 @@ from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.guards.locks import InUse
 from drgs.lab import study as engine
 from drgs.lab.study import Cell, Metric, Study, append_row, cell_of, distinct_seeds, read_study, run_cell, run_cells
+from drgs.lab.study_plot import draw_curves
 from drgs.lab.study_report import fill_between, study_report
-from drgs.lab.study_statistics import differences, estimate, unit_of
+from drgs.lab.study_statistics import at_views, differences, estimate, unit_of, view_counts
 
 METRICS = (
     Metric("psnr", "PSNR", 2),
@@ -468,6 +469,34 @@ def test_the_report_says_gain_and_loss(tmp_path):
     assert page.read_text() == "a\n<!-- x: begin -->\n\nnew\n\n<!-- x: end -->\nb\n"
     with pytest.raises(ValueError, match="must have <!-- y: begin --> and <!-- y: end -->"):
         fill_between(page, "y", "new")
+
+
+def test_curves_are_of_the_metrics_of_then(tmp_path):
+    """Means, differences and their intervals at each number of views that was measured, the end among them; rows that
+    were not measured on the way count at the end only; the picture has a panel a scene.
+    """
+    rows = []
+    for seed in range(6):
+        for policy, less in (("p", 0.0), ("Random, 1", 1.0)):
+            curve = {str(n): {"psnr": 10.0 + n - less * n, "flip": 1.0, "steps": n} for n in (3, 4)}
+            row = row_of(policy=policy, seed=seed, psnr=30.0 - less, picks=["a", "b", "c", "d"], curve=curve)
+            rows.append({**row, "initial": [f"v{seed}", "w"]})
+    rows.append({**row_of(policy="p", seed=7, psnr=30.0, picks=["a"] * 4), "initial": ["v7", "w"]})
+    assert view_counts(rows) == [3, 4, 6]
+    assert [row["metrics"]["psnr"] for row in at_views(rows, 4)[:2]] == [14.0, 10.0]
+    assert len(at_views(rows, 6)) == 13
+    assert view_counts(rows[-1:]) == []
+    text = told(rows)
+    assert "| p | 13.00 | 14.00 | 30.00 |" in text
+    assert "| p | +3.00 [+3.00, +3.00] **gain**, 6 of 6 | +4.00 [+4.00, +4.00] **gain**, 6 of 6 | +1.00 " in text
+    assert "Against the number of views" not in told(rows[-1:])
+    study = dataclasses.replace(small(tmp_path), policies={"p": {}, "Random, 1": {}})
+    assert not draw_curves(study, rows[-1:], METRICS[0], tmp_path / "none.png")
+    pytest.importorskip("matplotlib")
+    for scenes in (1, 5):
+        there = [{**row, "scene": f"s{k}"} for k in range(scenes) for row in rows]
+        assert draw_curves(study, there, METRICS[0], tmp_path / f"{scenes}.png")
+        assert (tmp_path / f"{scenes}.png").stat().st_size > 5000
 
 
 def test_a_page_comes_from_its_rows(monkeypatch):

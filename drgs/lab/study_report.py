@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.files import atomic_write
 from drgs.lab.study import Metric, Study
-from drgs.lab.study_statistics import Effect, Unit, differences, estimate, unit_of, values_of
+from drgs.lab.study_statistics import Effect, Unit, at_views, differences, estimate, unit_of, values_of, view_counts
 
 __all__ = ["fill_between", "study_report"]
 
@@ -58,6 +58,8 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             if verdicts := _verdicts(study, mine, study.comparisons):
                 table += "\n\n" + verdicts
             parts += [f"{below} Other pairs", table]
+        if counts := view_counts(mine):
+            parts += [f"{below} Against the number of views", _curves(study, mine, counts)]
         parts += [f"{below} Every unit", _points(study, mine)]
     if len(protocols) > 1:
         parts += [f"{'#' * level} `paper` against `blind`", _leaked(study, rows)]
@@ -188,6 +190,31 @@ def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], n
         return "No pair of policies has a unit in common yet."
     last = [f"{np.median(sizes[m.key]):.{m.digits}f}" if sizes[m.key] else "none" for m in study.metrics]
     return _table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
+
+
+def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
+    """Of each metric: policies against numbers of views, on average over scenes; below, what is left of differences."""
+    told = (
+        "Measured with so many views, on the way just before the next one is picked, with the last number at the end; "
+        "every scene counts alike."
+    )
+    parts = [_wrapped(told)]
+    for metric in study.metrics:
+        means, others = [], []
+        for label in _labels(study, rows):
+            values = [values_of(at_views(rows, count), metric.key, label) for count in counts]
+            averages = [estimate(found).mean if found else None for found in values]
+            means.append([label, *("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)])
+            if label == study.reference:
+                continue
+            found = [_estimates(study, at_views(rows, count), label, study.reference)[metric.key] for count in counts]
+            if any(found):
+                others.append([label, *(_difference(metric, one) if one else "none" for one in found)])
+        heads = ["policy", *(f"{count} views" for count in counts)]
+        parts += [f"{_title(metric)}:", _table(heads, means)]
+        if others:
+            parts += [f"The same, less that of `{study.reference}`:", _table(heads, others)]
+    return "\n\n".join(parts)
 
 
 def _leaked(study: Study, rows: StudyRows) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Effect", "differences", "estimate", "unit_of", "values_of"]
+__all__ = ["Effect", "at_views", "differences", "estimate", "unit_of", "values_of", "view_counts"]
 
 Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 
@@ -59,6 +59,27 @@ def unit_of(row: Mapping[str, Any]) -> Unit:
         return row["scene"], tuple(row["split"]), (row["camera"],)
     drawn = (f"seed {row['seed']}",) if row["start"] == "seed" else ("first",)
     return row["scene"], tuple(row["split"]), tuple(sorted(row.get("initial") or drawn))
+
+
+def view_counts(rows: Iterable[Mapping[str, Any]]) -> list[int]:
+    """Numbers of views at which rows say how good a fit was; none where none was measured on the way."""
+    rows = [row for row in rows if row.get("curve")]
+    return sorted({int(count) for row in rows for count in row["curve"]} | {_last(row) for row in rows})
+
+
+def at_views(rows: Iterable[Mapping[str, Any]], count: int) -> list[dict[str, Any]]:
+    """The rows that were measured with so many views, on the way or at the end, with the metrics of then."""
+    found = []
+    for row in rows:
+        metrics = row["metrics"] if _last(row) == count else row.get("curve", {}).get(str(count))
+        if metrics is not None:
+            found.append({**row, "metrics": metrics})
+    return found
+
+
+def _last(row: Mapping[str, Any]) -> int:
+    """Views of the end of a fit."""
+    return len(row.get("initial") or ()) + len(row.get("picks") or ())
 
 
 def values_of(rows: Iterable[Mapping[str, Any]], metric: str, policy: str) -> dict[Unit, float]:

@@ -1,0 +1,68 @@
+"""The picture of a study: a metric against the number of views, a panel a scene, a line a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drgs.guards.outputs import replacing
+from drgs.lab.study import Metric, Study
+from drgs.lab.study_statistics import at_views, values_of, view_counts
+
+__all__ = ["draw_curves"]
+
+_COLUMNS = 4
+_SIZE = 3.4  # inches of a panel
+
+
+def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric, path: Path) -> bool:
+    """Write what a study's fits had at each number of views, on average over the units of a scene.
+
+    Args:
+        study: Whose policies are drawn, in their order.
+        rows: Of one protocol.
+        metric: Its.
+        path: A .png or .svg.
+    Returns:
+        False where there is no matplotlib, or no row was measured on the way.
+    """
+    counts = view_counts(rows)
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    if not counts:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    columns = min(_COLUMNS, len(scenes))
+    lines = -(-len(scenes) // columns)
+    figure, axes = plt.subplots(lines, columns, figsize=(_SIZE * columns, _SIZE * lines), dpi=100, squeeze=False)
+    for axis in axes.flat[len(scenes) :]:
+        axis.set_axis_off()
+    colors = plt.get_cmap("tab20")
+    for axis, scene in zip(axes.flat, scenes, strict=False):
+        mine = [row for row in rows if row["scene"] == scene]
+        for number, label in enumerate(study.policies):
+            found = [(count, values_of(at_views(mine, count), metric.key, label)) for count in counts]
+            points = [(count, float(np.mean(list(values.values())))) for count, values in found if values]
+            if points:
+                style = "--" if label == study.reference else "-"
+                axis.plot(
+                    *zip(*points, strict=True), style, color=colors(number % 20), lw=1.2, ms=3, marker="o", label=label
+                )
+        axis.set(title=scene, xlabel="views", xticks=counts)
+        axis.set_ylabel(metric.title if axis in axes[:, 0] else "")
+        axis.grid(lw=0.3)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), fontsize=8, frameon=False)
+    figure.tight_layout(rect=(0, 0.02 + 0.06 * -(-len(labels) // 5) / lines, 1, 1))
+    with replacing(path, path.suffix) as name:
+        figure.savefig(name)
+    plt.close(figure)
+    return True
