@@ -10,6 +10,7 @@ import pytest
 import drgs
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import Dataset, View, added_points, initial_points, load
+from drgs.data.guesses import points_beside
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
 from drgs.fitting.active import ActiveViews
@@ -132,8 +133,8 @@ def test_triangulates_with_the_given_poses(tmp_path, rng):
 
 
 def test_triangulates_views_far_apart(tmp_path, rng):
-    """Two views 70 degrees apart: known poses say where to look for each feature's partner; random points where both
-    look make up for the few that there are.
+    """Two views 70 degrees apart: known poses say where to look for each feature's partner; points as far away as these
+    make up for the few that there are, and lie on the plane as well.
     """
     image, views = texture(rng), []
     for index, angle in enumerate(np.radians([-35.0, 35.0])):
@@ -143,16 +144,13 @@ def test_triangulates_views_far_apart(tmp_path, rng):
         color, _ = render_plane(camera, image)
         assert cv2.imwrite(str(views[-1].image_path), np.round(color[..., ::-1] * 255).astype(np.uint8))
     points, _, source = initial_points(views)
-    found, random = re.fullmatch(
-        r"triangulated from 2 given poses, (\d+) points, and (\d+) random where they look", source
+    found, guessed = re.fullmatch(
+        r"triangulated from 2 given poses, (\d+) points, and (\d+) as far away as those beside them", source
     ).groups()
     assert int(found) > 200
     assert on_plane(points[: int(found)]) > 0.9
-    assert len(points) == int(found) + int(random) == 2000
-    for view in views:
-        pixels, depth = view.camera.project(points)
-        assert ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all()
-        assert (depth > 0).all()
+    assert len(points) == int(found) + int(guessed) == 2000
+    assert np.median(np.abs(points[int(found) :, 2])) < 0.2  # 5 % of the distance
     assert len(initial_points(views, max_points=100)[0]) == 100
 
 
@@ -169,6 +167,9 @@ def test_one_view_more_costs_its_own_pairs(tmp_path, rng):
     assert 200 < count == found < len(later)
     np.testing.assert_array_equal(later, all_at_once)
     assert on_plane(later[:found]) > 0.95 > on_plane(later[found:])
+    assert np.median(np.abs(later[found:, 2])) < 0.3
+    inside = views[3].camera.project(later[found:])[0]
+    assert ((inside > 0) & (inside < (WIDTH, HEIGHT))).all(), "along rays of the last view"
     pixels, _ = views[3].camera.project(later[:found])
     columns, rows = pixels.astype(int).T
     # A track's color is the mean of its pictures', at features: edges, where half a pixel changes it.
@@ -274,3 +275,33 @@ def test_real_banana_and_head_load(data_dir):
         assert (dataset.format, len(dataset.views)) == (kind, count)
         assert dataset.views[0].image(90, 60).shape == (60, 90, 3)
     assert 0.1 < dataset.views[0].mask(90, 90).mean() < 0.9
+
+
+def test_guesses_are_as_far_away_as_what_is_beside_them(tmp_path, rng):
+    """Two walls, left 2 and right 6 away: each pixel gets the distance of its side; a view that shows none of them gets
+    both; a masked pixel gets none.
+    """
+    camera = Camera(intrinsics(300, 300, 150.5, 128.0), np.eye(4), WIDTH, HEIGHT)
+    views = []
+    for index in range(2):
+        path, mask = tmp_path / f"{index}.png", tmp_path / f"{index}_mask.png"
+        assert cv2.imwrite(str(path), rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+        inside = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        inside[:50] = 0
+        assert cv2.imwrite(str(mask), inside)
+        views.append(View(camera, f"{index}", image_path=path, mask_path=mask))
+    at = rng.uniform((0, 50), (WIDTH, HEIGHT), (400, 2))
+    near = at[:, 0] < WIDTH / 2
+    depth = np.where(near, 2.0, 6.0)
+    points = np.c_[(at - (150.5, 128.0)) / 300 * depth[:, None], depth]
+    shown = np.stack([np.ones(400, bool), np.zeros(400, bool)])
+    found, colors = points_beside(views, points, shown, 1000, rng)
+    pixels, z = camera.project(found)
+    assert len(found) == len(colors) == 1000
+    assert pixels[:, 1].min() >= 50
+    left = pixels[:500, 0] < WIDTH / 2
+    far = np.abs(pixels[:500, 0] - WIDTH / 2) > 30  # from the edge between the walls
+    assert (np.abs(np.log(z[:500] / np.where(left, 2.0, 6.0)))[far] < 0.3).all()
+    assert np.mean(z[500:] < 4) == pytest.approx(near.mean(), abs=0.1)
+    columns, rows = pixels.astype(int).T
+    np.testing.assert_allclose(views[0].image()[rows[:500], columns[:500]], colors[:500], atol=1e-6)

@@ -112,12 +112,12 @@ class Matches:
         """The points of all matches; matches that share a feature make one point.
 
         Returns:
-            Points (P, 3) float64, colors (P, 3) float32, and whether the last picture shows each (P,) bool.
+            Points (P, 3) float64, colors (P, 3) float32, and which of them each of V pictures shows (V, P) bool.
         """
         starts = np.cumsum([0] + [len(picture.pixels) for picture in self.pictures])
         found = sorted(self._found.items())
         if not sum(len(points) for _, (_, _, points) in found):
-            return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty(0, bool)
+            return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((len(self.pictures), 0), bool)
         edges = [np.stack([a + starts[i], b + starts[j]], axis=-1) for (i, j), (a, b, _) in found]
         points = [points for _, (_, _, points) in found]
         return _tracks(self.pictures, starts, np.concatenate(edges), np.concatenate(points))
@@ -235,7 +235,7 @@ def _tracks(
     np.maximum.at(most, edges.ravel(), np.repeat(support, 2))
     kept = np.flatnonzero((support >= 3) | ((support == 2) & (most[edges] == 2).all(axis=1)))
     if not len(kept):
-        return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty(0, bool)
+        return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((len(pictures), 0), bool)
     label = _components(edges[kept], len(pixels))[edges[kept, 0]]
     order = np.lexsort((-support[kept], label))
     chosen = kept[order[np.append(True, np.diff(label[order]) > 0)]]
@@ -252,9 +252,9 @@ def _tracks(
     np.add.at(b, match, (across @ eyes[:, :, None])[:, :, 0])
     np.add.at(color, match, np.concatenate([picture.colors for picture in pictures])[member])
     made = np.linalg.solve(A, b[:, :, None])[:, :, 0]
-    in_last = np.zeros(len(chosen), bool)
-    in_last[match[picture_of[member] == len(pictures) - 1]] = True
-    return made, color / np.bincount(match)[:, None].astype(np.float32), in_last
+    shown = np.zeros((len(pictures), len(chosen)), bool)
+    shown[picture_of[member], match] = True
+    return made, color / np.bincount(match)[:, None].astype(np.float32), shown
 
 
 def _components(edges: np.ndarray, count: int) -> np.ndarray:

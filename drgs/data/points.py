@@ -1,6 +1,4 @@
-"""Initial points of a scene: the data set's own, from depth maps, triangulated, or random; and the
-scene extent.
-"""
+"""Initial points of a scene: the data set's own, from depth maps, triangulated, or guessed (guesses.py)."""
 
 from __future__ import annotations
 
@@ -9,52 +7,26 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras import Camera
-from drgs.data.capture import Focus
+from drgs.data.guesses import FEWEST, MASK_KEEP, back_project, points_anywhere, points_beside, subset
 from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
 from drgs.display.progress import Bar
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["added_points", "initial_points", "read_point_ply", "scene_extent"]
+__all__ = ["added_points", "initial_points", "read_point_ply"]
 
-_EXTENT_MARGIN = 1.1
 _MIN_TRIANGULATED = 50
-_ENOUGH = 2_000  # triangulated points that need no random ones beside them
+_ENOUGH = 2_000  # triangulated points that need no others beside them
 _MAX_RANDOM = 20_000
 _NEIGHBORS = 10
 _FEATURE_SIZE = 1600
-_MASK_KEEP = 0.5
 _MAX_PLY_HEADER = 65536
 _PLY_BYTES = {
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
-
-
-def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
-    """1.1 x the largest distance of a camera center to their mean (3DGS), in scene units.
-
-    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to
-    it; 1.0 without points.
-
-    Args:
-        cameras: at least one.
-        points: (P,3) world points, used only in that case.
-    """
-    if not cameras:
-        raise ValueError("scene_extent: there must be at least one camera, got none; pass the training views' cameras")
-    centers = np.stack([camera.center for camera in cameras])
-    middle = centers.mean(axis=0)
-    spread = float(np.linalg.norm(centers - middle, axis=1).max())
-    # Below it, cameras that stand in one place differ by rounding alone.
-    if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
-        return _EXTENT_MARGIN * spread
-    if points is not None and len(points):
-        return _EXTENT_MARGIN * float(np.median(np.linalg.norm(points - middle, axis=1)))
-    return 1.0
 
 
 def initial_points(
@@ -66,7 +38,8 @@ def initial_points(
     """Points to start Gaussians from, by the first way that works.
 
     The data set's own points; back-projected depth maps; SIFT features triangulated with the given
-    poses; random points where the cameras look. Given a list of views, nothing but these views is
+    poses, and where these are few also points along other pixels' rays, as far away as what is
+    triangulated near them; random points where the cameras look. Given a list of views, nothing but these views is
     read, as active runs need it. Of synchronous cameras of a data set, those that are held out are not
     read. What moves has points where it was at first: of views at several times, those at the first one
     are read, unless they are from one place (a single camera that moves: then all).
@@ -86,7 +59,7 @@ def initial_points(
         raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
         colors = data.colors if data.colors is not None else np.full(data.points.shape, 0.5, dtype=np.float32)
-        keep = _subset(len(data.points), max_points, rng)
+        keep = subset(len(data.points), max_points, rng)
         note = "" if len(keep) == len(data.points) else f", {len(keep)} kept"
         return data.points[keep], colors[keep], f"{data.point_source}{note}"
     if any(view.depth_path is not None for view in views):
@@ -96,20 +69,19 @@ def initial_points(
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.has_image for view in views):
-        points, colors, _ = _triangulated(views, Matches(), progress)
+        points, colors, shown = _triangulated(views, Matches(), progress)
         if len(points) >= _MIN_TRIANGULATED:
-            keep = _subset(len(points), max_points, rng)
             source = f"triangulated from {len(views)} given poses, {len(points)} points"
-            points, colors = points[keep], colors[keep]
             missing = min(max_points, _ENOUGH) - len(points)
             if missing > 0:
                 # What no two views show would stay empty: density control does not leave what there is.
-                more, more_colors = _random(views, missing, rng)
+                more, more_colors = points_beside(views, points, shown, missing, rng)
                 points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
-                source += f", and {len(more)} random where they look"
-            return points, colors, source
+                return points, colors, f"{source}, and {len(more)} as far away as those beside them"
+            keep = subset(len(points), max_points, rng)
+            return points[keep], colors[keep], source
         tried = f" (triangulation gave {len(points)})"
-    points, colors = _random(views, min(max_points, _MAX_RANDOM), rng)
+    points, colors = points_anywhere(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
 
 
@@ -144,12 +116,16 @@ def added_points(
 
     Returns:
         points (P,3) float64 and colors (P,3) float32: first those triangulated with the last view, whose number is the
-        third value, then random ones where the views look.
+        third value, then guesses: along rays of the last view as far away as what is triangulated near them, or, where
+        these are next to none, random ones where the views look.
     """
-    points, colors, in_last = _triangulated(views, matches, progress)
-    more, more_colors = _random(views, _MAX_RANDOM, np.random.default_rng(seed))
-    found = int(in_last.sum())
-    return np.concatenate([points[in_last], more]), np.concatenate([colors[in_last], more_colors]), found
+    points, colors, shown = _triangulated(views, matches, progress)
+    mine, rng = shown[-1] if len(points) else np.empty(0, bool), np.random.default_rng(seed)
+    if mine.sum() >= FEWEST:
+        more, more_colors = points_beside(views[-1:], points, shown[-1:], _MAX_RANDOM, rng)
+    else:
+        more, more_colors = points_anywhere(views, _MAX_RANDOM, rng)
+    return np.concatenate([points[mine], more]), np.concatenate([colors[mine], more_colors]), int(mine.sum())
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -208,11 +184,6 @@ def _check_ply_size(path: Path) -> None:
         raise ValueError(f"a header that claims at least {least} bytes of data where the file holds {held}")
 
 
-def _subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of all, or of ``limit`` random ones in their order."""
-    return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))
-
-
 # -------------------------------------------------- depth
 
 
@@ -232,7 +203,7 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
         # A sensor sees no depth at edges, on dark and on far surfaces: 40 % of the pixels of an office. Without a
         # point there, nothing ever grows there; the nearest known depth is a fair guess.
         depth = _filled(depth)
-        valid = np.ones(depth.shape, bool) if mask is None else mask > _MASK_KEEP
+        valid = np.ones(depth.shape, bool) if mask is None else mask > MASK_KEEP
         pixels = np.flatnonzero(valid)
         if not len(pixels):
             continue
@@ -240,7 +211,7 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
         # between views.
         step = max(1.0, len(pixels) / share)
         chosen = pixels[np.arange(rng.uniform(0, min(step, len(pixels))), len(pixels), step).astype(np.int64)]
-        points.append(_back_project(view.camera, chosen, depth.reshape(-1)[chosen]))
+        points.append(back_project(view.camera, chosen, depth.reshape(-1)[chosen]))
         if not view.has_image:
             colors.append(np.full((len(chosen), 3), 0.5, dtype=np.float32))
         else:
@@ -262,21 +233,11 @@ def _filled(depth: np.ndarray) -> np.ndarray:
     return known[label]
 
 
-def _back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(P,3) world points of flat pixel indices (P,) of the undistorted image at z-depths (P,)."""
-    K = camera.K
-    y = (pixels // camera.width + 0.5 - K[1, 2]) / K[1, 1]
-    x = (pixels % camera.width + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    local = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[:, None].astype(np.float64)
-    c2w = camera.c2w
-    return local @ c2w[:3, :3].T + c2w[:3, 3]
-
-
 def _triangulated(
     views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated; and which
-    points the last view shows.
+    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated: (P,3)
+    points, (P,3) colors, and which points each view shows, (V,P).
     """
     import cv2
 
@@ -290,7 +251,7 @@ def _triangulated(
         mask = view.mask(camera.width, camera.height)
         if mask is not None:
             # Features reach past their center; a few pixels of margin keep the outline itself out.
-            mask = cv2.erode((mask > _MASK_KEEP).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+            mask = cv2.erode((mask > MASK_KEEP).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         matches.pictures.append(detect(camera, view.image(camera.width, camera.height), mask))
     if progress:
         progress("features", len(new), len(new))
@@ -298,53 +259,3 @@ def _triangulated(
     matches.match(nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS), progress)
     with Bar("triangulation"):
         return matches.triangulate()
-
-
-# -------------------------------------------------- random
-
-
-def _random(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points along random pixels' rays, kept where at least half as many cameras look as look at the best point, and
-    two if two look anywhere.
-    """
-    cameras = [view.camera.undistorted() for view in views]
-    distance = _focus_distance(cameras)
-    masks = [view.mask() if view.mask_path is not None else None for view in views]
-    drawn = 8 * count
-    points, colors = [], []
-    for index, camera in enumerate(cameras):
-        number = drawn // len(cameras) + (index < drawn % len(cameras))
-        size = camera.width * camera.height
-        allowed = np.arange(size) if masks[index] is None else np.flatnonzero(masks[index] > _MASK_KEEP)
-        if not len(allowed) or not number:
-            continue
-        pixels = rng.choice(allowed, number)
-        # Uniform in disparity between half and three times the distance: near things need more
-        # points.
-        depth = 1.0 / rng.uniform(1 / (3 * distance), 2 / distance, number)
-        points.append(_back_project(camera, pixels, depth))
-        view = views[index]
-        gray = np.full((number, 3), 0.5, dtype=np.float32)
-        colors.append(view.image().reshape(-1, 3)[pixels] if view.has_image else gray)
-    if not points:
-        return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
-    points, colors = np.concatenate(points), np.concatenate(colors)
-    seen = np.zeros(len(points), dtype=np.int64)
-    for camera, mask in zip(cameras, masks, strict=True):
-        pixels, _ = camera.project(points)
-        inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-        if mask is not None:
-            columns, rows = pixels[inside].astype(np.int64).T
-            inside[inside] = mask[rows, columns] > _MASK_KEEP
-        seen += inside
-    candidates = np.flatnonzero(seen >= max(seen.max() / 2, min(2, seen.max())))
-    keep = candidates[_subset(len(candidates), count, rng)]
-    return points[keep], colors[keep]
-
-
-def _focus_distance(cameras: list[Camera]) -> float:
-    """How far the cameras look: to the point that they look at, if there is one, else their extent."""
-    focus = Focus.of(cameras)
-    if focus is not None:
-        return float(np.median(np.linalg.norm(focus.eyes - focus.center, axis=1)))
-    return scene_extent(cameras) * (1.0 if len(cameras) == 1 else 3.0)

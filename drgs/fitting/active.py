@@ -123,7 +123,7 @@ class ActiveViews:
     def points(self, frame: Frame, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, bool]:
         """Points for new Gaussians from the view that was picked last.
 
-        Those that can be triangulated with it, and random ones where the scene leaves its pixels more than half
+        Those that can be triangulated with it, and guesses beside these where the scene leaves its pixels more than half
         transparent. Of a view with a depth map: points of the map, there only.
 
         Args:

@@ -1,0 +1,156 @@
+"""Points where nothing is triangulated, guessed: beside what is, or anywhere that cameras look; the scene extent."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.data.capture import Focus
+from drgs.data.views import View
+
+__all__ = ["FEWEST", "MASK_KEEP", "back_project", "points_anywhere", "points_beside", "scene_extent", "subset"]
+
+FEWEST = 3
+"""Triangulated points of a view that say how far away its other pixels may be."""
+MASK_KEEP = 0.5
+"""Weight in a mask from which on a pixel counts."""
+_EXTENT_MARGIN = 1.1
+_MOST = 1_000  # triangulated points of a view that are looked at
+_NEAREST = 4  # of these in the image, one of which says how far away a pixel is: on this side of an edge or on that
+_JITTER = 0.05  # relative standard deviation of that distance: surfaces are slanted
+_CHUNK = 2_000  # pixels at a time
+
+
+def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
+    """1.1 x the largest distance of a camera center to their mean (3DGS), in scene units.
+
+    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to
+    it; 1.0 without points.
+
+    Args:
+        cameras: at least one.
+        points: (P,3) world points, used only in that case.
+    """
+    if not cameras:
+        raise ValueError("scene_extent: there must be at least one camera, got none; pass the training views' cameras")
+    centers = np.stack([camera.center for camera in cameras])
+    middle = centers.mean(axis=0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    # Below it, cameras that stand in one place differ by rounding alone.
+    if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
+        return _EXTENT_MARGIN * spread
+    if points is not None and len(points):
+        return _EXTENT_MARGIN * float(np.median(np.linalg.norm(points - middle, axis=1)))
+    return 1.0
+
+
+def points_beside(
+    views: list[View], points: np.ndarray, shown: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """About `count` points along random pixels' rays, evenly of all views, as far away as triangulated points that the
+    same view shows nearby; of a view that shows next to none: as those of the others.
+
+    Args:
+        views: at least one.
+        points: (P,3) triangulated ones.
+        shown: (V,P) which of them each view shows; one shows one at least.
+        count: of new points.
+        rng: of pixels and depths.
+    """
+    cameras = [view.camera.undistorted() for view in views]
+    own = [camera.project(points[mine]) for camera, mine in zip(cameras, shown, strict=True)]
+    anywhere = np.concatenate([depth for _, depth in own])
+    found, colors = [], []
+    for index, (view, camera, (places, depths)) in enumerate(zip(views, cameras, own, strict=True)):
+        number = count // len(views) + (index < count % len(views))
+        mask = view.mask() if view.mask_path is not None else None
+        allowed = np.arange(camera.width * camera.height) if mask is None else np.flatnonzero(mask > MASK_KEEP)
+        if not len(allowed) or not number:
+            continue
+        pixels = rng.choice(allowed, number)
+        if len(depths) >= FEWEST:
+            kept = subset(len(depths), _MOST, rng)
+            depth = depths[kept][_one_of_nearest(places[kept], pixels, camera.width, rng)]
+        else:
+            depth = rng.choice(anywhere, number)
+        found.append(back_project(camera, pixels, depth * np.exp(_JITTER * rng.normal(size=number))))
+        colors.append(view.image().reshape(-1, 3)[pixels])
+    if not found:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
+    return np.concatenate(found), np.concatenate(colors)
+
+
+def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.random.Generator) -> np.ndarray:
+    """For each flat pixel the index of one of the places (P,2) that are nearest to it."""
+    centers = np.stack([pixels % width, pixels // width], axis=-1) + 0.5
+    count = min(_NEAREST, len(places))
+    which = rng.integers(0, count, len(pixels))
+    found = np.empty(len(pixels), np.int64)
+    for start in range(0, len(pixels), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        squares = ((centers[part, None] - places[None]) ** 2).sum(axis=2)
+        nearest = np.argpartition(squares, count - 1, axis=1)[:, :count]
+        found[part] = nearest[np.arange(len(nearest)), which[part]]
+    return found
+
+
+def points_anywhere(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points along random pixels' rays, kept where at least half as many cameras look as look at the best point, and
+    two if two look anywhere.
+    """
+    cameras = [view.camera.undistorted() for view in views]
+    distance = _focus_distance(cameras)
+    masks = [view.mask() if view.mask_path is not None else None for view in views]
+    drawn = 8 * count
+    points, colors = [], []
+    for index, camera in enumerate(cameras):
+        number = drawn // len(cameras) + (index < drawn % len(cameras))
+        size = camera.width * camera.height
+        allowed = np.arange(size) if masks[index] is None else np.flatnonzero(masks[index] > MASK_KEEP)
+        if not len(allowed) or not number:
+            continue
+        pixels = rng.choice(allowed, number)
+        # Uniform in disparity between half and three times the distance: near things need more
+        # points.
+        depth = 1.0 / rng.uniform(1 / (3 * distance), 2 / distance, number)
+        points.append(back_project(camera, pixels, depth))
+        view = views[index]
+        gray = np.full((number, 3), 0.5, dtype=np.float32)
+        colors.append(view.image().reshape(-1, 3)[pixels] if view.has_image else gray)
+    if not points:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
+    points, colors = np.concatenate(points), np.concatenate(colors)
+    seen = np.zeros(len(points), dtype=np.int64)
+    for camera, mask in zip(cameras, masks, strict=True):
+        pixels, _ = camera.project(points)
+        inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        if mask is not None:
+            columns, rows = pixels[inside].astype(np.int64).T
+            inside[inside] = mask[rows, columns] > MASK_KEEP
+        seen += inside
+    candidates = np.flatnonzero(seen >= max(seen.max() / 2, min(2, seen.max())))
+    keep = candidates[subset(len(candidates), count, rng)]
+    return points[keep], colors[keep]
+
+
+def _focus_distance(cameras: list[Camera]) -> float:
+    """How far the cameras look: to the point that they look at, if there is one, else their extent."""
+    focus = Focus.of(cameras)
+    if focus is not None:
+        return float(np.median(np.linalg.norm(focus.eyes - focus.center, axis=1)))
+    return scene_extent(cameras) * (1.0 if len(cameras) == 1 else 3.0)
+
+
+def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """(P,3) world points of flat pixel indices (P,) of the undistorted image at z-depths (P,)."""
+    K = camera.K
+    y = (pixels // camera.width + 0.5 - K[1, 2]) / K[1, 1]
+    x = (pixels % camera.width + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    local = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[:, None].astype(np.float64)
+    c2w = camera.c2w
+    return local @ c2w[:3, :3].T + c2w[:3, 3]
+
+
+def subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of all, or of ``limit`` random ones in their order."""
+    return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))
