@@ -398,6 +398,20 @@ def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
     assert again.metrics["mean"] == found.metrics["mean"]
 
 
+def test_a_fit_that_begins_again_goes_on_with_its_schedules(still, tmp_path, monkeypatch):
+    """Other Gaussians, of the same degree of SH and width of features; step, photographs and generator stay, and
+    density control counts from them. A killed run ends in the same bits.
+    """
+    monkeypatch.setattr(ActiveViews, "new_start", lambda self: (torch.rand(9, 3), torch.rand(9, 3)))
+    how = config(deterministic=True, sh_every=0.01, refine_start=0.9)
+    torch.manual_seed(0)
+    a = fit(lazily(still), tmp_path / "a", how, active=plan(), progress=False)
+    assert len(a.gaussians) == 9
+    assert a.gaussians.sh.shape[1] == 4
+    picks = [event for event in a.run.events() if event["event"] == "pick"]
+    assert [event["points"] for event in picks] == [9, 9]
+
+
 def test_picked_view_brings_points_where_nothing_is(still):
     """An even share of the budget, inside the mask; none where Gaussians cover the view, or when not wanted."""
     train = lazily(still).split(4)[0]

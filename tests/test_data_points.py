@@ -193,6 +193,35 @@ def test_picked_views_bring_triangulated_points(tmp_path, rng):
     assert on_plane(points.numpy()) > 0.95
 
 
+def test_fits_begin_again_at_points_of_all_views(tmp_path, rng):
+    """After each pick: what all views so far show together; not without `restart`, nor where nothing matches, nor with
+    points of the whole data set.
+    """
+    views = plane_views(tmp_path, rng, count=5)
+    for view in views[:2]:  # nothing to match
+        assert cv2.imwrite(str(view.image_path), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+
+    def starts(init_points="views", **fields):
+        config = FitConfig(max_pixels=10**6, max_gaussians=3000, max_steps=10, init_points=init_points)
+        plan, found = ActiveViews(ActiveConfig(initial=2, add=3, every=1, **fields), views, config), []
+        plan.chosen = [0, 1]
+        for index in (2, 3, 4):
+            plan.chosen.append(index)
+            plan.picks.append({"index": index})
+            start = plan.new_start()
+            found.append(None if start is None else len(start[0]))
+            if start is not None:
+                assert len(start[0]) == len(start[1]) <= config.max_gaussians - plan.reserved
+                assert float(start[0][:, 2].abs().median()) < 0.3
+        return found, [pick.get("restarted") for pick in plan.picks]
+
+    found, told = starts()
+    assert told == [False, True, True]
+    assert found[0] is None
+    assert min(found[1:]) > 200
+    assert starts(restart=False) == starts("all") == ([None] * 3, [None] * 3)
+
+
 def test_triangulation_stays_inside_the_masks(tmp_path, rng):
     """Features outside the masks are dropped."""
 

@@ -13,7 +13,7 @@ from drgs.data.guesses import scene_extent
 from drgs.data.llff import load_llff
 from drgs.data.multicamera import find_camera_folders, frame_folders, load_cameras
 from drgs.data.neu3d import POSES_BOUNDS, find_posed_frames, find_videos, load_neu3d
-from drgs.data.points import added_points, initial_points
+from drgs.data.points import added_points, initial_points, triangulated_points
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
 from drgs.data.train_meta import META, load_train_meta
@@ -23,7 +23,16 @@ from drgs.data.view_checks import check_times
 from drgs.data.views import Dataset, View
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["Dataset", "Semantics", "View", "added_points", "initial_points", "load", "scene_extent"]
+__all__ = [
+    "Dataset",
+    "Semantics",
+    "View",
+    "added_points",
+    "initial_points",
+    "load",
+    "scene_extent",
+    "triangulated_points",
+]
 
 
 def load(

@@ -14,7 +14,7 @@ from drgs.data.views import Dataset, View
 from drgs.display.progress import Bar
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["added_points", "initial_points", "read_point_ply"]
+__all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_points"]
 
 _MIN_TRIANGULATED = 50
 _ENOUGH = 2_000  # triangulated points that need no others beside them
@@ -69,20 +69,48 @@ def initial_points(
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.has_image for view in views):
-        points, colors, shown = _triangulated(views, Matches(), progress)
-        if len(points) >= _MIN_TRIANGULATED:
-            source = f"triangulated from {len(views)} given poses, {len(points)} points"
-            missing = min(max_points, _ENOUGH) - len(points)
-            if missing > 0:
-                # What no two views show would stay empty: density control does not leave what there is.
-                more, more_colors = points_beside(views, points, shown, missing, rng)
-                points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
-                return points, colors, f"{source}, and {len(more)} as far away as those beside them"
-            keep = subset(len(points), max_points, rng)
-            return points[keep], colors[keep], source
-        tried = f" (triangulation gave {len(points)})"
+        points, colors, found = triangulated_points(views, seed, max_points, Matches(), progress)
+        if len(points):
+            source = f"triangulated from {len(views)} given poses, {found} points"
+            guessed = max(len(points) - found, 0)
+            return points, colors, source + (f", and {guessed} as far away as those beside them" if guessed else "")
+        tried = f" (triangulation gave {found})"
     points, colors = points_anywhere(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
+
+
+def triangulated_points(
+    views: list[View],
+    seed: int,
+    max_points: int,
+    matches: Matches,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Points to start Gaussians from that all of these views together show, without depth maps.
+
+    Args:
+        views: at least two, with images.
+        seed: of all random choices.
+        max_points: at most so many.
+        matches: as for `added_points`.
+        progress: as for `initial_points`.
+
+    Returns:
+        points (P,3) float64 and colors (P,3) float32: those triangulated, and where they are few, guesses as far away
+        as these; none, where there are too few to go by. Third, how many are triangulated, before any is left out.
+    """
+    rng = np.random.default_rng(seed)
+    points, colors, shown = _triangulated(views, matches, progress)
+    found = len(points)
+    if found < _MIN_TRIANGULATED:
+        return points[:0], colors[:0], found
+    missing = min(max_points, _ENOUGH) - found
+    if missing > 0:
+        # What no two views show would stay empty: density control does not leave what there is.
+        more, more_colors = points_beside(views, points, shown, missing, rng)
+        return np.concatenate([points, more]), np.concatenate([colors, more_colors]), found
+    keep = subset(found, max_points, rng)
+    return points[keep], colors[keep], found
 
 
 def _all_at_first(data: Dataset) -> list[View]:

@@ -123,8 +123,8 @@ class ActiveViews:
     def points(self, frame: Frame, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, bool]:
         """Points for new Gaussians from the view that was picked last.
 
-        Those that can be triangulated with it, and guesses beside these where the scene leaves its pixels more than half
-        transparent. Of a view with a depth map: points of the map, there only.
+        Those that can be triangulated with it, and guesses beside these where the scene leaves its pixels more than
+        half transparent. Of a view with a depth map: points of the map, there only.
 
         Args:
             frame: Its photograph.
@@ -169,6 +169,26 @@ class ActiveViews:
         if len(kept) < _FEWEST:
             return nothing
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
+
+    def new_start(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """(P, 3) points and (P, 3) colors to begin the fit again with: what all views seen so far show together.
+
+        What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. None
+        where the fit goes on: without `restart`, with points of the whole data set or of depth maps, and where next to
+        nothing can be triangulated.
+        """
+        from drgs.data import triangulated_points
+
+        seen = [self.views[i] for i in self.chosen]
+        dense = any(view.depth_path is not None for view in seen)
+        if not self.active.restart or not self._share or dense:
+            return None
+        room = self._config.max_gaussians - self.reserved
+        with Bar("points of all views") as bar:
+            seed = self._config.seed + len(self.picks)
+            points, colors, _ = triangulated_points(seen, seed, room, self._matches, bar.stage)
+        self.picks[-1]["restarted"] = len(points) > 0
+        return (torch.from_numpy(points), torch.from_numpy(colors)) if len(points) else None
 
     def frames(self) -> list[Frame]:
         """The photographs seen so far."""
@@ -299,8 +319,7 @@ class ActiveViews:
             ValueError: If the checkpoint chose by another rule, or from other views.
         """
         old, new = header["active"], self._resolved(self.active.to_json())
-        # Of an earlier version: as the default does.
-        was = self._resolved({**type(self.active)().to_json(), **old["config"]})
+        was = self._resolved(self.active.recorded(old["config"]))
         for key in new:
             if new[key] != was[key]:
                 raise ValueError(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 from drgs.guards.arguments import check_fields, must_be
 from drgs.information.choices import (
@@ -256,6 +257,10 @@ class ActiveConfig:
             Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
             evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
             initial points of the whole data set and at later times, else `uncovered`.
+        restart: After each pick the Gaussians begin again, at points that all views seen so far show together, as in
+            FisherRF's code; schedules, networks and photographs go on. Not where `pick_points` brings none, with
+            points of depth maps, and where next to none can be triangulated. False: the Gaussians that there are go
+            on, as in arXiv 2512.22771.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
             None: all that the fit has.
         measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
@@ -278,6 +283,7 @@ class ActiveConfig:
     network: NetworkScore = "ratio"
     combine: Combine | None = None
     probes: int = 16
+    restart: bool = True
     measure: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -292,6 +298,11 @@ class ActiveConfig:
         check_fields("active", self, ranges)
         check_combined("active", self.blocks, self.criterion, self.network, self.combine)
         Prior(value=self.prior)
+
+    @classmethod
+    def recorded(cls, config: Mapping[str, Any]) -> dict:
+        """A recorded config with what an earlier version did not know: as it did, which never began again."""
+        return {**cls().to_json(), "restart": False, **config}
 
     def scoring(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
         """As `drgs.select` takes it, for views that are rendered with these settings."""

@@ -119,6 +119,15 @@ class Trainer:
             new |= self.motion.new_gates(len(points), self.rows)
         self.rows.append(new)
 
+    def restart(self, points: torch.Tensor, colors: torch.Tensor) -> None:
+        """Begin again with Gaussians at other points; schedules, networks and photographs stay as they are."""
+        features = self.rows.tensors.get("features")
+        width, degree = 0 if features is None else features.shape[1], self.rows.sh_degree
+        self.rows = GaussianRows.from_points(points, colors, *self.config.start_of(False), features=width)
+        while self.rows.sh_degree < degree:
+            self.rows.raise_sh_degree()
+        self._start_count = len(self.rows)
+
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
         self.frames = [*self.frames, frame]

@@ -338,7 +338,8 @@ def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> Non
         if wanted is None:
             continue
         now = json.loads(json.dumps(wanted.to_json()))
-        was = {**json.loads(json.dumps(type(wanted)().to_json())), **(found or {})}
+        found = found or {}
+        was = wanted.recorded(found) if isinstance(wanted, ActiveConfig) else {**FitConfig().to_json(), **found}
         for key, value in now.items():
             if value != was[key] and key != "save_every":
                 raise ValueError(
