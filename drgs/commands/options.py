@@ -36,6 +36,7 @@ from drgs.fitting.config import (
     InitPoints,
     MaskUse,
     PickPoints,
+    Restart,
     Schedule,
     Start,
 )
@@ -151,8 +152,8 @@ class Fit(Choosing, Data, Taught, Moving):
     """Steps before the first of them, and between two; default 200, or at times the same part of 17,000."""
     pick_points: PickPoints = ActiveConfig.pick_points
     """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
-    restart: bool = ActiveConfig.restart
-    """After each pick begin again at points of all views seen so far; not with depth maps or --init-points all."""
+    restart: Restart = ActiveConfig.restart
+    """After a pick begin again at points of all views so far: if these are twice as many (auto), always, or never."""
     measure: tuple[int, ...] = ActiveConfig.measure
     """Measure the held-out views also when there are so many views, just before the next one is chosen."""
 

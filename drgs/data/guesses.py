@@ -8,7 +8,16 @@ from drgs.cameras import Camera
 from drgs.data.capture import Focus
 from drgs.data.views import View
 
-__all__ = ["FEWEST", "MASK_KEEP", "back_project", "points_anywhere", "points_beside", "scene_extent", "subset"]
+__all__ = [
+    "FEWEST",
+    "MASK_KEEP",
+    "back_project",
+    "empty_share",
+    "points_anywhere",
+    "points_beside",
+    "scene_extent",
+    "subset",
+]
 
 FEWEST = 3
 """Triangulated points of a view that say how far away its other pixels may be."""
@@ -17,6 +26,7 @@ MASK_KEEP = 0.5
 _EXTENT_MARGIN = 1.1
 _MOST = 1_000  # triangulated points of a view that are looked at
 _NEAREST = 4  # of these in the image, one of which says how far away a pixel is: on this side of an edge or on that
+_CELLS = 16  # along each side of an image
 _JITTER = 0.05  # relative standard deviation of that distance: surfaces are slanted
 _CHUNK = 2_000  # pixels at a time
 
@@ -47,8 +57,9 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
 def points_beside(
     views: list[View], points: np.ndarray, shown: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """About `count` points along random pixels' rays, evenly of all views, as far away as triangulated points that the
-    same view shows nearby; of a view that shows next to none: as those of the others.
+    """About `count` points along random pixels' rays, as far away as triangulated points that the same view shows
+    nearby; of a view that shows next to none: as those of the others. Pixels with a triangulated point in their cell of
+    a grid get none; the other cells, of all views alike, as many each.
 
     Args:
         views: at least one.
@@ -60,12 +71,18 @@ def points_beside(
     cameras = [view.camera.undistorted() for view in views]
     own = [camera.project(points[mine]) for camera, mine in zip(cameras, shown, strict=True)]
     anywhere = np.concatenate([depth for _, depth in own])
+    open_pixels = [
+        _open_pixels(view, camera, places) for view, camera, (places, _) in zip(views, cameras, own, strict=True)
+    ]
+    shares = np.array(
+        [len(pixels) / camera.width / camera.height for pixels, camera in zip(open_pixels, cameras, strict=True)]
+    )
+    numbers = np.floor(count * np.cumsum(np.append(0, shares)) / max(shares.sum(), 1e-12)).astype(int)
     found, colors = [], []
-    for index, (view, camera, (places, depths)) in enumerate(zip(views, cameras, own, strict=True)):
-        number = count // len(views) + (index < count % len(views))
-        mask = view.mask() if view.mask_path is not None else None
-        allowed = np.arange(camera.width * camera.height) if mask is None else np.flatnonzero(mask > MASK_KEEP)
-        if not len(allowed) or not number:
+    for view, camera, (places, depths), allowed, number in zip(
+        views, cameras, own, open_pixels, np.diff(numbers), strict=True
+    ):
+        if not number:
             continue
         pixels = rng.choice(allowed, number)
         if len(depths) >= FEWEST:
@@ -78,6 +95,28 @@ def points_beside(
     if not found:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
     return np.concatenate(found), np.concatenate(colors)
+
+
+def empty_share(views: list[View], points: np.ndarray, shown: np.ndarray) -> float:
+    """The share of all views' pixels that have no triangulated point in their cell of the grid of `points_beside`."""
+    left = whole = 0
+    for view, mine in zip(views, shown, strict=True):
+        camera = view.camera.undistorted()
+        left += len(_open_pixels(view, camera, camera.project(points[mine])[0]))
+        whole += camera.width * camera.height
+    return left / max(whole, 1)
+
+
+def _open_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
+    """Flat indices of the pixels inside the mask in whose cell none of the places (P,2) is."""
+    across, down = (-(-size // _CELLS) for size in (camera.width, camera.height))
+    taken = np.zeros((_CELLS, _CELLS), bool)
+    columns, rows = (places // (across, down)).astype(int).clip(0, _CELLS - 1).T
+    taken[rows, columns] = True
+    is_open = ~np.kron(taken, np.ones((down, across), bool))[: camera.height, : camera.width]
+    if view.mask_path is not None:
+        is_open &= view.mask() > MASK_KEEP
+    return np.flatnonzero(is_open)
 
 
 def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.guesses import FEWEST, MASK_KEEP, back_project, points_anywhere, points_beside, subset
+from drgs.data.guesses import (
+    FEWEST,
+    MASK_KEEP,
+    back_project,
+    empty_share,
+    points_anywhere,
+    points_beside,
+    subset,
+)
 from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
@@ -72,8 +80,7 @@ def initial_points(
         points, colors, found = triangulated_points(views, seed, max_points, Matches(), progress)
         if len(points):
             source = f"triangulated from {len(views)} given poses, {found} points"
-            guessed = max(len(points) - found, 0)
-            return points, colors, source + (f", and {guessed} as far away as those beside them" if guessed else "")
+            return points, colors, f"{source}; {len(points)} with guesses where there are none"
         tried = f" (triangulation gave {found})"
     points, colors = points_anywhere(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
@@ -104,13 +111,12 @@ def triangulated_points(
     found = len(points)
     if found < _MIN_TRIANGULATED:
         return points[:0], colors[:0], found
-    missing = min(max_points, _ENOUGH) - found
-    if missing > 0:
-        # What no two views show would stay empty: density control does not leave what there is.
-        more, more_colors = points_beside(views, points, shown, missing, rng)
-        return np.concatenate([points, more]), np.concatenate([colors, more_colors]), found
-    keep = subset(found, max_points, rng)
-    return points[keep], colors[keep], found
+    # What no two views show would stay empty: density control does not leave what there is.
+    share = empty_share(views, points, shown)
+    guesses = round(min(max(_ENOUGH - found, share * found / max(1 - share, share)), share * max_points))
+    keep = subset(found, max_points - guesses, rng)
+    more, more_colors = points_beside(views, points, shown, guesses, rng)
+    return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
 
 
 def _all_at_first(data: Dataset) -> list[View]:

@@ -42,6 +42,8 @@ SELECTION = "selection.json"
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
+_MORE = 2  # times as many triangulated points as at the last start are worth another one,
+_SURE = 1000  # unless that had so many
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 
 
@@ -171,24 +173,29 @@ class ActiveViews:
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
 
     def new_start(self) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """(P, 3) points and (P, 3) colors to begin the fit again with: what all views seen so far show together.
+        """(P, 3) points and (P, 3) colors to begin the fit again with, where all views seen so far together show so
+        much more than it began with; None where it goes on.
 
-        What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. None
-        where the fit goes on: without `restart`, with points of the whole data set or of depth maps, and where next to
-        nothing can be triangulated.
+        What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. But what
+        was learned is lost. So `auto` begins again where twice as many points are triangulated as at the last start,
+        and these were few.
         """
         from drgs.data import triangulated_points
 
-        seen = [self.views[i] for i in self.chosen]
+        seen, restart = [self.views[i] for i in self.chosen], self.active.restart
         dense = any(view.depth_path is not None for view in seen)
-        if not self.active.restart or not self._share or dense:
+        if restart == "never" or not self._share or dense:
             return None
-        room = self._config.max_gaussians - self.reserved
+        seed, room = self._config.seed + len(self.picks), self._config.max_gaussians - self.reserved
         with Bar("points of all views") as bar:
-            seed = self._config.seed + len(self.picks)
-            points, colors, _ = triangulated_points(seen, seed, room, self._matches, bar.stage)
-        self.picks[-1]["restarted"] = len(points) > 0
-        return (torch.from_numpy(points), torch.from_numpy(colors)) if len(points) else None
+            points, colors, found = triangulated_points(seen, seed, room, self._matches, bar.stage)
+            began = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), None)
+            if began is None:
+                start = seen[: len(self.timetable.start)]
+                began = triangulated_points(start, seed, room, Matches())[2] if len(start) > 1 else 0
+        again = len(points) > 0 and (restart == "always" or (began < _SURE and found >= _MORE * began))
+        self.picks[-1] |= {"triangulated": found, "restarted": again}
+        return (torch.from_numpy(points), torch.from_numpy(colors)) if again else None
 
     def frames(self) -> list[Frame]:
         """The photographs seen so far."""

@@ -42,6 +42,7 @@ __all__ = [
 InitPoints = Literal["auto", "views", "all"]
 MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
+Restart = Literal["auto", "always", "never"]
 Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
 Degree = Literal[0, 1, 2, 3]
@@ -257,10 +258,10 @@ class ActiveConfig:
             Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
             evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
             initial points of the whole data set and at later times, else `uncovered`.
-        restart: After each pick the Gaussians begin again, at points that all views seen so far show together, as in
-            FisherRF's code; schedules, networks and photographs go on. Not where `pick_points` brings none, with
-            points of depth maps, and where next to none can be triangulated. False: the Gaussians that there are go
-            on, as in arXiv 2512.22771.
+        restart: Whether the Gaussians begin again after a pick, at points that all views seen so far show together;
+            schedules, networks and photographs go on. `auto`: where twice as many are triangulated as at the last
+            start, and these were fewer than 1,000; `always`, as FisherRF's code; `never`, as arXiv 2512.22771. Not
+            where `pick_points` brings none, with points of depth maps, and where next to none can be triangulated.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
             None: all that the fit has.
         measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
@@ -283,7 +284,7 @@ class ActiveConfig:
     network: NetworkScore = "ratio"
     combine: Combine | None = None
     probes: int = 16
-    restart: bool = True
+    restart: Restart = "auto"
     measure: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -302,7 +303,7 @@ class ActiveConfig:
     @classmethod
     def recorded(cls, config: Mapping[str, Any]) -> dict:
         """A recorded config with what an earlier version did not know: as it did, which never began again."""
-        return {**cls().to_json(), "restart": False, **config}
+        return {**cls().to_json(), "restart": "never", **config}
 
     def scoring(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
         """As `drgs.select` takes it, for views that are rendered with these settings."""
