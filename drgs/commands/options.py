@@ -153,7 +153,7 @@ class Fit(Choosing, Data, Taught, Moving):
     pick_points: PickPoints = ActiveConfig.pick_points
     """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
     restart: Restart = ActiveConfig.restart
-    """After a pick begin again at points of all views so far: if these are twice as many (auto), always, or never."""
+    """After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never."""
     measure: tuple[int, ...] = ActiveConfig.measure
     """Measure the held-out views also when there are so many views, just before the next one is chosen."""
 

@@ -42,8 +42,7 @@ SELECTION = "selection.json"
 _COVERED = 0.5  # opacity of a pixel that needs no new points
 _WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
 _MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
-_MORE = 2  # times as many triangulated points as at the last start are worth another one,
-_SURE = 1000  # unless that had so many
+_SURE = 1000  # triangulated points of a start that is good enough to go on
 _FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
 
 
@@ -173,12 +172,11 @@ class ActiveViews:
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
 
     def new_start(self) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """(P, 3) points and (P, 3) colors to begin the fit again with, where all views seen so far together show so
-        much more than it began with; None where it goes on.
+        """(P, 3) points and (P, 3) colors to begin the fit again with, as all views seen so far show them together;
+        None where it goes on.
 
-        What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. But what
-        was learned is lost. So `auto` begins again where twice as many points are triangulated as at the last start,
-        and these were few.
+        What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. But to
+        begin again loses what was learned. So `auto` does it until a start has had enough triangulated points.
         """
         from drgs.data import triangulated_points
 
@@ -193,7 +191,7 @@ class ActiveViews:
             if began is None:
                 start = seen[: len(self.timetable.start)]
                 began = triangulated_points(start, seed, room, Matches())[2] if len(start) > 1 else 0
-        again = len(points) > 0 and (restart == "always" or (began < _SURE and found >= _MORE * began))
+        again = len(points) > 0 and (restart == "always" or began < _SURE)
         self.picks[-1] |= {"triangulated": found, "restarted": again}
         return (torch.from_numpy(points), torch.from_numpy(colors)) if again else None
 

@@ -259,9 +259,9 @@ class ActiveConfig:
             evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
             initial points of the whole data set and at later times, else `uncovered`.
         restart: Whether the Gaussians begin again after a pick, at points that all views seen so far show together;
-            schedules, networks and photographs go on. `auto`: where twice as many are triangulated as at the last
-            start, and these were fewer than 1,000; `always`, as FisherRF's code; `never`, as arXiv 2512.22771. Not
-            where `pick_points` brings none, with points of depth maps, and where next to none can be triangulated.
+            schedules, networks and photographs go on. `auto`: until 1,000 were triangulated at a start; `always`, as
+            FisherRF's code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth
+            maps, and where next to none can be triangulated.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
             None: all that the fit has.
         measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
