@@ -21,6 +21,7 @@ import studies
 from studies import ROOT, SCALES
 
 from drgs.lab.study import Metric, Study, read_study, run_cells
+from drgs.lab.study_plot import draw_curves
 from drgs.lab.study_report import fill_between, study_report
 from drgs.train import ActiveConfig, FitConfig
 
@@ -53,7 +54,7 @@ def study_of(scale: str, runs: Path) -> Study:
         folder=lambda scene, split: studies.folder(scene, runs),
         policies=POLICIES,
         fit=FitConfig(**size),
-        active=ActiveConfig(initial=2, add=10, every=every),
+        active=ActiveConfig(initial=2, add=10, every=every, measure=(3, 4, 6, 8)),
         metrics=METRICS,
         reference="random",
     )
@@ -85,6 +86,8 @@ def main() -> int:
     args = parser.parse_args()
     if args.page:
         fill_between(ROOT / "docs" / "active-static.md", "active", page_of(args.scale, args.start))
+        rows = [row for row in read_study(RESULTS) if row["start"] == args.start]
+        draw_curves(study_of(args.scale, Path()), rows, METRICS[0], ROOT / "docs" / "pictures" / "active-curves.png")
         return 0
     study = study_of(args.scale, args.runs)
     units = [(scene, SPLIT, args.start, "blind", seed) for seed in range(args.seeds) for scene in args.scenes]

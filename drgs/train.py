@@ -314,13 +314,14 @@ class _Loop:
         trainer = self.trainer
         decoder: Any = trainer.network("decoder")
         frame, record = plan.pick(trainer.scene(), trainer.frames, trainer.step_index, decoder)
-        points, colors, dense = plan.points(frame, trainer.scene())
         if start := plan.new_start():
             trainer.restart(*start)
-            points = start[0]
-        elif len(points):
-            trainer.add_points(points, colors, *trainer.config.start_of(dense))
-        record["points"] = len(points)
+            record["points"] = len(start[0])
+        else:
+            points, colors, dense = plan.points(frame, trainer.scene())
+            if len(points):
+                trainer.add_points(points, colors, *trainer.config.start_of(dense))
+            record["points"] = len(points)
         trainer.reserved = plan.reserved
         trainer.add_frame(frame)
         plan.write(self.run_folder)

@@ -399,17 +399,33 @@ def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
 
 
 def test_a_fit_that_begins_again_goes_on_with_its_schedules(still, tmp_path, monkeypatch):
-    """Other Gaussians, of the same degree of SH and width of features; step, photographs and generator stay, and
-    density control counts from them. A killed run ends in the same bits.
+    """Other Gaussians of the same degree of SH; steps and photographs go on, and points are not added besides. A run
+    that is killed in between ends in the same bits.
     """
-    monkeypatch.setattr(ActiveViews, "new_start", lambda self: (torch.rand(9, 3), torch.rand(9, 3)))
+    made = torch.rand(2, 9, 3, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(ActiveViews, "new_start", lambda self: (made[0] + len(self.picks), made[1]))
+    monkeypatch.setattr(ActiveViews, "points", None)
     how = config(deterministic=True, sh_every=0.01, refine_start=0.9)
-    torch.manual_seed(0)
     a = fit(lazily(still), tmp_path / "a", how, active=plan(), progress=False)
     assert len(a.gaussians) == 9
     assert a.gaussians.sh.shape[1] == 4
+    assert float(a.gaussians.means.min()) > 1  # those of the second pick
     picks = [event for event in a.run.events() if event["event"] == "pick"]
-    assert [event["points"] for event in picks] == [9, 9]
+    assert [(event["step"], event["points"]) for event in picks] == [(4, 9), (8, 9)]
+    assert load_state(a.run.state)[1]["step"] == 16
+    step = Trainer.step
+
+    def killed(self):
+        if self.step_index == 6:
+            raise Killed
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", killed)
+    with pytest.raises(Killed):
+        fit(lazily(still), tmp_path / "b", how, active=plan(), progress=False)
+    monkeypatch.setattr(Trainer, "step", step)
+    b = fit(lazily(still), tmp_path / "b", how, active=plan(), resume=True, progress=False)
+    assert a.run.point_cloud.read_bytes() == b.run.point_cloud.read_bytes()
 
 
 def test_picked_view_brings_points_where_nothing_is(still):

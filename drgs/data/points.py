@@ -46,8 +46,8 @@ def initial_points(
     """Points to start Gaussians from, by the first way that works.
 
     The data set's own points; back-projected depth maps; SIFT features triangulated with the given
-    poses, and where these are few also points along other pixels' rays, as far away as what is
-    triangulated near them; random points where the cameras look. Given a list of views, nothing but these views is
+    poses, and guesses along the rays of pixels that have none of these near, as far away as what is
+    triangulated beside them; random points where the cameras look. Given a list of views, nothing but these is
     read, as active runs need it. Of synchronous cameras of a data set, those that are held out are not
     read. What moves has points where it was at first: of views at several times, those at the first one
     are read, unless they are from one place (a single camera that moves: then all).
@@ -103,17 +103,20 @@ def triangulated_points(
         progress: as for `initial_points`.
 
     Returns:
-        points (P,3) float64 and colors (P,3) float32: those triangulated, and where they are few, guesses as far away
-        as these; none, where there are too few to go by. Third, how many are triangulated, before any is left out.
+        points (P,3) float64 and colors (P,3) float32: those triangulated, and where images have none of them, guesses
+        as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are, before any
+        is left out.
     """
     rng = np.random.default_rng(seed)
     points, colors, shown = _triangulated(views, matches, progress)
     found = len(points)
     if found < _MIN_TRIANGULATED:
         return points[:0], colors[:0], found
-    # What no two views show would stay empty: density control does not leave what there is.
+    # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
+    # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
     share = empty_share(views, points, shown)
-    guesses = round(min(max(_ENOUGH - found, share * found / max(1 - share, share)), share * max_points))
+    as_dense = found * min(1.0, share / max(1 - share, 1e-9))
+    guesses = round(min(max(_ENOUGH - found, as_dense), share * max_points))
     keep = subset(found, max_points - guesses, rng)
     more, more_colors = points_beside(views, points, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found

@@ -89,6 +89,7 @@ class ActiveViews:
         self._share = config.max_gaussians // (len(self.chosen) + self.timetable.add) if grows else 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._matches = Matches()
+        self._began: int | None = None  # triangulated points of the start, once they are known
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
 
     def check_blocks(self, fitted: dict[Block, bool]) -> None:
@@ -185,12 +186,13 @@ class ActiveViews:
         if restart == "never" or not self._share or dense:
             return None
         seed, room = self._config.seed + len(self.picks), self._config.max_gaussians - self.reserved
+        began = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), self._began)
         with Bar("points of all views") as bar:
-            points, colors, found = triangulated_points(seen, seed, room, self._matches, bar.stage)
-            began = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), None)
-            if began is None:
+            if began is None:  # the first call: what is matched here is kept for the next one
                 start = seen[: len(self.timetable.start)]
-                began = triangulated_points(start, seed, room, Matches())[2] if len(start) > 1 else 0
+                began = triangulated_points(start, seed, room, self._matches, bar.stage)[2] if len(start) > 1 else 0
+                self._began = began
+            points, colors, found = triangulated_points(seen, seed, room, self._matches, bar.stage)
         again = len(points) > 0 and (restart == "always" or began < _SURE)
         self.picks[-1] |= {"triangulated": found, "restarted": again}
         return (torch.from_numpy(points), torch.from_numpy(colors)) if again else None
