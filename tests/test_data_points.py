@@ -177,6 +177,20 @@ def test_one_view_more_costs_its_own_pairs(tmp_path, rng):
     assert np.median(np.abs(views[3].image()[rows, columns] - colors[:found])) < 0.1
 
 
+def test_points_do_not_depend_on_how_many_views_came_at_once(tmp_path, rng, monkeypatch):
+    """Where cameras are matched with the nearest ones only, those that were nearest before others came do not count:
+    a fit that was killed and resumed, which matches all views at once, has the points of one that was not.
+    """
+    monkeypatch.setattr("drgs.data.points._NEIGHBORS", 1)
+    views, matches = plane_views(tmp_path, rng, count=5), Matches()
+    for count in (2, 4):
+        added_points([views[i] for i in (0, 4, 1, 3, 2)[:count]], 0, matches)
+    one_by_one = added_points([views[i] for i in (0, 4, 1, 3, 2)], 0, matches)
+    at_once = added_points([views[i] for i in (0, 4, 1, 3, 2)], 0, Matches())
+    assert one_by_one[2] == at_once[2] > 100
+    np.testing.assert_array_equal(one_by_one[0], at_once[0])
+
+
 def test_picked_views_bring_triangulated_points(tmp_path, rng):
     """A wall that hides everything, as random points may grow to, keeps no triangulated points out; views that are not
     picked are not read.

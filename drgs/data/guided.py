@@ -108,14 +108,17 @@ class Matches:
         if progress:
             progress("matching", len(left), len(left))
 
-    def triangulate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The points of all matches; matches that share a feature make one point.
+    def triangulate(self, pairs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points of the matches of these pairs; matches that share a feature make one point.
+
+        What else was matched, when there were fewer pictures, is left out: points then depend on the pictures alone,
+        not on how many of them came at once, and a fit that was killed and resumed has those of one that was not.
 
         Returns:
             Points (P, 3) float64, colors (P, 3) float32, and which of them each of V pictures shows (V, P) bool.
         """
         starts = np.cumsum([0] + [len(picture.pixels) for picture in self.pictures])
-        found = sorted(self._found.items())
+        found = [(pair, self._found[pair]) for pair in sorted(pairs)]
         if not sum(len(points) for _, (_, _, points) in found):
             return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((len(self.pictures), 0), bool)
         edges = [np.stack([a + starts[i], b + starts[j]], axis=-1) for (i, j), (a, b, _) in found]

@@ -293,6 +293,7 @@ def _triangulated(
     if progress:
         progress("features", len(new), len(new))
     poses = np.stack([picture.camera.c2w for picture in matches.pictures])
-    matches.match(nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS), progress)
+    pairs = nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS)
+    matches.match(pairs, progress)
     with Bar("triangulation"):
-        return matches.triangulate()
+        return matches.triangulate(pairs)
