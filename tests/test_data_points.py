@@ -345,13 +345,21 @@ def test_guesses_are_as_far_away_as_what_is_beside_them(tmp_path, rng):
     pixels, z = camera.project(found)
     assert len(found) == len(colors) == 1000
     assert pixels[:, 1].min() >= 50
-    first = int(1000 * (1 - 1 / (2 - len(np.unique(at // 19, axis=0)) / (16 * 11))))  # about: it has fewer open cells
-    left = pixels[:, 0] < WIDTH / 2
-    far = (np.abs(pixels[:, 0] - WIDTH / 2) > 60) & (np.arange(1000) < first - 100)  # from the edge between the walls
-    assert far.sum() > 100
-    assert (np.abs(np.log(z / np.where(left, 2.0, 6.0)))[far] < 0.3).all()
-    cell = lambda x: {tuple(c) for c in (x // (-(-WIDTH // 16), -(-HEIGHT // 16))).astype(int)}  # noqa: E731
-    assert not cell(pixels[: first - 100]) & cell(at)
-    assert np.mean(z[first + 100 :] < 4) == pytest.approx(near.mean(), abs=0.1)
+
+    def cell(places):
+        return [tuple(c) for c in (places // (WIDTH // 16, HEIGHT // 16)).astype(int)]
+
+    # The first view has fewer open cells than the second, of which it shows no point.
+    centers = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(50, HEIGHT)), axis=-1).reshape(-1, 2) + 0.5
+    taken = set(cell(at))
+    open_pixels = sum(c not in taken for c in cell(centers))
+    first = int(1000 * open_pixels / (open_pixels + len(centers)))
+    assert 200 < first < 500
+    left = pixels[:first, 0] < WIDTH / 2
+    far = np.abs(pixels[:first, 0] - WIDTH / 2) > 60  # from the edge between the walls
+    assert (np.abs(np.log(z[:first] / np.where(left, 2.0, 6.0)))[far] < 0.3).all()
+    assert not taken & set(cell(pixels[:first]))
+    assert taken & set(cell(pixels[first:]))
+    assert np.mean(z[first:] < 4) == pytest.approx(near.mean(), abs=0.1)
     columns, rows = pixels.astype(int).T
-    np.testing.assert_allclose(views[0].image()[rows, columns][: first - 100], colors[: first - 100], atol=1e-6)
+    np.testing.assert_allclose(views[0].image()[rows[:first], columns[:first]], colors[:first], atol=1e-6)
