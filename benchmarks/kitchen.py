@@ -10,14 +10,8 @@ all times, an upper reference. One thread a process; any number of processes may
 --shard: the lock of a run folder says who has a cell. Finished rows (benchmarks/kitchen.jsonl) and runs are kept,
 killed ones resumed.
 
-Sizes at `small` are so that 78 cells, six units, fit into about five hours of two processes (--seeds 3: half of it; a
-unit is whole before the next one begins). Measured on kitchen 0, on a machine that others used as well, in seconds of
-processor: 0.16 a step of the static stage and 0.25 of the dynamic one; 263 for the whole cell `geometry`, 32 of them
-its 13 picks, 17 reading and measuring; 24, 27 and 34 for the first three picks of `joint`, 18 to 20 views with 16
-probes each, about 1.5 a view. A cell without information is thus about 235, `moments`, `fisherrf` and the geometry ones
-245 to 290, and the five with a deformation 235 + 312 views * 1.5, about 715: 5,600 a unit, and 70 a kitchen that is
-filmed. 6 * 5,600 / 2 = 4.7 hours. What was not run to its end is `joint` (three picks of 13) and the others than
-`geometry`, whose numbers are sums of these parts.
+Sizes at `small` are so that three units, 39 cells, take about two hours of two processes (a unit is whole before the
+next one begins); docs/dynamic.md has the seconds of fits and picks.
 
 As the steps are a nineteenth of the paper's, features and decoder go five times as fast, as in benchmarks/semantic.py,
 and so does the field. That was tried on kitchen 0 (all views, 2,700 pixels, 3,000 Gaussians, color alone; the only
