@@ -228,7 +228,43 @@ def moments(pool: Pool) -> Selection:
     return Selection(picks, scores, evaluations=len(scores), notes=notes)
 
 
+def field(pool: Pool) -> Selection:
+    """Largest drop of the pool's expected error about where things are or may be."""
+    from drgs.information.prior_field import prior_field
+
+    return prior_field(pool)
+
+
+def facility(pool: Pool) -> Selection:
+    """Places that the pool's views will show, each by the chosen view that sees it best."""
+    from drgs.information.facility import facility
+
+    return facility(pool)
+
+
 # -------------------------------------------------- policies that look at poses only, or at nothing
+
+
+def poses(pool: Pool) -> Selection:
+    """k-medoids on camera centers and directions: the pool's views, each by the chosen one nearest to it."""
+    views = [*pool.train, *pool.candidates]
+    centers = np.array([camera.center for camera in views])
+    size = np.linalg.norm(centers - centers.mean(0), axis=1).mean() or 1.0
+    forward = np.array([camera.c2w[:3, 2] for camera in views])
+    angles = np.arccos((forward @ forward.T).clip(-1, 1))
+    distances = np.sqrt((np.linalg.norm(centers[:, None] - centers, axis=2) / size) ** 2 + (0.5 * angles) ** 2)
+    near, known = np.exp(-0.5 * distances**2), len(pool.train)
+    covered = near[:known].max(0) if known else np.zeros(len(views))
+    picks, scores, left = [], [], list(range(len(pool.candidates)))
+    for _ in range(pool.k):
+        gains = [float((near[known + i] - covered).clip(min=0).mean()) for i in left]
+        scores = scores or gains
+        order = sorted(range(len(left)), key=lambda j: -gains[j])
+        margin = gains[order[0]] - gains[order[1]] if len(order) > 1 else None
+        best = left.pop(order[0])
+        picks.append(pool.pick(best, gains[order[0]], margin=margin))
+        covered = np.maximum(covered, near[known + best])
+    return Selection(picks, scores, evaluations=pool.k * len(pool.candidates))
 
 
 def farthest(pool: Pool) -> Selection:
@@ -298,6 +334,9 @@ POLICIES: dict[str, Callable[[Pool], Selection]] = {
     "fisherrf": fisherrf,
     "coverage": coverage,
     "moments": moments,
+    "field": field,
+    "facility": facility,
+    "poses": poses,
     "farthest": farthest,
     "uniform": uniform,
     "random": random,
