@@ -9,6 +9,8 @@ References:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771: `eig`, section 3.3.
     [2] Jiang et al., FisherRF, ECCV 2024: `eig` of a diagonal, lambda = 1e-6.
     [3] Wilson et al., POp-GS, CVPR 2025: `logdet` ("D-opt"), `trace_cov` ("T-opt"), one block a Gaussian.
+    [4] Bates & Watts, Nonlinear Regression Analysis and Its Applications, 1988: V-optimality. Ash et al., Gone Fishing
+        (BAIT), NeurIPS 2021: of a pool that is to be labelled.
 """
 
 from __future__ import annotations
@@ -122,10 +124,13 @@ def information_gain(
     criterion: str = "eig",
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
+    pool: Information | None = None,
 ) -> Gain:
     """How much a candidate view adds to the training views, parameters taken as independent.
 
-    `eig` = sum Hc / (H + l), `logdet` = sum log(1 + Hc / (H + l)), `trace_cov` = sum 1 / (H + l) - 1 / (H + Hc + l).
+    `eig` = sum Hc / (H + l), `logdet` = sum log(1 + Hc / (H + l)), `trace_cov` = sum 1 / (H + l) - 1 / (H + Hc + l),
+    `v_opt` = sum P (1 / (H + l) - 1 / (H + Hc + l)), P the information of all views that will be looked at: the drop of
+    the predicted variance of their pixels [4].
     Features count once: all D channels have the same information, which divides out of the mean over them.
 
     Args:
@@ -133,6 +138,7 @@ def information_gain(
         criterion: One of `CRITERIA`; `block_logdet` takes {"blocks": (N, 13, 13)}, see `block_gain`.
         prior: Default `Prior()`, lambda = 1e-6 everywhere.
         weights: Group -> factor >= 0, default 1. `trace_cov` adds variances of different units unless they say how.
+        pool: P, of `v_opt` alone; same groups and shapes.
     Raises:
         ValueError: If groups, shapes, criterion or weights are wrong, or an entry is negative, NaN or infinite.
     """
@@ -142,7 +148,10 @@ def information_gain(
         must_be("information_gain", "prior", prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
     check("information_gain: train", train, criterion)
     check("information_gain: candidate", candidate, criterion)
-    return scorer(train, criterion, prior, weights)(candidate)
+    if pool is not None:
+        must_be("information_gain", "pool", pool, Mapping, "group -> tensor, as fisher.diagonal returns")
+        check("information_gain: pool", pool, criterion)
+    return scorer(train, criterion, prior, weights, pool)(candidate)
 
 
 def scorer(
@@ -150,6 +159,7 @@ def scorer(
     criterion: str = "eig",
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
+    pool: Information | None = None,
 ) -> Callable[[Information], Gain]:
     """`information_gain` against a fixed H: what does not depend on the candidate is done once.
 
@@ -158,13 +168,18 @@ def scorer(
     if criterion not in CRITERIA:
         raise ValueError(f"information_gain: criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}")
     prior = prior or Prior()
+    if (pool is not None) != (criterion == "v_opt"):
+        raise ValueError(
+            f"information_gain: pool must be given with criterion v_opt and no other, got {criterion} "
+            f"{'without' if pool is None else 'with'} one; it is the information of all views that will be looked at"
+        )
     if criterion == "block_logdet":
         if weights:
             raise ValueError(
                 f"information_gain: weights must be None for block_logdet, got {dict(weights)}; a block has no parts"
             )
         return _Blocks(train[BLOCKS], prior, BLOCK_LAYOUT)
-    return _Diagonal(train, criterion, prior, dict(weights or {}))
+    return _Diagonal(train, criterion, prior, dict(weights or {}), pool)
 
 
 def variances(train: Information, prior: Prior | None = None) -> dict[str, torch.Tensor]:
@@ -214,8 +229,9 @@ def _trace_cov(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
     return ratio.reciprocal_().add_(1).reciprocal_().mul_(variance)
 
 
-# Criterion -> what a parameter adds, of Hc / (H + l), which it may overwrite, and 1 / (H + l); float64.
-_TERMS = {"eig": _eig, "logdet": _logdet, "trace_cov": _trace_cov}
+# Criterion -> what a parameter adds, of Hc / (H + l), which it may overwrite, and 1 / (H + l); float64. Of `v_opt` the
+# second is P / (H + l).
+_TERMS = {"eig": _eig, "logdet": _logdet, "trace_cov": _trace_cov, "v_opt": _trace_cov}
 CRITERIA = (*_TERMS, "block_logdet")
 """Names of the criteria; the first is the default everywhere."""
 
@@ -223,7 +239,9 @@ CRITERIA = (*_TERMS, "block_logdet")
 class _Diagonal:
     """Scores of candidates against a diagonal H."""
 
-    def __init__(self, train: Information, criterion: str, prior: Prior, weights: dict):
+    def __init__(
+        self, train: Information, criterion: str, prior: Prior, weights: dict, pool: Information | None = None
+    ):
         for name, weight in weights.items():
             if name not in train:
                 raise ValueError(f"information_gain: weights must be of {', '.join(train)}, got {name!r}; drop it")
@@ -233,26 +251,22 @@ class _Diagonal:
         self.inverse = variances(train, prior)
         self.left_out = {name: int((x == 0).sum()) for name, x in self.inverse.items()}
         self.unseen = {name: (H == 0).to(torch.float64) for name, H in train.items()}
+        self.wanted = self.inverse
+        if pool is not None:
+            _check_alike("pool", pool, self.inverse)
+            self.wanted = {name: pool[name].to(torch.float64) * x for name, x in self.inverse.items()}
 
     def __call__(self, candidate: Information) -> Gain:
         """The gain of one candidate."""
-        if candidate.keys() != self.inverse.keys():
-            raise ValueError(
-                f"information_gain: candidate must have the groups of train, {', '.join(self.inverse)}, got "
-                f"{', '.join(candidate)}; compute both alike"
-            )
+        _check_alike("candidate", candidate, self.inverse)
         parts, unseen, terms_of = {}, {}, _TERMS[self.criterion]
         for name, variance in self.inverse.items():
-            Hc, weight = candidate[name], float(self.weights.get(name, 1.0))
-            if Hc.shape != variance.shape:
-                raise ValueError(
-                    f"information_gain: {name} must have the shape of train, {tuple(variance.shape)}, got "
-                    f"{tuple(Hc.shape)}; use the same Gaussians for both"
-                )
-            seen_or_not = only_unseen = 0.0
-            chunks = (x.flatten().split(_CHUNK) for x in (Hc, variance, self.unseen[name]))
-            for new, known, is_unseen in zip(*chunks, strict=True):
-                terms = terms_of(new.to(torch.float64, copy=True).mul_(known), known)
+            weight, seen_or_not, only_unseen = float(self.weights.get(name, 1.0)), 0.0, 0.0
+            chunks = (
+                x.flatten().split(_CHUNK) for x in (candidate[name], variance, self.wanted[name], self.unseen[name])
+            )
+            for new, known, wanted, is_unseen in zip(*chunks, strict=True):
+                terms = terms_of(new.to(torch.float64, copy=True).mul_(known), wanted)
                 seen_or_not += float(terms.sum())
                 only_unseen += float(terms @ is_unseen)
             parts[name], unseen[name] = weight * seen_or_not, weight * only_unseen
@@ -263,6 +277,21 @@ class _Diagonal:
                 "raise lambda or check the information for NaN"
             )
         return Gain(total, parts, dict(self.left_out), unseen)
+
+
+def _check_alike(what: str, information: Information, train: Information) -> None:
+    """Refuse information that is of other parameters than that of the training views."""
+    if information.keys() != train.keys():
+        raise ValueError(
+            f"information_gain: {what} must have the groups of train, {', '.join(train)}, got "
+            f"{', '.join(information)}; compute both alike"
+        )
+    for name, x in train.items():
+        if information[name].shape != x.shape:
+            raise ValueError(
+                f"information_gain: {name} must have the shape of train, {tuple(x.shape)}, got "
+                f"{tuple(information[name].shape)} of {what}; use the same Gaussians for both"
+            )
 
 
 # -------------------------------------------------- one block a Gaussian

@@ -41,6 +41,11 @@ def random_information(rng, n=40, K=4, seen=0.7):
     }
 
 
+def gain_of(Hc, H, criterion, prior=None, pool=None):
+    """`information_gain`; of `v_opt` for a pool that sees what the training views see, unless another one is given."""
+    return information_gain(Hc, H, criterion, prior, pool=(pool or H) if criterion == "v_opt" else None)
+
+
 def random_blocks(rng, n=20, rows=40):
     """Sums of outer products, the units of the parameters far apart."""
     J = torch.tensor(rng.normal(size=(n, rows, 13)) * 10 ** rng.uniform(-2, 2, (1, 1, 13)))
@@ -63,19 +68,20 @@ def views(rng, count=4, n=8):
 
 def test_definitions(rng):
     """Each criterion against its formula, written as loops."""
-    H, Hc = random_information(rng), random_information(rng)
+    H, Hc, P = random_information(rng), random_information(rng), random_information(rng)
     prior = Prior(1e-3, groups={"means": 10.0})
     formulas = {
-        "eig": lambda h, c, lam: c / (h + lam),
-        "logdet": lambda h, c, lam: math.log1p(c / (h + lam)),
-        "trace_cov": lambda h, c, lam: 1 / (h + lam) - 1 / (h + c + lam),
+        "eig": lambda h, c, lam, p: c / (h + lam),
+        "logdet": lambda h, c, lam, p: math.log1p(c / (h + lam)),
+        "trace_cov": lambda h, c, lam, p: 1 / (h + lam) - 1 / (h + c + lam),
+        "v_opt": lambda h, c, lam, p: p * (1 / (h + lam) - 1 / (h + c + lam)),
     }
     for criterion, formula in formulas.items():
-        gain = information_gain(Hc, H, criterion, prior, {"sh": 0.5})
+        gain = information_gain(Hc, H, criterion, prior, {"sh": 0.5}, P if criterion == "v_opt" else None)
         for name in H:
             lam = 10.0 if name == "means" else 1e-3
-            pairs = zip(H[name].flatten().tolist(), Hc[name].flatten().tolist(), strict=True)
-            values = [(formula(h, c, lam), h) for h, c in pairs]
+            triples = zip(*(x[name].flatten().tolist() for x in (H, Hc, P)), strict=True)
+            values = [(formula(h, c, lam, p), h) for h, c, p in triples]
             factor = 0.5 if name == "sh" else 1.0
             assert gain.parts[name] == pytest.approx(factor * math.fsum(v for v, _ in values), rel=1e-9)
             assert gain.unseen[name] == pytest.approx(factor * math.fsum(v for v, h in values if h == 0), rel=1e-9)
@@ -110,14 +116,14 @@ def test_permutation(rng, criterion):
         H, Hc = ({"blocks": random_blocks(rng, 40)} for _ in range(2))
     else:
         H, Hc = random_information(rng), random_information(rng)
-    one = information_gain(Hc, H, criterion)
+    one = gain_of(Hc, H, criterion)
     turned = ({name: x[order] for name, x in y.items()} for y in (Hc, H))
-    two = information_gain(*turned, criterion)
+    two = gain_of(*turned, criterion)
     assert two.total == pytest.approx(one.total, rel=1e-12)
     assert two.parts == pytest.approx(one.parts, rel=1e-12)
 
 
-@pytest.mark.parametrize("criterion", ["eig", "logdet"])
+@pytest.mark.parametrize("criterion", ["eig", "logdet", "v_opt"])
 def test_units(rng, criterion):
     """Seen parameters: as lambda -> 0 a group's unit stops mattering, linearly in lambda; a relative one never does."""
     H, Hc = random_information(rng, seen=1.0), random_information(rng)
@@ -125,13 +131,13 @@ def test_units(rng, criterion):
     other = [{name: x / unit**2 if name == "means" else x for name, x in y.items()} for y in (Hc, H)]
     differences = []
     for value in (1e-4, 1e-6, 1e-8, 0.0):
-        gains = [information_gain(*pair, criterion, Prior(value)).total for pair in ((Hc, H), other)]
+        gains = [gain_of(*pair, criterion, Prior(value)).total for pair in ((Hc, H), other)]
         differences.append(abs(gains[1] / gains[0] - 1))
     assert differences[0] > 1e-6
     assert differences[1] < 0.1 * differences[0]
     assert differences[2] < 0.02 * differences[1]
     assert differences[3] < 1e-12
-    relative = [information_gain(*pair, criterion, Prior(1e-2, relative=True)).total for pair in ((Hc, H), other)]
+    relative = [gain_of(*pair, criterion, Prior(1e-2, relative=True)).total for pair in ((Hc, H), other)]
     assert relative[1] == pytest.approx(relative[0], rel=1e-12)
 
 
@@ -160,7 +166,8 @@ def test_more_information_gains_less(rng):
         H, more, Hc = random_information(rng), random_information(rng), random_information(rng)
         later = {name: H[name] + more[name] for name in H}
         for criterion in DIAGONAL:
-            assert information_gain(Hc, later, criterion).total < information_gain(Hc, H, criterion).total
+            before, after = (gain_of(Hc, known, criterion, pool=more).total for known in (H, later))
+            assert after < before
         H, more, Hc = random_blocks(rng, rows=5), random_blocks(rng, rows=5), random_blocks(rng, rows=5)
         assert block_gain(Hc, H + more).total < block_gain(Hc, H).total
 
@@ -172,13 +179,13 @@ def test_lambda_zero(rng):
     """Parameters without training information are left out and counted; nothing is NaN, also where 0 meets 0."""
     H, Hc = random_information(rng, seen=0.5), random_information(rng, seen=0.5)
     for criterion in DIAGONAL:
-        gain = information_gain(Hc, H, criterion, Prior(0.0))
+        gain = gain_of(Hc, H, criterion, Prior(0.0))
         assert gain.left_out == {name: int((x == 0).sum()) for name, x in H.items()}
         assert sum(gain.left_out.values()) > 0
         assert set(gain.unseen.values()) == {0.0}
         seen = {name: x > 0 for name, x in H.items()}
         pairs = ({name: y[name][seen[name]] for name in H} for y in (Hc, H))
-        assert gain.total == pytest.approx(information_gain(*pairs, criterion, Prior(0.0)).total, rel=1e-12)
+        assert gain.total == pytest.approx(gain_of(*pairs, criterion, Prior(0.0)).total, rel=1e-12)
     nothing = {name: torch.zeros_like(x) for name, x in H.items()}
     assert information_gain(Hc, nothing, "eig", Prior(0.0)).total == 0
     assert information_gain(nothing, H, "logdet", Prior(0.0)).total == 0
@@ -220,7 +227,7 @@ def test_empty():
     """No Gaussians: nothing to gain."""
     none = {"means": torch.zeros(0, 3).double(), "sh": torch.zeros(0, 1, 3).double()}
     for criterion in DIAGONAL:
-        assert information_gain(none, none, criterion) == Gain(
+        assert gain_of(none, none, criterion) == Gain(
             0.0, {"means": 0.0, "sh": 0.0}, {"means": 0, "sh": 0}, {"means": 0.0, "sh": 0.0}
         )
     assert block_gain(torch.zeros(0, 13, 13), torch.zeros(0, 13, 13)).total == 0
@@ -245,6 +252,10 @@ def test_errors(rng):
         scorer(H)(bad)
     with pytest.raises(ValueError, match="criterion must be one of eig, logdet"):
         information_gain(Hc, H, "D-opt")
+    with pytest.raises(ValueError, match="pool must be given with criterion v_opt and no other, got eig with one"):
+        information_gain(Hc, H, "eig", pool=H)
+    with pytest.raises(ValueError, match="got v_opt without one"):
+        information_gain(Hc, H, "v_opt")
     with pytest.raises(ValueError, match="candidate must have the groups of train"):
         information_gain({"means": Hc["means"]}, H)
     with pytest.raises(ValueError, match=r"means must have the shape of train, \(40, 3\), got \(39, 3\)"):

@@ -30,7 +30,9 @@ def scene():
 
 @pytest.fixture(scope="module")
 def ring():
-    return [dataclasses.replace(c, name=f"{i:02d}") for i, c in enumerate(orbit((0, 0, 0), 4.0, 10, width=40, height=30))]
+    return [
+        dataclasses.replace(c, name=f"{i:02d}") for i, c in enumerate(orbit((0, 0, 0), 4.0, 10, width=40, height=30))
+    ]
 
 
 def flat(camera, depth=2.0, alpha=0.75):

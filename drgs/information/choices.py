@@ -25,10 +25,12 @@ __all__ = [
     "checked_blocks",
 ]
 
-Criterion = Literal["eig", "logdet", "trace_cov", "block_logdet"]
+Criterion = Literal["eig", "logdet", "trace_cov", "v_opt", "block_logdet"]
 """The names in `drgs.gain.CRITERIA`, where the functions are; the first is the default everywhere."""
 
-Policy = Literal["fisher", "fisherrf", "coverage", "moments", "field", "facility", "poses", "farthest", "uniform", "random"]
+Policy = Literal[
+    "fisher", "fisherrf", "coverage", "moments", "field", "facility", "poses", "farthest", "uniform", "random"
+]
 """The names in `drgs.select.POLICIES`, where the functions are."""
 
 Method = Literal["exact", "columns", "probes", "fisherrf"]

@@ -88,9 +88,17 @@ class Combination:
     apart: tuple[str, ...] = ()
     traced: str = ""
 
-    def scorer(self, H: Information) -> Callable[[Information], Gain]:
+    @property
+    def pooled(self) -> bool:
+        """Whether scores ask for the information of all views together, known ones and candidates."""
+        return self.scoring.criterion == "v_opt"
+
+    def scorer(self, H: Information, pool: Information | None = None) -> Callable[[Information], Gain]:
         """Gains of candidates against H, that of the known views.
 
+        Args:
+            H: Group -> tensor.
+            pool: Of all views together, where scores are `pooled`.
         Raises:
             ValueError: If the prior or weights name a group that there is not.
         """
@@ -98,7 +106,7 @@ class Combination:
         if not self.apart:
             if self.traced:
                 return _Trace(scoring.weights)
-            return scorer(H, scoring.criterion, scoring.prior, scoring.weights)
+            return scorer(H, scoring.criterion, scoring.prior, scoring.weights, pool)
         known = {name.partition(".")[2] for name in H}
         for what, names in (("Prior: groups", scoring.prior.groups), ("information_gain: weights", scoring.weights)):
             for name in names:
@@ -110,8 +118,11 @@ class Combination:
             weights = {name: x for name, x in scoring.weights.items() if name in own}
             lambdas = {name: x for name, x in scoring.prior.groups.items() if name in own}
             prior = dataclasses.replace(scoring.prior, groups=lambdas)
-            traced = block == self.traced
-            by_block[block] = _Trace(weights) if traced else scorer(own, scoring.criterion, prior, weights)
+            if block == self.traced:
+                by_block[block] = _Trace(weights)
+            else:
+                theirs = None if pool is None else _own(pool, block)
+                by_block[block] = scorer(own, scoring.criterion, prior, weights, theirs)
 
         def score(candidate: Information) -> Gain:
             gains = {block: one(_own(candidate, block)) for block, one in by_block.items()}

@@ -85,7 +85,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
     combination, prior = combination or Combination(pool.scoring), pool.scoring.prior
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
-    H, scores, kept = _first_round(pool, information, combination)
+    H, everything, scores, kept = _first_round(pool, information, combination)
     gains = combination.compared(scores)
     selection = Selection(
         picks=[],
@@ -110,15 +110,17 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         left.remove(best)
         _add(H, kept.pop(best))
         fresh = set()  # the other scores are bounds now
-        selection.evaluations += _refresh(gains, left, fresh, falling, combination.scorer(H), kept)
+        selection.evaluations += _refresh(gains, left, fresh, falling, combination.scorer(H, everything), kept)
         for i, gain in zip(left, combination.compared([gains[i] for i in left]), strict=True):
             gains[i] = gain
 
 
 def _first_round(
     pool: Pool, information: ViewInformation, combination: Combination
-) -> tuple[dict[str, torch.Tensor], list[Gain], dict[int, Information]]:
-    """H of the training views, every candidate's gain and, where more than one is picked, its information by index."""
+) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor] | None, list[Gain], dict[int, Information]]:
+    """H of the training views and, where scores are pooled, of all views; every candidate's gain and, where it is
+    wanted again, its information by index.
+    """
     H: dict[str, torch.Tensor] = {}
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
@@ -130,12 +132,19 @@ def _first_round(
         part = information(f"candidate {i} ({camera.name})", camera)
         if i == 0:
             H = _nothing(part) | H  # also of what known views were not asked
-            score = combination.scorer(H)
-        gains.append(score(part))
-        if pool.k > 1:
+            score = None if combination.pooled else combination.scorer(H)
+        if score:
+            gains.append(score(part))
+        if pool.k > 1 or combination.pooled:
             kept[i] = part
         del part  # else two views are alive while the next one is computed
-    return H, gains, kept
+    if not combination.pooled:
+        return H, None, gains, kept
+    everything = {name: x.clone() for name, x in H.items()}
+    for part in kept.values():
+        _add(everything, part)
+    score = combination.scorer(H, everything)
+    return H, everything, [score(part) for part in kept.values()], kept
 
 
 def _nothing(part: Information) -> dict[str, torch.Tensor]:

@@ -83,4 +83,6 @@ def prior_field(pool: Pool) -> Selection:
         picks.append(pool.pick(best, gains[order[0]], margin=margin))
         left.pop(order[0])
         known = known + told[len(pool.train) + best]
-    return Selection(picks, scores, evaluations=sum(len(pool.candidates) - j for j in range(pool.k)), computed=len(views))
+    return Selection(
+        picks, scores, evaluations=sum(len(pool.candidates) - j for j in range(pool.k)), computed=len(views)
+    )
