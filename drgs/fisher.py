@@ -32,6 +32,7 @@ from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import camera_list, check_any_scene, check_scene, check_view, gaussians_at
+from drgs.information.background import CELLS, background_information, background_variance
 from drgs.information.columns import by_columns, jacobian_columns
 from drgs.information.groups import GROUPS, Group, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
@@ -51,6 +52,7 @@ __all__ = [
     "Information",
     "Prior",
     "SemanticMetric",
+    "background",
     "blocks",
     "coverage",
     "diagonal",
@@ -239,6 +241,21 @@ def coverage(
 
 
 @alone
+def background(
+    gaussians: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
+) -> torch.Tensor:
+    """(1536,) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything, a
+    number for each cell of directions; its three channels have the same. See `drgs.information.background`.
+    """
+    cameras = _cameras_of("fisher.background", gaussians, cameras, settings)
+    settings = settings or RenderSettings.preset("exact")
+    total = torch.zeros(CELLS, dtype=torch.float64)
+    for camera in cameras:
+        total += background_information(gaussians, camera, settings)
+    return total
+
+
+@alone
 def variance_map(
     gaussians: Scene,
     camera: Camera,
@@ -254,7 +271,8 @@ def variance_map(
 
     Args:
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
-        weights: Group -> tensor shaped like its information; groups that are missing weigh 0.
+        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `background`, (1536,), is
+            that of the color behind what the Gaussians leave open.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
     check_view("fisher.variance_map", seen, camera, settings)
@@ -263,15 +281,24 @@ def variance_map(
     if semantics is not None:
         semantics.check("fisher.variance_map", seen)
     known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
+    behind, factors = weights.get("background"), _weights(channel_weights)
+    weights = {name: x for name, x in weights.items() if name != "background"}
+    if behind is not None and tuple(behind.shape) != (CELLS,):
+        raise ValueError(
+            f"fisher.variance_map: weights of background must have shape {(CELLS,)}, got {tuple(behind.shape)}"
+        )
     for name, x in weights.items():
         if name not in known:
             raise ValueError(f"fisher.variance_map: weights must be of {', '.join(known)}, got {name!r}")
         shape = known[name].shape(seen)
         if tuple(x.shape) != shape:
             raise ValueError(f"fisher.variance_map: weights of {name} must have shape {shape}, got {tuple(x.shape)}")
-    if not len(seen):
-        return torch.zeros(camera.height, camera.width)
-    return Replay(seen, camera, settings, semantics=semantics).variance(weights, _weights(channel_weights))
+    found = torch.zeros(camera.height, camera.width)
+    if len(seen) and weights:
+        found = Replay(seen, camera, settings, semantics=semantics).variance(weights, factors)
+    if behind is not None:
+        found = found + sum(factors) * background_variance(seen, camera, behind, settings).float()
+    return found
 
 
 def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings | None = None) -> torch.Tensor:

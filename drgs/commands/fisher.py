@@ -46,7 +46,12 @@ __all__ = ["KINDS", "Told", "added", "map_weights", "run"]
 
 KINDS = ("variance", "share")  # of maps
 # Block -> groups that it says nothing about.
-_OTHERS = {"geometry": ("features", *NETWORK_GROUPS), "semantic": ("sh", *NETWORK_GROUPS), "deformation": tuple(GROUPS)}
+_OTHERS = {
+    "geometry": ("features", "background", *NETWORK_GROUPS),
+    "semantic": ("sh", "background", *NETWORK_GROUPS),
+    "deformation": (*GROUPS, "background"),
+    "background": (*GROUPS, *NETWORK_GROUPS),
+}
 
 
 def run(args: Fisher) -> None:
@@ -170,6 +175,9 @@ class Told:
             options = self.options(block)
             if block == "deformation":
                 found[block] = fisher.network(self.scene, camera, self.settings, **options)
+                continue
+            if block == "background":
+                found[block] = {block: fisher.background(self.scene, camera, self.settings)}
                 continue
             if self.method == "probes":
                 options["probes"] = self.probes

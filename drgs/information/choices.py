@@ -38,9 +38,9 @@ Method = Literal["exact", "columns", "probes", "fisherrf"]
 
 METHODS: tuple[Method, ...] = typing.get_args(Method)
 
-Block = Literal["geometry", "semantic", "deformation"]
-"""What is asked of a view: what its colors and its features tell about the Gaussians, and what the image tells about
-the network that moves them."""
+Block = Literal["geometry", "semantic", "deformation", "background"]
+"""What is asked of a view: what its colors and its features tell about the Gaussians, what the image tells about the
+network that moves them, and about what stands behind them, where they leave a pixel open."""
 
 BLOCK_NAMES: tuple[Block, ...] = typing.get_args(Block)
 """In the order in which results name them."""

@@ -198,17 +198,20 @@ def asked_of(
     """
     combined = scoring.combined_of(blocks)
     network = [name for name in scoring.groups or () if name in NETWORK_GROUPS]
-    theirs = None if scoring.groups is None else tuple(x for x in scoring.groups if x not in network)
+    named = (*network, "background")
+    theirs = None if scoring.groups is None else tuple(x for x in scoring.groups if x not in named)
     traced = "deformation" if "deformation" in blocks and scoring.network != "ratio" else ""
     apart = blocks if combined == "zscore" else ()
     parts: list[Sequence[str]] = [[block] for block in apart] or [blocks]
     made = [_of_gaussians(scoring, part, metric, theirs, bool(apart)) for part in parts]
     if "deformation" in blocks and (scoring.groups is None or network):
-        rows = _rows(tuple(x for x in blocks if x != "deformation"), metric)
+        rows = _rows(tuple(x for x in blocks if x in ("geometry", "semantic")), metric)
         estimate = "diagonal" if scoring.network == "ratio" else scoring.network
         options = {"estimate": estimate, "probes": scoring.probes, **rows}
         name = "deformation" if apart else ""
         made.append(Asked("network", (), tuple(sorted(options.items())), name, tuple(network) or None, not traced))
+    if "background" in blocks and (scoring.groups is None or "background" in scoring.groups):
+        made.append(Asked("background", block="background" if apart else ""))
     asked = [one for one in made if one is not None]
     if not asked:
         raise ValueError(
@@ -228,7 +231,7 @@ def _of_gaussians(
     apart: bool,
 ) -> Asked | None:
     """What these blocks ask about Gaussians, together; None if that is nothing."""
-    blocks = tuple(x for x in blocks if x != "deformation")
+    blocks = tuple(x for x in blocks if x in ("geometry", "semantic"))
     without: tuple[str, ...] = () if "semantic" in blocks else ("features",)
     if "semantic" in blocks and "geometry" not in blocks:
         without = ("sh",)
