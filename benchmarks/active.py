@@ -1,101 +1,140 @@
-"""From 2 to 12 views by every policy, color alone: held-out quality, paired over scenes and seeds.
+"""From 2 to 12 views by every policy, color alone: held-out quality against the number of views, paired by units.
 
-    python benchmarks/active.py [--scale small] [--seeds 3] [--start first] [--scenes ...] [--policies ...]
-    python benchmarks/active.py --page
+    python benchmarks/active.py [--set report] [--scale small] [--seeds 5] [--shard K/N]     fits, rows as they come
+    python benchmarks/active.py --page [--merge ROWS.jsonl ...]                              docs/active-static.md
 
 The paper's static loop (2 views, one more every 200 steps at `paper` scale) as cells of `drgs.lab.study`: rows of
 benchmarks/active.jsonl and runs that are there are kept, killed ones resumed, and several processes may work side by
-side. Every 8th view is held out. The rows that are there begin with the first view whatever the seed: three units, one
-a scene, with three seeds each. `--start seed` makes every seed a unit. The page, docs/active-static.md, is of one of
-both.
+side. A unit is (scene, split, initial views); every seed draws other initial views, and captures are held out from two
+offsets on. Made scenes (`room-N`, `still-N`, N the seed) have test views drawn as the candidates are, 24 or more.
+
+Scenes were named before anything was run: constants of policies are chosen on `CHOICE`, the page reports `REPORT`, and
+no scene is in both. `blind` everywhere; the paper's protocol on the made scenes of the report, two units each.
 """
 
 from __future__ import annotations
 
-import argparse
+import os
 import sys
-import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
-import studies
-from studies import ROOT, SCALES
+os.environ.setdefault("DRGS_THREADS", "1")
 
-from drgs.lab.study import Metric, Study, read_study, run_cells
+import studies
+from studies import ROOT
+
+from drgs.lab.study import Metric, Study, distinct_seeds
 from drgs.lab.study_plot import draw_curves
-from drgs.lab.study_report import fill_between, study_report
+from drgs.lab.study_report import study_report
 from drgs.train import ActiveConfig, FitConfig
 
+CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")
+REPORT = ("office", "statue", "room-5", "room-6", "room-7", "still-1", "still-2", "still-3")
+SETS = {"report": REPORT, "choice": CHOICE}
+
+
+def _fisher(criterion: str, *blocks: str) -> dict:
+    return {"policy": "fisher", "criterion": criterion, "blocks": blocks or ("geometry",)}
+
+
 POLICIES = {
-    "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
-    "fisher, eig": {"policy": "fisher", "criterion": "eig"},
-    "fisher, logdet, relative 1e-3": {
-        "policy": "fisher",
-        "criterion": "logdet",
-        "prior": 1e-3,
-        "relative_prior": True,
+    **{name: {"policy": name} for name in ("random", "uniform", "farthest", "poses", "fisherrf", "facility", "field")},
+    **{f"{criterion}": _fisher(criterion) for criterion in ("eig", "logdet", "block_logdet", "v_opt")},
+    "v_opt, background": _fisher("v_opt", "background"),
+    **{
+        f"{criterion}, with background": _fisher(criterion, "geometry", "background")
+        for criterion in ("eig", "block_logdet", "v_opt")
     },
-    "fisherrf": {"policy": "fisherrf"},
-    "coverage": {"policy": "coverage"},
-    "farthest": {"policy": "farthest"},
-    "uniform": {"policy": "uniform"},
-    "random": {"policy": "random"},
 }
-METRICS = (Metric("psnr", "PSNR", 2), Metric("ssim", "SSIM"), Metric("flip", "FLIP", larger=False))
-RESULTS = ROOT / "benchmarks" / "active.jsonl"
-SPLIT = 8, 0
+METRICS = (
+    Metric("psnr", "PSNR", 2),
+    Metric("ssim", "SSIM"),
+    Metric("flip", "FLIP", larger=False),
+    Metric("uncovered", "uncovered", larger=False),
+)
+PAGE = ROOT / "docs" / "active-static.md"
+CURVES = ROOT / "docs" / "pictures" / "active-curves.png"
+SPLITS = {"banana": ((7, 0), (7, 3)), "captures": ((4, 0), (4, 2)), "made": ((3, 0),)}
+"""What is held out, by scene; seeds take the splits in turn."""
+SCALES = {
+    "small": (FitConfig(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, semantics="ignore"), 40, (160, 120)),
+    "paper": (FitConfig(max_pixels=130_000, max_gaussians=30_000, max_steps=7000, semantics="ignore"), 200, (320, 240)),
+}
 
 
 def study_of(scale: str, runs: Path) -> Study:
-    """The study at a scale."""
-    size = dict(SCALES[scale])
-    every = size.pop("every")
+    """The study at a scale; made scenes are made where they are not there yet."""
+    fit, every, (width, height) = SCALES[scale]
+
+    def folder(scene: str, split: tuple[int, int]) -> Path:
+        name, _, seed = scene.partition("-")
+        if not seed:
+            return studies.DATA / scene
+        from scenes import room, still_life
+
+        made = {"room": room, "still": still_life}[name].generate
+        return made(runs / f"active-{scale}-{scene}", views=84, width=width, height=height, seed=int(seed))
+
     return Study(
         name=f"active-{scale}",
-        folder=lambda scene, split: studies.folder(scene, runs),
+        folder=folder,
         policies=POLICIES,
-        fit=FitConfig(**size),
+        fit=fit,
         active=ActiveConfig(initial=2, add=10, every=every, measure=(3, 4, 6, 8)),
         metrics=METRICS,
         reference="random",
+        comparisons=tuple(
+            (label, other)
+            for label in ("v_opt, background", "v_opt, with background")
+            for other in ("farthest", "uniform", "fisherrf")
+        ),
     )
 
 
-def page_of(scale: str, start: str) -> str:
-    """The part of docs/active-static.md."""
-    size = SCALES[scale]
-    rows = [row for row in read_study(RESULTS) if row["start"] == start]
-    seeds = len({row["seed"] for row in rows})
-    text = (
-        f"`python benchmarks/active.py --scale {scale} --start {start}`: {size['max_gaussians']:,} Gaussians, at most "
-        f"{size['max_pixels']:,} pixels, {size['max_steps']:,} steps, 2 views and one more every {size['every']} steps "
-        f"until 12; {seeds} seeds. Nothing of a view is read before it is picked."
-    )
-    return textwrap.fill(text, 120, break_on_hyphens=False) + "\n\n" + study_report(study_of(scale, Path()), rows)
+def splits_of(scene: str) -> tuple[tuple[int, int], ...]:
+    """What is held out of a scene; seeds take the splits in turn."""
+    return SPLITS.get(scene, SPLITS["made" if "-" in scene else "captures"])
+
+
+def units_of(study: Study, seeds: int, scenes: Sequence[str]) -> list:
+    """Seeds outermost; the first two of made scenes once more by the paper's protocol, at the end."""
+    drawn = {}
+    for scene in scenes:
+        for number, split in enumerate(splits_of(scene)):
+            count = len(range(number, seeds, len(splits_of(scene))))
+            drawn[scene, split] = distinct_seeds(study, scene, split, count) if count else []
+    units = []
+    for number in range(seeds):
+        for scene in scenes:
+            turn, place = divmod(number, len(splits_of(scene)))
+            split = splits_of(scene)[place]
+            units.append((scene, split, "seed", "blind", drawn[scene, split][turn]))
+    made = [scene for scene in scenes if "-" in scene]
+    for number in range(min(2, seeds)):
+        units += [(x, splits_of(x)[0], "seed", "paper", drawn[x, splits_of(x)[0]][number]) for x in made]
+    return units
+
+
+def report(study: Study, rows: list[dict]) -> str:
+    """The tables, and the picture of the curves."""
+    blind = [row for row in rows if row["protocol"] == "blind"]
+    if draw_curves(study, blind, METRICS[0], CURVES):
+        shown = f"![PSNR against the number of views](pictures/{CURVES.name})"
+        return f"{shown}\n\n{study_report(study, rows)}"
+    return study_report(study, rows)
+
+
+def planned(seeds: int) -> int:
+    """Cells of the report."""
+    made = sum("-" in scene for scene in REPORT)
+    return (len(REPORT) * seeds + made * min(2, seeds)) * len(POLICIES)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scale", choices=list(SCALES), default="small")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--start", choices=("first", "seed"), default="first", help="what the initial views begin with")
-    parser.add_argument("--scenes", nargs="+", default=list(studies.SCENES))
-    parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=list(POLICIES))
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
-    parser.add_argument("--shard", default="0/1", help="K/N: every N-th cell from the K-th on")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
-    args = parser.parse_args()
-    if args.page:
-        fill_between(ROOT / "docs" / "active-static.md", "active", page_of(args.scale, args.start))
-        rows = [row for row in read_study(RESULTS) if row["start"] == args.start]
-        draw_curves(study_of(args.scale, Path()), rows, METRICS[0], ROOT / "docs" / "pictures" / "active-curves.png")
-        return 0
-    study = study_of(args.scale, args.runs)
-    units = [(scene, SPLIT, args.start, "blind", seed) for seed in range(args.seeds) for scene in args.scenes]
-    shard, shards = map(int, args.shard.split("/"))
-    cells = [cell for cell in study.cells(units) if cell.policy in args.policies][shard::shards]
-    taken, failed = run_cells(study, cells, args.runs, RESULTS, say=lambda line: print(line, flush=True))
-    print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {studies.stamp('active')}")
-    return 1 if failed else 0
+    return studies.command(
+        "active", PAGE, SCALES, study_of, units_of, planned=planned, report=report, seeds=5, sets=SETS
+    )
 
 
 if __name__ == "__main__":

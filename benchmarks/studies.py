@@ -13,7 +13,7 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -146,22 +146,24 @@ def command(
     page: Path,
     scales: Iterable[str],
     study_of: Callable[[str, Path], Study],
-    units_of: Callable[[Study, int], list],
+    units_of: Callable[..., list],
     planned: Callable[[int], int],
     report: Callable[[Study, list[dict]], str],
     seeds: int = 3,
+    sets: Mapping[str, Sequence[str]] | None = None,
 ) -> int:
-    """The command line of a study that fits data sets it makes itself; rows go to benchmarks/SCRIPT.jsonl.
+    """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl.
 
     Args:
         script: Its name, and that of its part of the page.
         page: Where the tables go.
         scales: What --scale may be, the default first.
         study_of: Scale, folder of runs -> study.
-        units_of: Study, --seeds -> units, as `Study.cells` takes them.
+        units_of: Study, --seeds and, with `sets`, the scenes -> units, as `Study.cells` takes them.
         planned: --seeds -> cells of the whole study.
         report: Study, its rows -> tables.
         seeds: The default of --seeds.
+        sets: --set -> its scenes, the first the default; None: all scenes, and no such option.
     Returns:
         The exit code.
     """
@@ -173,7 +175,10 @@ def command(
     parser.add_argument("--policies", nargs="+", help="cells of these policies alone")
     parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
     parser.add_argument("--merge", type=Path, nargs="+", default=[], help="rows of another checkout, to be added")
+    if sets:
+        parser.add_argument("--set", choices=list(sets), default=next(iter(sets)), help="of scenes")
     args = parser.parse_args()
+    scenes = sets[args.set] if sets else None
     results = ROOT / "benchmarks" / f"{script}.jsonl"
     for path in args.merge:
         for row in read_study(path):
@@ -181,14 +186,14 @@ def command(
     study = study_of(args.scale, args.runs)
     if args.page:
         rows = [row for row in read_study(results) if row["study"] == study.name]
+        rows = [row for row in rows if scenes is None or row["scene"] in scenes]
         done = f"{len(rows)} of {planned(args.seeds)} cells are finished."
         text = f"`python benchmarks/{script}.py --scale {args.scale}`: {done}\n\n"
         fill_between(page, script, text + report(study, rows))
         return 0
     shard, shards = map(int, args.shard.split("/"))
-    cells = [
-        cell for cell in study.cells(units_of(study, args.seeds)) if cell.policy in (args.policies or [cell.policy])
-    ]
+    units = units_of(study, args.seeds, scenes) if scenes else units_of(study, args.seeds)
+    cells = [cell for cell in study.cells(units) if cell.policy in (args.policies or [cell.policy])]
     cells = cells[shard::shards]
     taken, failed = run_cells(study, cells, args.runs, results, say=lambda line: print(line, flush=True))
     print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {stamp(script)}")
