@@ -39,6 +39,7 @@ from drgs.information.spacetime import by_number, farthest_in_time, has_times, u
 
 __all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
 
+_EMPTY = 0.05  # share of pixels
 FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
 # One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
@@ -242,18 +243,59 @@ def facility(pool: Pool) -> Selection:
     return facility(pool)
 
 
+def switch(pool: Pool) -> Selection:
+    """`farthest` while the candidates show emptiness, `fisher` after that."""
+    from drgs.information.places import sight_of
+
+    shown = [1 - float(sight_of(pool.scene, camera).alpha.mean()) for camera in pool.candidates]
+    emptiness = sum(shown) / len(shown)
+    selection = (farthest if emptiness > _EMPTY else fisher)(pool)
+    selection.notes.append(f"candidates show emptiness in {emptiness:.1%} of their pixels")
+    return selection
+
+
+def diverse(pool: Pool) -> Selection:
+    """Largest gain of information times what the pose does not share with known ones: det of a quality-diversity kernel.
+
+    With L_uv = q_u k(u, v) q_v, q^2 the gain of each candidate alone and k a kernel of poses, log det L_S grows by
+    log q_v^2 + log k(v, v | S), the variance that is left of v's pose given those of S: greedy choice for determinantal
+    point processes (Kulesza & Taskar 2012), where known views have no choice.
+    """
+    found = fisher(dataclasses.replace(pool, k=1))
+    views = [*pool.train, *pool.candidates]
+    kernel = np.exp(-0.5 * _pose_distances(views) ** 2)
+    gains, picks, scores, known = np.array(found.scores), [], [], list(range(len(pool.train)))
+    left = list(range(len(pool.candidates)))
+    for _ in range(pool.k):
+        rest = [len(pool.train) + i for i in left]
+        across = kernel[np.ix_(rest, known)]
+        solved = np.linalg.solve(kernel[np.ix_(known, known)] + 1e-6 * np.eye(len(known)), across.T)
+        values = gains[left] * (1 - (across * solved.T).sum(1)).clip(min=0)
+        scores = scores or values.tolist()
+        order = np.argsort(-values, kind="stable")
+        margin = float(values[order[0]] - values[order[1]]) if len(order) > 1 else None
+        best = left.pop(int(order[0]))
+        picks.append(pool.pick(best, values[order[0]], margin=margin))
+        known.append(len(pool.train) + best)
+    return dataclasses.replace(found, picks=picks, scores=scores)
+
+
 # -------------------------------------------------- policies that look at poses only, or at nothing
+
+
+def _pose_distances(views: Sequence[Camera]) -> np.ndarray:
+    """(V, V) distances of camera centers, in those from their middle, and of directions, in half radians."""
+    centers = np.array([camera.center for camera in views])
+    size = np.linalg.norm(centers - centers.mean(0), axis=1).mean() or 1.0
+    forward = np.array([camera.c2w[:3, 2] for camera in views])
+    angles = np.arccos((forward @ forward.T).clip(-1, 1))
+    return np.hypot(np.linalg.norm(centers[:, None] - centers, axis=2) / size, 0.5 * angles)
 
 
 def poses(pool: Pool) -> Selection:
     """k-medoids on camera centers and directions: the pool's views, each by the chosen one nearest to it."""
     views = [*pool.train, *pool.candidates]
-    centers = np.array([camera.center for camera in views])
-    size = np.linalg.norm(centers - centers.mean(0), axis=1).mean() or 1.0
-    forward = np.array([camera.c2w[:3, 2] for camera in views])
-    angles = np.arccos((forward @ forward.T).clip(-1, 1))
-    distances = np.sqrt((np.linalg.norm(centers[:, None] - centers, axis=2) / size) ** 2 + (0.5 * angles) ** 2)
-    near, known = np.exp(-0.5 * distances**2), len(pool.train)
+    near, known = np.exp(-0.5 * _pose_distances(views) ** 2), len(pool.train)
     covered = near[:known].max(0) if known else np.zeros(len(views))
     picks, scores, left = [], [], list(range(len(pool.candidates)))
     for _ in range(pool.k):
@@ -336,6 +378,8 @@ POLICIES: dict[str, Callable[[Pool], Selection]] = {
     "moments": moments,
     "field": field,
     "facility": facility,
+    "switch": switch,
+    "diverse": diverse,
     "poses": poses,
     "farthest": farthest,
     "uniform": uniform,

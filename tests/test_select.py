@@ -505,6 +505,18 @@ def test_progress():
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
+def test_pool_that_does_not_fit_into_memory(rng, monkeypatch):
+    """`v_opt` asks for what cannot be kept a second time: the same scores, and `progress` knows of it."""
+    pool, seen, gone = random_pool(rng, 6), [], []
+    monkeypatch.setattr("drgs.information.greedy.available", lambda: 0 if gone else 1 << 30)
+    kept = choose(pool, ["c0"], criterion="v_opt", progress=lambda *x: seen.append(x))
+    assert (kept.computed, seen[-1]) == (6, (6, 6))
+    gone.append(True)
+    again = choose(pool, ["c0"], criterion="v_opt", progress=lambda *x: seen.append(x))
+    assert (again.computed, seen[-1]) == (11, (11, 11))
+    assert dataclasses.replace(again, seconds=0.0, computed=6) == dataclasses.replace(kept, seconds=0.0)
+
+
 # -------------------------------------------------- policies without information
 
 

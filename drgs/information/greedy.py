@@ -20,6 +20,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.gain import Gain, Information, Prior, check
+from drgs.guards.memory import available
 from drgs.information.cache import camera_key
 from drgs.information.combine import Combination
 from drgs.information.network_groups import NETWORK_GROUPS
@@ -30,6 +31,7 @@ __all__ = ["InformationSource", "ViewInformation", "greedy"]
 InformationSource = tuple[Callable[[Camera], Information], Hashable]
 """Camera -> Information, and the key of the cache: what that depends on besides scene and camera."""
 
+_SHARE = 0.25  # of the memory there is, for information that could be computed again
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
 
 
@@ -50,6 +52,7 @@ class ViewInformation:
         """
         self.pool, self.source, self.known = pool, source, known or source
         self.computed = self.done = 0
+        self._expected = len(pool.train) + len(pool.candidates)
         self.told: dict[str, bool] = {}
 
     def __call__(self, what: str, camera: Camera, is_known: bool = False) -> Information:
@@ -64,8 +67,12 @@ class ViewInformation:
                 self.told[name] = self.told.get(name, False) or bool(x.any())
         self.done += 1
         if pool.progress:
-            pool.progress(self.done, len(pool.train) + len(pool.candidates))
+            pool.progress(self.done, self._expected)
         return found
+
+    def expect(self, more: int) -> None:
+        """So many views will be asked for once more, for `progress`."""
+        self._expected += more
 
     def _new(self, what: str, camera: Camera, compute: Callable[[Camera], Information]) -> Information:
         found = {name: x.to(torch.float32) for name, x in compute(camera).items()}
@@ -128,23 +135,36 @@ def _first_round(
         part = information(f"training view {i} ({camera.name})", camera, is_known=True)
         H = H or _nothing(part)
         _add(H, part)
-    for i, camera in enumerate(pool.candidates):
-        part = information(f"candidate {i} ({camera.name})", camera)
+    views = [(i, f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]
+    score, everything, keeps = None, None, pool.k > 1
+    for i, what, camera in views:
+        part = information(what, camera)
         if i == 0:
             H = _nothing(part) | H  # also of what known views were not asked
-            score = None if combination.pooled else combination.scorer(H)
+            if combination.pooled:
+                everything = {name: x.clone() for name, x in H.items()}
+                keeps = keeps or _fits(part, len(views))
+            else:
+                score = combination.scorer(H)
+        if everything is not None:
+            _add(everything, part)
         if score:
             gains.append(score(part))
-        if pool.k > 1 or combination.pooled:
+        if keeps:
             kept[i] = part
         del part  # else two views are alive while the next one is computed
-    if not combination.pooled:
-        return H, None, gains, kept
-    everything = {name: x.clone() for name, x in H.items()}
-    for part in kept.values():
-        _add(everything, part)
-    score = combination.scorer(H, everything)
-    return H, everything, [score(part) for part in kept.values()], kept
+    if everything is not None:
+        score = combination.scorer(H, everything)
+        if not keeps:
+            information.expect(len(views))
+        gains = [score(kept[i] if keeps else information(what, camera)) for i, what, camera in views]
+    return H, everything, gains, kept
+
+
+def _fits(part: Information, count: int) -> bool:
+    """Whether so many views' information may be held at a time: computing it twice takes longer, but no memory."""
+    there = available()
+    return there is None or count * sum(x.nbytes for x in part.values()) < _SHARE * there
 
 
 def _nothing(part: Information) -> dict[str, torch.Tensor]:
