@@ -242,16 +242,19 @@ def coverage(
 
 @alone
 def background(
-    gaussians: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
+    gaussians: Scene,
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> torch.Tensor:
-    """(1536,) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything, a
-    number for each cell of directions; its three channels have the same. See `drgs.information.background`.
+    """(1536, 3) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything,
+    a row for each cell of directions. See `drgs.information.background`; arguments as of `diagonal`.
     """
     cameras = _cameras_of("fisher.background", gaussians, cameras, settings)
-    settings = settings or RenderSettings.preset("exact")
-    total = torch.zeros(CELLS, dtype=torch.float64)
+    settings, weights = settings or RenderSettings.preset("exact"), _weights(channel_weights)
+    total = torch.zeros(CELLS, 3, dtype=torch.float64)
     for camera in cameras:
-        total += background_information(gaussians, camera, settings)
+        total += background_information(gaussians, camera, settings, weights)
     return total
 
 
@@ -271,7 +274,7 @@ def variance_map(
 
     Args:
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
-        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `background`, (1536,), is
+        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `background`, (1536, 3), is
             that of the color behind what the Gaussians leave open.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
@@ -283,9 +286,9 @@ def variance_map(
     known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
     behind, factors = weights.get("background"), _weights(channel_weights)
     weights = {name: x for name, x in weights.items() if name != "background"}
-    if behind is not None and tuple(behind.shape) != (CELLS,):
+    if behind is not None and tuple(behind.shape) != (CELLS, 3):
         raise ValueError(
-            f"fisher.variance_map: weights of background must have shape {(CELLS,)}, got {tuple(behind.shape)}"
+            f"fisher.variance_map: weights of background must have shape {(CELLS, 3)}, got {tuple(behind.shape)}"
         )
     for name, x in weights.items():
         if name not in known:
@@ -297,7 +300,7 @@ def variance_map(
     if len(seen) and weights:
         found = Replay(seen, camera, settings, semantics=semantics).variance(weights, factors)
     if behind is not None:
-        found = found + sum(factors) * background_variance(seen, camera, behind, settings).float()
+        found = found + background_variance(seen, camera, behind, settings, factors).float()
     return found
 
 

@@ -309,9 +309,7 @@ def _blocks_and_others(train: Information, prior: Prior) -> Callable[[Informatio
 
     def score(candidate: Information) -> Gain:
         a, b = of_blocks(candidate), of_others({name: x for name, x in candidate.items() if name != BLOCKS})
-        return Gain(
-            a.total + b.total, a.parts | b.parts, a.left_out | b.left_out, a.unseen | b.unseen, a.repaired
-        )
+        return Gain(a.total + b.total, a.parts | b.parts, a.left_out | b.left_out, a.unseen | b.unseen, a.repaired)
 
     return score
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import drgs
-from drgs.cameras import Camera, intrinsics, look_at, orbit
+from drgs.cameras import Camera, orbit
 from drgs.information.facility import overlap
 from drgs.information.places import Sight, places, sight_of
 from drgs.information.prior_field import wrong

@@ -7,13 +7,13 @@ is
 
     H_c = sum_{p in c} (1 - alpha_p)^2
 
-in each channel, whatever b is. As features do, the channels count once. Cells are those of a cube around the camera
-whose faces have 16x16 of them, spaced evenly in angle (Ronchi et al., "The 'cubed sphere'", 1996): 1,536, of 4 to 6
-degrees.
+in each of the three channels, whatever b is. Cells are those of a cube around the camera whose faces have 16x16 of
+them, spaced evenly in angle (Ronchi et al., "The 'cubed sphere'", 1996): 1,536, of 4 to 6 degrees.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,14 +55,18 @@ def _open(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tenso
     return (1 - alpha.double().cpu()).clamp(min=0).square()
 
 
-def background_information(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tensor:
-    """(1536,) float64 H_c of a view."""
+def background_information(
+    scene: Scene, camera: Camera, settings: RenderSettings, channel_weights: Sequence[float]
+) -> torch.Tensor:
+    """(1536, 3) float64 H_c of a view in each channel, times the channel's weight."""
     total = torch.zeros(CELLS, dtype=torch.float64)
-    return total.index_add_(0, background_cells(camera).flatten(), _open(scene, camera, settings).flatten())
+    total.index_add_(0, background_cells(camera).flatten(), _open(scene, camera, settings).flatten())
+    return total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
 
 
 def background_variance(
-    scene: Scene, camera: Camera, weights: torch.Tensor, settings: RenderSettings
+    scene: Scene, camera: Camera, weights: torch.Tensor, settings: RenderSettings, channel_weights: Sequence[float]
 ) -> torch.Tensor:
-    """(H, W) float64 (1 - alpha)^2 times the weight of the pixel's cell, weights (1536,)."""
-    return _open(scene, camera, settings) * weights.double().cpu()[background_cells(camera)]
+    """(H, W) float64 (1 - alpha)^2 times the weights (1536, 3) of the pixel's cell, summed over weighted channels."""
+    each = weights.double().cpu() @ torch.tensor(channel_weights, dtype=torch.float64)
+    return _open(scene, camera, settings) * each[background_cells(camera)]

@@ -29,7 +29,18 @@ Criterion = Literal["eig", "logdet", "trace_cov", "v_opt", "block_logdet"]
 """The names in `drgs.gain.CRITERIA`, where the functions are; the first is the default everywhere."""
 
 Policy = Literal[
-    "fisher", "fisherrf", "coverage", "moments", "field", "facility", "switch", "diverse", "poses", "farthest", "uniform", "random"
+    "fisher",
+    "fisherrf",
+    "coverage",
+    "moments",
+    "field",
+    "facility",
+    "switch",
+    "diverse",
+    "poses",
+    "farthest",
+    "uniform",
+    "random",
 ]
 """The names in `drgs.select.POLICIES`, where the functions are."""
 
