@@ -35,7 +35,6 @@ import drgs  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.commands.orbits import Wish, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
-from drgs.data.sizes import at_most  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
 from drgs.lab.crops import crops  # noqa: E402
@@ -44,6 +43,7 @@ from drgs.lab.dumps import cotangents  # noqa: E402
 from drgs.lab.rasterizers import function, load_rasterizer  # noqa: E402
 from drgs.lab.raw import PARAMETERS, raw_of, with_pose  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
+from drgs.sizes import at_most  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 
 BACKGROUND = (0.3, 0.6, 0.2)

@@ -28,12 +28,12 @@ from drgs.cameras import intrinsics_from_fov
 from drgs.commands.orbits import Wish, scene_orbit
 from drgs.commands.viewpoints import evenly
 from drgs.data import load
-from drgs.data.sizes import at_most
 from drgs.files import Run, atomic_write
 from drgs.fitting.records import fit_record
 from drgs.lab.ladder import Pictures, ladder, table
 from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
+from drgs.sizes import at_most
 
 BEGIN, END = "<!-- ladder: begin -->", "<!-- ladder: end -->"
 FOVS = (20, 45, 70, 95, 120)

@@ -274,8 +274,8 @@ def variance_map(
 
     Args:
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
-        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `background`, (1536, 3), is
-            that of the color behind what the Gaussians leave open.
+        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `background`,
+            (1536, 3), is that of the color behind what the Gaussians leave open.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
     check_view("fisher.variance_map", seen, camera, settings)

@@ -10,9 +10,9 @@ import torch
 
 import drgs
 from drgs.cameras import Camera, orbit
-from drgs.information.facility import overlap
-from drgs.information.places import Sight, places, sight_of
-from drgs.information.prior_field import wrong
+from drgs.policies.facility import overlap
+from drgs.policies.field import wrong
+from drgs.policies.places import Sight, places, sight_of
 from drgs.select import select
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from drgs import runtime
 from drgs.commands.given import Given
 from drgs.commands.viewpoints import check_counts, seen_views
-from drgs.data.sizes import at_most
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
@@ -15,6 +14,7 @@ from drgs.guards.outputs import check_file, claim
 from drgs.lab import dumps, ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval

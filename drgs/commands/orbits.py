@@ -20,9 +20,9 @@ import torch
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.data.capture import Focus, path, upright
-from drgs.data.sizes import at_most
 from drgs.integrator import render
 from drgs.settings import RenderSettings
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,7 +13,6 @@ from drgs.commands.painters import OPAQUE
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.camera_lists import described
 from drgs.data.checks import read_npy
-from drgs.data.sizes import at_most
 from drgs.display import pictures
 from drgs.display.progress import Bar
 from drgs.features.decoder import load_decoder
@@ -23,6 +22,7 @@ from drgs.features.teacher import read_tensor
 from drgs.files import SCHEMA, save_ply, write_json
 from drgs.guards.outputs import claim
 from drgs.integrator import render
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

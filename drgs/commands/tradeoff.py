@@ -32,7 +32,6 @@ from drgs import runtime
 from drgs.commands.given import Given
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.camera_lists import described
-from drgs.data.sizes import at_most
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
@@ -42,6 +41,7 @@ from drgs.lab.tradeoff_advice import USES, Advice, recommend
 from drgs.lab.tradeoff_full import FullSize, measure_full
 from drgs.lab.tradeoff_plot import plot
 from drgs.lab.tradeoff_rows import CLOCKS, TRADEOFF_VARIANTS, Interval, Measured, TradeoffRow
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Literal
 from drgs import data
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_distance
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
-from drgs.data.sizes import at_most, resized_alike
 from drgs.files import Run
 from drgs.fitting.config import FitConfig
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
+from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

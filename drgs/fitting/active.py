@@ -21,12 +21,12 @@ import numpy as np
 import torch
 
 from drgs.data.guided import Matches
-from drgs.data.sizes import at_most, resized_alike
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.timetable import Timetable
+from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

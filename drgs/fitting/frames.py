@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
-from drgs.data.sizes import reduced_size
 from drgs.display.progress import Bar
+from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

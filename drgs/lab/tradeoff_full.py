@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs import fisher
-from drgs.data.sizes import at_most
 from drgs.integrator import render
 from drgs.lab.tradeoff import clocked, placed
 from drgs.lab.tradeoff_advice import interval, leaders
 from drgs.lab.tradeoff_rows import CLOCKS, FullTime, Interval, Measured, TradeoffRow
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -1,6 +1,6 @@
 """A prior field: how wrong the pool's views will be about where things are, given what chosen views can tell of it.
 
-A place p of drgs.information.places is where something may be, known with covariance C_0 = s^2 I before any view, s a
+A place p of drgs.policies.places is where something may be, known with covariance C_0 = s^2 I before any view, s a
 part of its distance. A view v that sees it tells about the plane across its ray d_v, to 1 / c pixels squared:
 
     I_v = T_v(p) exp(kappa (cos(angle) - 1)) c (f_v / z_v)^2 (1 - d_v d_v^T)
@@ -22,8 +22,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from drgs.information.places import Places, Sight, places, sight_of
 from drgs.information.pool import Pool, Selection
+from drgs.policies.places import Places, Sight, places, sight_of
 
 __all__ = ["precision", "prior_field", "wrong"]
 

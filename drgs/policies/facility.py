@@ -1,21 +1,21 @@
 """Facility location: every place that the pool's views will show should be seen by one chosen view from near its ray.
 
-The score of a set of views is sum_p w_p max_v k(v, p) over the places p of drgs.information.places, with weights w_p and
+The score of a set of views is sum_p w_p max_v k(v, p) over the places p of drgs.policies.places, with weights w_p and
 
     k(v, p) = T_v(p) exp(kappa (cos(angle) - 1)) min(1, d_q / d_v)
 
-the share of the light from p that reaches v, a von Mises kernel of the angle between v's ray and that of the view q that
-p was drawn for, and how much coarser v sees it. Monotone and submodular: the greedy choice has at least 1 - 1/e of the
-best score that any set of as many views has (Nemhauser, Wolsey & Fisher 1978). All views count alike, the known ones
-too: the pool stands for what will be looked at.
+the share of the light from p that reaches v, a von Mises kernel of the angle between v's ray and that of the view q
+that p was drawn for, and how much coarser v sees it. Monotone and submodular: the greedy choice has at least 1 - 1/e of
+the best score that any set of as many views has (Nemhauser, Wolsey & Fisher 1978). All views count alike, the known
+ones too: the pool stands for what will be looked at.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from drgs.information.places import Places, Sight, places, sight_of
 from drgs.information.pool import Pool, Selection
+from drgs.policies.places import Places, Sight, places, sight_of
 
 __all__ = ["facility", "overlap"]
 

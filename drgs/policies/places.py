@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.data.sizes import at_most
 from drgs.ellipsoids import colors_only
-from drgs.integrator import render
 from drgs.settings import RenderSettings
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -65,6 +64,8 @@ class Sight:
 
 def sight_of(scene: Scene, camera: Camera, pixels: int = _PIXELS) -> Sight:
     """What a view shows of a scene at its time, at most so many pixels."""
+    from drgs.integrator import render  # loads Dr.Jit, which policies by poses need not have
+
     small = at_most(camera, pixels)
     with torch.no_grad():
         # `exact` and `fast` measure depth along the ray, `ewa` along the axis of the camera.

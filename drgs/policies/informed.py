@@ -1,0 +1,121 @@
+"""Policies by the information of views.
+
+Those whose scores depend on what has been picked are greedy: take the best, add its information to H, score again
+(`drgs.information.greedy`). How a score comes from information is a `Scoring`; its criteria are in gain.py.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from drgs.cameras import Camera
+from drgs.gain import Information
+from drgs.information.combine import Asked, Combination, asked_of
+from drgs.information.greedy import InformationSource, ViewInformation, greedy
+from drgs.information.pool import Pool, Selection
+from drgs.information.semantics import SemanticMetric
+
+__all__ = ["coverage", "fisher", "fisherrf", "moments"]
+
+_FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
+
+
+def fisher(pool: Pool) -> Selection:
+    """Largest gain of Fisher information, of the blocks of the image that the scoring names."""
+    scoring, metric = pool.scoring, None
+    if pool.information is not None:  # it knows by itself what it is about
+        return _greedy(pool, ())
+    with torch.no_grad():
+        seen = pool.scene.at(pool.candidates[0].time)
+    blocks = scoring.blocks_of(seen, scene=pool.scene)
+    if "semantic" in blocks:
+        assert seen.features is not None  # else there is no such block
+        metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
+    asked, combination = asked_of(scoring, blocks, metric)
+    selection = _greedy(pool, asked, combination)
+    selection.blocks, selection.semantics = list(blocks), metric.to_json() if metric else None
+    if "deformation" in blocks:
+        selection.network = {"score": scoring.network, "probes": scoring.probes}
+        if scoring.network == "ratio" and scoring.probes < _FEW_PROBES:
+            selection.notes.append(
+                f"deformation: {scoring.probes} probes are few to divide by, where one view is all that is known of a "
+                f"parameter its ratio is too large; take {_FEW_PROBES} or more"
+            )
+    if combination.apart:
+        selection.combine = "zscore"
+        selection.notes.append(f"scores are sums of z-scores of {', '.join(combination.apart)} over the candidates")
+    return selection
+
+
+def fisherrf(pool: Pool) -> Selection:
+    """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations and no features."""
+    prior, weights = pool.scoring.prior, _without_rotations(pool.scoring.weights)
+    prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
+    asked = Asked("diagonal", ("features",), (("method", "fisherrf"),))
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights=weights), [asked])
+
+
+def coverage(pool: Pool) -> Selection:
+    """Largest sum Wc / (W + lambda), W = sum over pixels of w^2."""
+    prior = dataclasses.replace(pool.scoring.prior, groups={})
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), [Asked("coverage")])
+
+
+def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None = None) -> Selection:
+    """`greedy` by what `drgs.fisher` says of each view, or by the pool's own information.
+
+    Args:
+        pool: Whose scoring says how much it counts.
+        asked: What is asked of a view.
+        combination: How that becomes a score; default by the pool's scoring, all groups together.
+    """
+    settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
+
+    def by(asked: Sequence[Asked]) -> InformationSource:
+        def compute(camera: Camera) -> Information:
+            found: dict[str, torch.Tensor] = {}
+            for one in asked:
+                found |= one(pool.scene, camera, settings)
+            return found
+
+        return compute, (settings, *asked)
+
+    if pool.information:
+        return greedy(pool, ViewInformation(pool, (pool.information, (pool.information, settings))), combination)
+    known = None if all(one.known for one in asked) else by([one for one in asked if one.known])
+    return greedy(pool, ViewInformation(pool, by(asked), known), combination)
+
+
+def _scored(pool: Pool, **fields: Any) -> Pool:
+    """The same pool with other fields of its scoring."""
+    return dataclasses.replace(pool, scoring=dataclasses.replace(pool.scoring, **fields))
+
+
+def _without_rotations(groups: Mapping[str, float]) -> dict[str, float]:
+    return {name: x for name, x in groups.items() if name != "rotations"}
+
+
+def moments(pool: Pool) -> Selection:
+    """Largest variance of the features along the rays, on average over pixels; of colors where there are no features.
+
+    It needs no training views, and picks do not change it: k picks are the k best, whatever they share.
+    """
+    from drgs.information.moments import moments_map  # loads Dr.Jit, which the policies below need not have
+
+    scores = []
+    for number, camera in enumerate(pool.candidates, 1):
+        found = moments_map(pool.scene.at(camera.time), camera, pool.scoring.settings)
+        scores.append(float(found.double().mean()))
+        if pool.progress:
+            pool.progress(number, len(pool.candidates))
+    order = sorted(range(len(scores)), key=lambda i: -scores[i])  # stable: ties by index
+    picks = []
+    for place, i in enumerate(order[: pool.k]):
+        margin = scores[i] - scores[order[place + 1]] if place + 1 < len(order) else None
+        picks.append(pool.pick(i, scores[i], margin=margin))
+    notes = ["moments rank candidates one by one: picks do not take each other into account"] if pool.k > 1 else []
+    return Selection(picks, scores, evaluations=len(scores), notes=notes)
