@@ -106,7 +106,7 @@ def test_errors_fall_with_what_is_told(rng):
 
 @pytest.mark.parametrize("policy", ["field", "facility", "poses"])
 def test_no_unit_of_length_matters(scene, ring, policy):
-    """The same world ten times as large, somewhere else: the same picks by the same scores."""
+    """The same world ten times as large, somewhere else: the same scores (of a ring, whose ties may fall otherwise)."""
     train, candidates = ring[:2], ring[2:]
     found = select(scene, candidates, train, 3, policy)
 
@@ -117,7 +117,7 @@ def test_no_unit_of_length_matters(scene, ring, policy):
 
     far = scene.replace(means=10 * scene.means + 7, log_scales=scene.log_scales + np.log(10))
     again = select(far, [moved(c) for c in candidates], [moved(c) for c in train], 3, policy)
-    assert [p.name for p in again.picks] == [p.name for p in found.picks]
+    assert [p.score for p in again.picks] == pytest.approx([p.score for p in found.picks], rel=1e-3)
     assert again.scores == pytest.approx(found.scores, rel=2e-2)  # a few points lie elsewhere by rounding
     assert all(score >= 0 for score in found.scores)
 
@@ -131,3 +131,25 @@ def test_views_beside_known_ones_are_not_wanted(scene, ring, policy):
     assert found.picks[0].name in ("06", "07", "08")
     assert found.scores[0] == min(found.scores)
     assert found.scores[0] < (0.9 if policy == "field" else 0.3) * max(found.scores)  # a field adds up what repeats
+
+
+def test_switch_goes_by_emptiness(scene, ring):
+    """Distance where candidates see past everything, information where they see nothing but Gaussians."""
+    train, candidates = ring[:2], ring[2:]
+    found = select(scene, candidates, train, 2, "switch")
+    assert found.scores == select(scene, candidates, train, 2, "farthest").scores
+    assert "emptiness" in found.notes[-1]
+    wall = scene.replace(log_scales=scene.log_scales + np.log(6), logit_opacities=scene.logit_opacities + 3)
+    assert select(wall, candidates, train, 2, "switch").scores == select(wall, candidates, train, 2, "fisher").scores
+
+
+def test_diverse_is_information_of_other_poses(scene, ring):
+    """At most the information alone; of a pose that is known nothing is left, and one pick makes its like worthless."""
+    train, twice = ring[:2], dataclasses.replace(ring[1], name="twice")
+    candidates = [twice, *ring[2:], dataclasses.replace(ring[7], name="also 07")]
+    told = select(scene, candidates, train, policy="fisher").scores
+    found = select(scene, candidates, train, 4, "diverse")
+    assert (np.array(found.scores) <= np.array(told) * (1 + 1e-9)).all()
+    assert found.scores[0] < 1e-3 * max(found.scores)
+    assert not {"twice"} & {p.name for p in found.picks}
+    assert len({"07", "also 07"} & {p.name for p in found.picks}) < 2
