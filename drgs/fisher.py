@@ -31,7 +31,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.doors import camera_list, check_any_scene, check_scene, check_view, gaussians_at
+from drgs.guards.doors import Masks, camera_list, check_any_scene, check_scene, check_view, gaussians_at, mask_list
 from drgs.information.background import CELLS, background_information, background_variance
 from drgs.information.columns import by_columns, jacobian_columns
 from drgs.information.groups import GROUPS, Group, Information, groups_of
@@ -88,6 +88,7 @@ def diagonal(
     probes: int = 16,
     seed: int = 0,
     semantics: SemanticMetric | None = None,
+    masks: Masks = None,
     **splats: Unpack[SplatTensors],
 ) -> Information:
     """The diagonal of J^T J, summed over views.
@@ -108,6 +109,8 @@ def diagonal(
         probes, seed: Of method `probes`.
         semantics: The metric in which features tell about the geometry; None: they do not (`exact`, `columns`,
             `probes`; only `exact` makes use of its `estimate`).
+        masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared, as a fit
+            does, so that squares are multiplied by its square; or None: 1. Outside, a view tells nothing.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
             `height`, and maybe `sh_degree` and `backgrounds`.
@@ -136,6 +139,7 @@ def diagonal(
     if semantics is not None:
         semantics.check("fisher.diagonal", seen)
     total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
+    shown = mask_list("fisher.diagonal", masks, cameras)
     for number, camera in enumerate(cameras):
         seen = gaussians_at("fisher.diagonal", gaussians, camera)
         for name, group in wanted.items():
@@ -149,14 +153,15 @@ def diagonal(
         network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
         part: dict[str, torch.Tensor] = {}
         if method == "columns":
-            part |= by_columns(seen, camera, settings, theirs, weights, semantics)
-            part |= by_columns(seen, camera, settings, own, weights, semantics, network)
+            part |= by_columns(seen, camera, settings, theirs, weights, semantics, mask=shown[number])
+            part |= by_columns(seen, camera, settings, own, weights, semantics, network, shown[number])
         elif method == "probes":
             draw = (probes, seed + number)
-            part |= by_probes(seen, camera, settings, theirs, weights, *draw, semantics)
-            part |= by_probes(seen, camera, settings, own, weights, *draw, semantics, network) if own else {}
+            part |= by_probes(seen, camera, settings, theirs, weights, *draw, semantics, mask=shown[number])
+            if own:
+                part |= by_probes(seen, camera, settings, own, weights, *draw, semantics, network, shown[number])
         else:
-            replay = Replay(seen, camera, settings, semantics=semantics)
+            replay = Replay(seen, camera, settings, semantics=semantics, mask=shown[number])
             part |= replay.diagonal(wanted, weights, method == "fisherrf")
         for name in wanted:
             total[name] += part[name]
@@ -202,11 +207,12 @@ def blocks(
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     semantics: SemanticMetric | None = None,
+    masks: Masks = None,
 ) -> torch.Tensor:
     """One dense block of J^T J for every Gaussian, summed over views.
 
     Args:
-        gaussians, cameras, settings, channel_weights, semantics: As for `diagonal`.
+        gaussians, cameras, settings, channel_weights, semantics, masks: As for `diagonal`.
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
@@ -214,29 +220,36 @@ def blocks(
     settings = settings or RenderSettings.preset("exact")
     count = len(gaussians_at("fisher.blocks", gaussians, cameras[0]))
     total = torch.zeros(count, BLOCK, BLOCK, dtype=torch.float64)
-    for camera in cameras:
+    for camera, mask in zip(cameras, mask_list("fisher.blocks", masks, cameras), strict=True):
         seen = gaussians_at("fisher.blocks", gaussians, camera)
         _check_same("fisher.blocks", "blocks", total, (len(seen), BLOCK, BLOCK))
         if semantics is not None:
             semantics.check("fisher.blocks", seen)
         if len(seen):
-            total += Replay(seen, camera, settings, semantics=semantics).blocks(_weights(channel_weights))
+            total += Replay(seen, camera, settings, semantics=semantics, mask=mask).blocks(_weights(channel_weights))
     return total
 
 
 @alone
 def coverage(
-    gaussians: Scene, cameras: Camera | Sequence[Camera], settings: RenderSettings | None = None
+    gaussians: Scene,
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    masks: Masks = None,
 ) -> torch.Tensor:
-    """(N,) float64 sum over views and pixels of w^2: the information about a color without direction."""
+    """(N,) float64 sum over views and pixels of w^2: the information about a color without direction.
+
+    Args:
+        gaussians, cameras, settings, masks: As for `diagonal`.
+    """
     cameras = _cameras_of("fisher.coverage", gaussians, cameras, settings)
     settings = settings or RenderSettings.preset("exact")
     total = torch.zeros(len(gaussians_at("fisher.coverage", gaussians, cameras[0])), dtype=torch.float64)
-    for camera in cameras:
+    for camera, mask in zip(cameras, mask_list("fisher.coverage", masks, cameras), strict=True):
         seen = gaussians_at("fisher.coverage", gaussians, camera)
         _check_same("fisher.coverage", "coverage", total, (len(seen),))
         if len(seen):
-            total += Replay(seen, camera, settings, geometry=False).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
+            total += Replay(seen, camera, settings, geometry=False, mask=mask).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
     return total
 
 

@@ -30,7 +30,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import camera_list, check_any_scene
+from drgs.guards.doors import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.cache import Cache
 from drgs.information.pool import Pick, Pool, Scoring, Selection
 from drgs.policies.facility import facility
@@ -54,6 +54,7 @@ def select(
     *,
     scoring: Scoring | None = None,
     rng: torch.Generator | None = None,
+    masks: Masks = None,
     cache: Cache | None = None,
     lazy: bool = True,
     progress: Callable[[int, int], object] | None = None,
@@ -76,6 +77,8 @@ def select(
         policy: A name in `POLICIES`.
         scoring: How views are scored; default `Scoring()`.
         rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
+        masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside of an object's mask
+            was not learned from. Nothing is known of candidates'.
         cache: Where to look for and keep information of single views.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
             Not done where scores can rise (a relative lambda, or lambda = 0).
@@ -106,6 +109,7 @@ def select(
         k=k,
         scoring=_scoring(scoring, fields),
         rng=rng or _GENERATOR,
+        masks=mask_list("select", masks, train),
         cache=cache,
         lazy=lazy,
         progress=progress,

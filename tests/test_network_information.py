@@ -245,6 +245,18 @@ def test_views_add_up_and_a_view_twice_is_twice_as_much(seen):
     assert not torch.allclose(one, other, rtol=0.1)  # two times at one pose have their own information
 
 
+@pytest.mark.parametrize("estimate", ["diagonal", "trace", "paper"])
+def test_masks_weigh_rows(seen, estimate):
+    """With the same random signs half of the light is a quarter of the information, and none is none."""
+    scene, cam, _ = seen
+    ask = lambda **x: fisher.network(scene, cam, estimate=estimate, probes=2, **x)  # noqa: E731
+    whole, power = ask(), 4 if estimate == "paper" else 2
+    for value in (0.5, 0.0):
+        found = ask(masks=[torch.full((cam.height, cam.width), value)])
+        for name, x in whole.items():
+            torch.testing.assert_close(found[name], value**power * x)
+
+
 def test_groups_that_have_none(seen):
     """Heads that are 0 hide the grid and all layers before them; last weights of 1e-4, or a step, show them."""
     scene, cam, _ = seen

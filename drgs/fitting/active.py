@@ -228,7 +228,7 @@ class ActiveViews:
 
         Args:
             scene: As it is now, seen by each view at its time.
-            frames: The photographs seen so far; of these, too, only the cameras matter.
+            frames: The photographs seen so far; of these, too, only the cameras matter, and the masks.
             step: Steps done.
             decoder: Of the features as it is now; they count in its metric.
         Returns:
@@ -241,15 +241,17 @@ class ActiveViews:
         left = self.timetable.left(len(self.picks), self.chosen)
         pixels = active.info_pixels or self._config.max_pixels
         semantics = None if decoder is None else SemanticMetric(decoder.metric())
+        seen = [at_most(frame.camera, pixels) for frame in frames]
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
                 scene,
                 [at_most(self._camera(i), pixels) for i in left],
-                [at_most(frame.camera, pixels) for frame in frames],
+                seen,
                 1,
                 active.policy,
                 scoring=active.scoring(self._config.settings, semantics),
                 rng=self._generator,
+                masks=[_reduced(frame.mask, camera) for frame, camera in zip(frames, seen, strict=True)],
                 progress=bar.update,
             )
         best = selection.picks[0]
@@ -374,3 +376,10 @@ class ActiveViews:
         if not view.is_checked:
             camera = resized_alike(camera, self._sizes)
         return at_most(camera, self._config.max_pixels)
+
+
+def _reduced(mask: torch.Tensor | None, camera: Camera) -> torch.Tensor | None:
+    """A mask at the size of a camera's image."""
+    if mask is None or tuple(mask.shape) == (camera.height, camera.width):
+        return mask
+    return torch.nn.functional.interpolate(mask[None, None], (camera.height, camera.width), mode="area")[0, 0]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, Scene
@@ -13,6 +15,7 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.settings import RenderSettings
 
 __all__ = [
+    "Masks",
     "camera_list",
     "check_any_scene",
     "cameras_of_one_size",
@@ -21,7 +24,11 @@ __all__ = [
     "check_scene",
     "check_view",
     "gaussians_at",
+    "mask_list",
 ]
+
+Masks = Sequence[torch.Tensor | None] | None
+"""For each of several cameras (H, W) in [0, 1], what its image is multiplied by before it is compared, or None: 1."""
 
 _SCENE = "drgs.load_ply(path) or drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh) makes one"
 _CAMERA = "drgs.Camera(K=K, w2c=w2c, width=width, height=height) makes one"
@@ -74,6 +81,29 @@ def camera_list(where: str, name: str, cameras: Any) -> list[Camera]:
     for index, camera in enumerate(cameras):
         must_be(where, f"{name}[{index}]", camera, Camera, _CAMERA)
     return cameras
+
+
+def mask_list(where: str, masks: Any, cameras: Sequence[Camera]) -> list[torch.Tensor | None]:
+    """A mask or None for each camera; `ArgumentError` for another number of them, another size, or values."""
+    if masks is None:
+        return [None] * len(cameras)
+    if not isinstance(masks, list | tuple) or len(masks) != len(cameras):
+        got = f"{len(masks)}" if isinstance(masks, list | tuple) else kind_of(masks)
+        raise ArgumentError(
+            f"{where}: masks must be a list with one for each of {len(cameras)} cameras, got {got}; None is one, too"
+        )
+    for index, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):
+        if mask is None:
+            continue
+        must_be(where, f"masks[{index}]", mask, torch.Tensor, "(H, W) in [0, 1], or None")
+        size = (camera.height, camera.width)
+        if tuple(mask.shape) != size or not bool(((mask >= 0) & (mask <= 1)).all()):
+            values = f" within {float(mask.min()):g} and {float(mask.max()):g}" if mask.numel() else ""
+            raise ArgumentError(
+                f"{where}: masks[{index}] must be {size} like its camera's image, all within 0 and 1, got "
+                f"{tuple(mask.shape)}{values}; resize it"
+            )
+    return list(masks)
 
 
 def cameras_of_one_size(where: str, cameras: Any) -> list[Camera]:

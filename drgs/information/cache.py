@@ -14,7 +14,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import Information
 
-__all__ = ["Cache", "camera_key"]
+__all__ = ["Cache", "camera_key", "value_key"]
 
 
 class Cache:
@@ -99,10 +99,10 @@ def _reference(scene: Scene) -> Callable[[], Scene | None]:
 
 def camera_key(camera: Camera) -> tuple:
     """Equal for cameras that see the same: every field by its value, so that a new field is in the key, too."""
-    return tuple(_by_value(getattr(camera, field.name)) for field in dataclasses.fields(camera))
+    return tuple(value_key(getattr(camera, field.name)) for field in dataclasses.fields(camera))
 
 
-def _by_value(x: Any) -> Hashable:
+def value_key(x: Any) -> Hashable:
     """A hashable stand-in: arrays and tensors, which compare by entry, become their bytes."""
     if isinstance(x, torch.Tensor):  # a key is a value, whatever graph it is in
         x = x.detach().cpu().numpy()

@@ -82,6 +82,7 @@ def by_columns(
     weights: Sequence[float],
     semantics: SemanticMetric | None,
     scene: Scene | None = None,
+    mask: torch.Tensor | None = None,
 ) -> Information:
     """The diagonal of J^T J from every column of J.
 
@@ -91,15 +92,18 @@ def by_columns(
         weights: Inverse noise variances of R, G and B.
         semantics: Of the features, if these tell about the geometry.
         scene: That the Gaussians come from.
+        mask: (H, W) what the image is multiplied by; None: 1.
     """
     result = {}
     scale = torch.tensor(weights, dtype=torch.float64)
+    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.double()
     for name, group in wanted.items():
         shape, squares = group.tangent(gaussians), []
         rows = np.argwhere(np.ones(shape))
         for start in range(0, len(rows), _BATCH):
             index = {name: rows[start : start + _BATCH]}
             columns = jacobian_columns(scene or gaussians, camera, index, settings).double()
+            columns = columns * factor.to(columns.device)[..., None]
             told = torch.zeros(len(columns), dtype=torch.float64)
             if group.outputs == (0, 3):
                 told += (columns[..., :3].square() * scale).sum((1, 2, 3))

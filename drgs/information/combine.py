@@ -13,7 +13,7 @@ import dataclasses
 import math
 import statistics
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -53,15 +53,19 @@ class Asked:
     groups: tuple[str, ...] | None = None
     known: bool = True
 
-    def __call__(self, scene: Scene, camera: Camera, settings: RenderSettings) -> Information:
-        """What one view says."""
+    def __call__(
+        self, scene: Scene, camera: Camera, settings: RenderSettings, mask: torch.Tensor | None = None
+    ) -> Information:
+        """What one view says; the emptiness beside an object is known, whatever its mask."""
         from drgs import fisher  # loads Dr.Jit, which policies that ask nothing need not have
 
-        options = dict(self.options)
+        options: dict[str, Any] = dict(self.options)
         # `diagonal` also knows the parameters that a scene computes its Gaussians from, but no closed form for them.
         own = self.function == "diagonal" and (options.get("groups") is None or options["method"] in _OF_SCENES)
         with torch.no_grad():  # information is a number
             seen = scene if own or self.function == "network" else scene.at(camera.time)
+            if mask is not None and self.function != "background":
+                options["masks"] = [mask]
             found = getattr(fisher, self.function)(seen, camera, settings, **options)
         if isinstance(found, torch.Tensor):
             found = {self.function: found}

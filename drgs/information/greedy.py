@@ -21,15 +21,15 @@ import torch
 from drgs.cameras import Camera
 from drgs.gain import Gain, Information, Prior, check
 from drgs.guards.memory import available
-from drgs.information.cache import camera_key
+from drgs.information.cache import camera_key, value_key
 from drgs.information.combine import Combination
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.pool import Pool, Selection
 
 __all__ = ["InformationSource", "ViewInformation", "greedy"]
 
-InformationSource = tuple[Callable[[Camera], Information], Hashable]
-"""Camera -> Information, and the key of the cache: what that depends on besides scene and camera."""
+InformationSource = tuple[Callable[[Camera, torch.Tensor | None], Information], Hashable]
+"""Camera and mask -> Information, and the key of the cache: what that depends on besides scene, camera and mask."""
 
 _SHARE = 0.25  # of the memory there is, for information that could be computed again
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
@@ -55,13 +55,16 @@ class ViewInformation:
         self._expected = len(pool.train) + len(pool.candidates)
         self.told: dict[str, bool] = {}
 
-    def __call__(self, what: str, camera: Camera, is_known: bool = False) -> Information:
+    def __call__(
+        self, what: str, camera: Camera, is_known: bool = False, mask: torch.Tensor | None = None
+    ) -> Information:
         """Of one view; `what` it is, for messages."""
         pool, (compute, key) = self.pool, self.known if is_known else self.source
         if pool.cache is None:
-            found = self._new(what, camera, compute)
+            found = self._new(what, camera, mask, compute)
         else:
-            found = pool.cache.get(pool.scene, (key, camera_key(camera)), lambda: self._new(what, camera, compute))
+            view = (key, camera_key(camera), None if mask is None else value_key(mask))
+            found = pool.cache.get(pool.scene, view, lambda: self._new(what, camera, mask, compute))
         for name, x in found.items():
             if name.rpartition(".")[2] in NETWORK_GROUPS:
                 self.told[name] = self.told.get(name, False) or bool(x.any())
@@ -74,8 +77,8 @@ class ViewInformation:
         """So many views will be asked for once more, for `progress`."""
         self._expected += more
 
-    def _new(self, what: str, camera: Camera, compute: Callable[[Camera], Information]) -> Information:
-        found = {name: x.to(torch.float32) for name, x in compute(camera).items()}
+    def _new(self, what: str, camera: Camera, mask: torch.Tensor | None, compute: Callable) -> Information:
+        found = {name: x.to(torch.float32) for name, x in compute(camera, mask).items()}
         self.computed += 1
         check(f"select: {what}", found, self.pool.scoring.criterion)
         return found
@@ -131,8 +134,8 @@ def _first_round(
     H: dict[str, torch.Tensor] = {}
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
-    for i, camera in enumerate(pool.train):
-        part = information(f"training view {i} ({camera.name})", camera, is_known=True)
+    for i, (camera, mask) in enumerate(zip(pool.train, pool.masks or [None] * len(pool.train), strict=True)):
+        part = information(f"training view {i} ({camera.name})", camera, is_known=True, mask=mask)
         H = H or _nothing(part)
         _add(H, part)
     views = [(i, f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]

@@ -82,12 +82,20 @@ class Rows:
         sink: What becomes of them: `Diagonal`, `Blocks` or `Variance`.
         finals: Per shared ray, the final state of the Primal pass.
         color: The color depends on the mean, through the direction.
+        masks: Per shared ray, what its rows are multiplied by; None: nothing.
     """
 
     def __init__(
-        self, model: HitModel, channels: Channels, buffer: Float | None, sink: Sink, finals: list[dict], color: bool
+        self,
+        model: HitModel,
+        channels: Channels,
+        buffer: Float | None,
+        sink: Sink,
+        finals: list[dict],
+        color: bool,
+        masks: list[Float] | None = None,
     ) -> None:
-        self.m, self.channels, self.sink, self.finals = model, channels, sink, finals
+        self.m, self.channels, self.sink, self.finals, self.masks = model, channels, sink, finals, masks
         self.buffer, self.color = buffer, color
         self.size = packed_size(_SHAPE + model.response.extra)
         self.colors = buffer is not None or sink.needs_color
@@ -100,6 +108,8 @@ class Rows:
         rest = [dr.fma(D(b), D(final["T"]), D(x)) for x, b in zip(final["sum"], backgrounds, strict=False)]
         rest += [D(x) for x in final["sum"][len(rest) :]]
         nothing = final["place"][0] == nowhere[0]
+        if self.masks:
+            nothing |= self.masks[k] <= 0
         state = {"T": lib.Float(1), "rest": rest, "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0)}
         return {**state, **self.sink.init()}
 
@@ -115,7 +125,7 @@ class Rows:
         loaded = self.channels.load(lib, index, rays[0], going, only=None if self.colors else "record")
         record, hits = loaded["record"], lib.Bool(False)
         extra = None if self.buffer is None else load_packed(lib, self.buffer, self.size, index, going)
-        for ray, st, final, place in zip(rays, states, self.finals, places, strict=True):
+        for k, (ray, st, final, place) in enumerate(zip(rays, states, self.finals, places, strict=True)):
             a, _, ok = m.hit(record, ray, active & (st["alive"] != 0))
             T, left, new, at_end = st["T"], 1 - a, dict(st), ok
             w = dr.select(ok, T * a, 0)
@@ -137,6 +147,10 @@ class Rows:
                 slopes = [dr.select(moves, x, 0) for x in self._slopes(record, extra, ray)]
                 if self.color:
                     turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
+            if self.masks:  # after `rest`, which is of the whole image
+                w = w * self.masks[k]
+                g = [x * self.masks[k] for x in g] if g else g
+                turned = [[x * self.masks[k] for x in each] for each in turned] if turned else turned
             rows.append(Row(slopes, g, w, turned, color, ray.carried[: ray.basis]))
             hits |= ok
             out.append(new)

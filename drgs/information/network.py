@@ -35,7 +35,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import camera_list, check_any_scene, check_view, gaussians_at
+from drgs.guards.doors import Masks, camera_list, check_any_scene, check_view, gaussians_at, mask_list
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.probes import Pullback
@@ -68,6 +68,7 @@ def network(
     seed: int = 0,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     semantics: SemanticMetric | None = None,
+    masks: Masks = None,
 ) -> Information:
     """What views say about a scene's deformation network, summed over views; an estimate.
 
@@ -82,6 +83,7 @@ def network(
         seed: Of the random signs, the same in all views.
         channel_weights: Inverse noise variances of R, G and B.
         semantics: The metric in which decoded features tell, too; its `estimate` says how many channels they take.
+        masks: As for `drgs.fisher.diagonal`.
     Returns:
         Group (`grid`, `mlp`; those that there are) -> float64 on the CPU: (P,) of its P parameters in the order of
         `scene.parameters()`, of `trace` and `paper` a number ().
@@ -92,8 +94,9 @@ def network(
     moving, groups = _checked(where, scene, estimate, mode, probes)
     total = {name: torch.zeros(_size(own) if estimate == "diagonal" else (), dtype=torch.float64)
              for name, own in groups.items()}  # fmt: skip
-    for camera in _cameras(where, cameras):
-        view = _View.of(where, moving, camera, settings, channel_weights, semantics)
+    views = _cameras(where, cameras)
+    for camera, mask in zip(views, mask_list(where, masks, views), strict=True):
+        view = _View.of(where, moving, camera, settings, channel_weights, semantics, mask)
         if view is None:
             continue
         with own_errors():
@@ -160,7 +163,8 @@ class _View:
 
     Attributes:
         call: Of the view.
-        scales: (C,) what the call's channels are multiplied by: colors, then semantic channels.
+        scales: (C,) what the call's channels are multiplied by, colors, then semantic channels; with a mask
+            (pixels, C).
     """
 
     call: Call
@@ -175,6 +179,7 @@ class _View:
         settings: RenderSettings | None,
         channel_weights: Sequence[float],
         semantics: SemanticMetric | None,
+        mask: torch.Tensor | None = None,
     ) -> _View | None:
         """Of a scene at the time of a camera; None if there is nothing to see."""
         with torch.no_grad():  # derivatives are taken from Dr.Jit's side
@@ -195,12 +200,14 @@ class _View:
             seen = reduced.reduced(seen)
             scales = torch.cat([scales, torch.full((directions.shape[1],), semantics.weight**0.5)])
         settings = settings or RenderSettings.preset("exact")
+        if mask is not None:
+            scales = mask.detach().double().cpu().reshape(-1, 1) * scales
         return cls(Call(seen.detach(), camera, settings, frozenset(), scene=deformed), scales)
 
     @property
     def rows(self) -> int:
         """C, rows of a pixel."""
-        return len(self.scales)
+        return self.scales.shape[-1]
 
     def pullback(self, groups: Groups) -> Pullback:
         """J^T of it; see `pulled`."""

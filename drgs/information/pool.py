@@ -190,6 +190,7 @@ class Pool:
         scene: As it is now; the Gaussians that a camera sees are `scene.at(camera.time)`.
         candidates: Cameras to choose from, at least `k`; a policy names them by their place in this list.
         train: Cameras whose views are known; may be empty.
+        masks: Of these, where they have some; see `drgs.fisher.diagonal`.
         k: How many to pick.
         scoring: How views are scored, where the policy scores them by information.
         rng: Where policies that draw take their numbers from.
@@ -205,6 +206,7 @@ class Pool:
     k: int
     scoring: Scoring
     rng: torch.Generator
+    masks: Sequence[torch.Tensor | None] | None = None
     cache: Cache | None = None
     lazy: bool = True
     progress: Callable[[int, int], object] | None = None

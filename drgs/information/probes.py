@@ -33,6 +33,7 @@ def by_probes(
     seed: int,
     semantics: SemanticMetric | None = None,
     scene: DeformableScene | None = None,
+    mask: torch.Tensor | None = None,
 ) -> Information:
     """Mean of (J^T v)^2 over Rademacher images v of RGB and decoded features; what only features tell about is exact.
 
@@ -40,6 +41,7 @@ def by_probes(
         semantics: Of the features; v has a sign for each direction that the decoder sees, and L v is what the features
             get of it, for E (J^T L v)^2 = diag(J^T M J). None: v is of RGB only.
         scene: Where the Gaussians come from: all groups are of this scene then.
+        mask: (H, W) what the image is multiplied by; None: 1.
     """
     if probes < 1:
         raise ValueError(f"fisher.diagonal: probes must be >= 1, got {probes}")
@@ -52,15 +54,16 @@ def by_probes(
     generator = torch.Generator().manual_seed(seed)
     pull = Pullback(call, [group.input for group in groups.values()])
     root = torch.tensor(weights).sqrt()
+    factor = torch.ones(1, 1) if mask is None else mask.detach().float().cpu().reshape(-1, 1)
     for _ in range(probes if groups else 0):
         sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1
-        features = semantics.cotangent(call.pixels, generator) if semantics else None
-        slopes = pull(sign * root, features)
+        features = semantics.cotangent(call.pixels, generator) * factor if semantics else None
+        slopes = pull(sign * root * factor, features)
         for name, group in groups.items():
             total[name] += group.pull(slopes[group.input], call.inputs[group.input].double().cpu()).square()
     result = {name: x / probes for name, x in total.items()}
     if other:
-        replay = Replay(gaussians, camera, settings, geometry=False, semantics=semantics)
+        replay = Replay(gaussians, camera, settings, geometry=False, semantics=semantics, mask=mask)
         result |= replay.diagonal(other, weights, False)
     return result
 

@@ -57,7 +57,12 @@ class Replay:
         settings: RenderSettings,
         geometry: bool = True,
         semantics: SemanticMetric | None = None,
+        mask: torch.Tensor | None = None,
     ) -> None:
+        """
+        Args:
+            mask: (H, W) what the image is multiplied by before it is compared; None: 1.
+        """
         # Without a graph of torch: information is a number, and its derivatives are taken here.
         slices: list[torch.Tensor | None] = [None]
         if semantics is not None and geometry:
@@ -75,6 +80,7 @@ class Replay:
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
             self.compositor.forward(*arguments, keep=True)
         p = {name: x.array for name, x in self.inputs.items()}
+        self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
         self.along_ray = settings.sh_direction == "ray"
         self.color, self.extras = False, None
         self.light: torch.Tensor | Any = None  # of SH along each ray, once `sums` or `sh_spread` was called
@@ -171,8 +177,11 @@ class Replay:
 
     def _replay(self, walk: Walk, sink: Sink) -> list[dict]:
         """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
-        rows = Rows(self.compositor.model, walk.channels, self.extras, sink, walk.finals, self.color)
-        return walk.part.run(rows)
+        part, masks = walk.part, None
+        if self.mask is not None:
+            masks = [dr.gather(self.lib.Float, self.mask, *at) for at in zip(part.flat, part.inside, strict=True)]
+        rows = Rows(self.compositor.model, walk.channels, self.extras, sink, walk.finals, self.color, masks)
+        return part.run(rows)
 
     def _summed(
         self, sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks], width: int, weights: Sequence[float]

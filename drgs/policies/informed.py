@@ -76,16 +76,16 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
     settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
 
     def by(asked: Sequence[Asked]) -> InformationSource:
-        def compute(camera: Camera) -> Information:
+        def compute(camera: Camera, mask: torch.Tensor | None) -> Information:
             found: dict[str, torch.Tensor] = {}
             for one in asked:
-                found |= one(pool.scene, camera, settings)
+                found |= one(pool.scene, camera, settings, mask)
             return found
 
         return compute, (settings, *asked)
 
-    if pool.information:
-        return greedy(pool, ViewInformation(pool, (pool.information, (pool.information, settings))), combination)
+    if own := pool.information:
+        return greedy(pool, ViewInformation(pool, (lambda camera, mask: own(camera), (own, settings))), combination)
     known = None if all(one.known for one in asked) else by([one for one in asked if one.known])
     return greedy(pool, ViewInformation(pool, by(asked), known), combination)
 

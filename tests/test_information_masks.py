@@ -1,0 +1,112 @@
+"""Masks in Fisher information: outside of them a view tells nothing, whichever way it is asked."""
+
+from __future__ import annotations
+
+import dense_jacobian as dense
+import numpy as np
+import pytest
+import torch
+from dense_jacobian import GROUPS, error
+from scenes_random import camera, gaussians
+
+from drgs import fisher
+from drgs.gain import information_gain
+from drgs.guards.arguments import ArgumentError
+from drgs.information.semantics import SemanticMetric
+from drgs.select import Cache, select
+from drgs.settings import RenderSettings
+
+KINDS = {
+    "tiles": {},
+    "center": {"order": "center"},
+    "bvh": {"traversal": "bvh"},
+    "ewa": {"response": "ewa", "order": "center", "dilation": 0.3},
+    "along rays": {"sh_direction": "ray"},
+}
+
+
+def soft(rng, cam):
+    """(H, W): a third 0, a third 1, the rest between."""
+    drawn = torch.from_numpy(rng.uniform(-1, 2, (cam.height, cam.width))).float()
+    return drawn.clamp(0, 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_are_multiplied(kind, rng):
+    """The oracle's Jacobian with each row times its pixel's mask: diagonal, blocks, columns."""
+    settings = RenderSettings.preset("exact", **KINDS[kind]).replace(background=(0.2, 0.5, 0.7))
+    g, cam, out = dense.scene(rng, settings, K=4)
+    mask = soft(rng, cam)
+    factor = mask.double().reshape(-1).repeat_interleave(3)
+    J = {name: x * factor.reshape(-1, *[1] * (x.ndim - 1)) for name, x in dense.jacobian(g, out).items()}
+    truth, rows = dense.squares(J), dense.stacked(J)
+    found = fisher.diagonal(g, cam, settings, masks=[mask])
+    for name in GROUPS:
+        assert error(found[name], truth[name]) <= 1e-4, name
+    blocks = torch.einsum("pni,pnj->nij", rows, rows)
+    assert float((fisher.blocks(g, cam, settings, masks=[mask]) - blocks).abs().max()) <= 1e-4 * float(blocks.max())
+    columns = fisher.diagonal(g, cam, settings, "columns", masks=[mask], groups=["means", "sh"])
+    for name, x in columns.items():
+        assert error(x, truth[name]) <= 1e-4, name
+
+
+@pytest.mark.parametrize("what", ["exact", "fisherrf", "coverage", "blocks", "semantic"])
+def test_halves_add_up(what, rng):
+    """What a view says inside of a sharp mask and outside of it is what it says."""
+    g, cam, settings = gaussians(rng, 10, 4, D=3, scale=0.25).detach(), camera(rng, (12, 10)), None
+    inside = (torch.from_numpy(rng.uniform(size=(cam.height, cam.width))) < 0.5).float()
+    asked = {
+        "exact": lambda **x: fisher.diagonal(g, cam, settings, **x),
+        "fisherrf": lambda **x: fisher.diagonal(g, cam, settings, "fisherrf", **x),
+        "coverage": lambda **x: {"coverage": fisher.coverage(g, cam, settings, **x)},
+        "blocks": lambda **x: {"blocks": fisher.blocks(g, cam, settings, **x)},
+        "semantic": lambda **x: fisher.diagonal(g, cam, settings, semantics=SemanticMetric.of(None, 3), **x),
+    }[what]
+    whole, one, other = asked(), asked(masks=[inside]), asked(masks=[1 - inside])
+    for name, x in whole.items():
+        assert float(one[name].abs().max()) > 0
+        torch.testing.assert_close(one[name] + other[name], x, rtol=1e-5, atol=1e-6 * float(x.abs().max()))
+
+
+def test_probes_know_masks(rng):
+    """On average what the closed form says; nothing where the mask is 0."""
+    g, cam = gaussians(rng, 6, 1, scale=0.25).detach(), camera(rng, (12, 10))
+    mask = soft(rng, cam)
+    exact = fisher.diagonal(g, cam, masks=[mask])
+    found = fisher.diagonal(g, cam, method="probes", probes=256, masks=[mask])
+    for name in GROUPS:
+        assert float(found[name].sum() / exact[name].sum()) == pytest.approx(1, abs=0.25), name
+    assert not any(x.any() for x in fisher.diagonal(g, cam, method="probes", masks=[0 * mask]).values())
+
+
+def test_known_views_tell_less(rng):
+    """`select` asks known views within their masks, candidates as they are; a cache keeps both apart."""
+    g, cache = gaussians(rng, 8, 1, scale=0.25).detach(), Cache()
+    cameras = [camera(rng, (12, 10)) for _ in range(3)]
+    known, candidates = cameras[:1], cameras[1:]
+    mask = soft(rng, known[0])
+    plain = select(g, candidates, known, cache=cache)
+    masked = select(g, candidates, known, cache=cache, masks=[mask])
+    assert masked.computed == 1
+    assert all(a >= b for a, b in zip(masked.scores, plain.scores, strict=True))
+    H = fisher.diagonal(g, known, masks=[mask])
+    for camera_, score in zip(candidates, masked.scores, strict=True):
+        assert score == pytest.approx(information_gain(fisher.diagonal(g, camera_), H).total, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        ([], "masks must be a list with one for each of 1 cameras, got 0"),
+        (torch.ones(10, 12), "masks must be a list with one for each of 1 cameras, got a Tensor of shape"),
+        ([torch.ones(3, 4)], r"masks\[0\] must be \(10, 12\) like its camera's image"),
+        ([torch.full((10, 12), 2.0)], r"all within 0 and 1, got \(10, 12\) within 2 and 2"),
+        ([torch.full((10, 12), float("nan"))], "all within 0 and 1"),
+        ([np.ones((10, 12))], r"masks\[0\] must be .*Tensor"),
+    ],
+)
+def test_bad_masks(rng, masks, message):
+    """One line that names the mask."""
+    g, cam = gaussians(rng, 3, 1).detach(), camera(rng, (12, 10))
+    with pytest.raises(ArgumentError, match=message):
+        fisher.diagonal(g, cam, masks=masks)
