@@ -3,9 +3,8 @@
     python benchmarks/predict.py [--scenes office head still_life] [--runs runs/studies]
 
 On a fit to 6 views every other view of the pool is added alone, the fit goes on for a while, and the drop of the error
-of held-out views is compared with the score that each policy gave the view before. Also the AUSE of the variance map:
-whether pixels that it calls uncertain are wrong. Results go to docs/active-static.md and benchmarks/predict.json;
-candidates that have been measured are not measured again.
+of held-out views is compared with the score that each policy gave the view before. Results go to docs/active-static.md
+and benchmarks/predict.json; candidates that have been measured are not measured again.
 """
 
 from __future__ import annotations
@@ -20,14 +19,13 @@ import torch
 from studies import ROOT
 
 import drgs
-from drgs import fisher
-from drgs.gain import Prior, variances
+from drgs.gain import Prior
 from drgs.lab.study_report import fill_between
 from drgs.select import Cache, select
 
 VIEWS, STEPS, MORE = 6, 1000, 200
-COVERED = ", alpha > 0.5"
 RELATIVE = {"policy": "fisher", "prior": Prior(1e-3, relative=True)}
+BOTH = ("geometry", "background")
 SCORES = {
     "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
     "fisher, logdet, relative 1e-3": {**RELATIVE, "criterion": "logdet"},
@@ -36,6 +34,11 @@ SCORES = {
     "fisher, trace_cov": {"policy": "fisher", "criterion": "trace_cov"},
     "fisher, trace_cov, relative 1e-3": {**RELATIVE, "criterion": "trace_cov"},
     "fisher, block_logdet": {"policy": "fisher", "criterion": "block_logdet"},
+    "fisher, v_opt": {"policy": "fisher", "criterion": "v_opt"},
+    "fisher, eig, with background": {"policy": "fisher", "criterion": "eig", "blocks": BOTH},
+    "fisher, v_opt, with background": {"policy": "fisher", "criterion": "v_opt", "blocks": BOTH},
+    "fisher, v_opt, background alone": {"policy": "fisher", "criterion": "v_opt", "blocks": ("background",)},
+    "facility": {"policy": "facility"},
     "fisherrf": {"policy": "fisherrf"},
     "coverage": {"policy": "coverage"},
     "farthest": {"policy": "farthest"},
@@ -64,11 +67,10 @@ def drops(name: str, runs: Path) -> dict:
     done = studies.read_rows(store, {})
     if "scores" not in done:
         cache = Cache()
+        candidates, known = [pool[i].camera for i in left], [frame.camera for frame in train]
+        told = {"settings": settings, "cache": cache, "masks": [frame.mask for frame in train]}
         done["scores"] = {
-            label: select(
-                g, [pool[i].camera for i in left], [f.camera for f in train], settings=settings, cache=cache, **options
-            ).scores
-            for label, options in SCORES.items()
+            label: select(g, candidates, known, **told, **options).scores for label, options in SCORES.items()
         }
         # What going on without a new view does is no merit of a view; the seeds say what chance does.
         control = [
@@ -76,53 +78,12 @@ def drops(name: str, runs: Path) -> dict:
         ]
         done |= {"names": [pool[i].name for i in left], "control": control, "after": []}
         studies.write_rows(store, done)
-    if COVERED not in done.get("ause", {}):
-        done["ause"] = ause(g, [f.camera for f in train], held_out, settings)
-        studies.write_rows(store, done)
     while len(done["after"]) < len(left):
         i = left[len(done["after"])]
         done["after"].append(error(studies.continued(trainer, [*train, pool[i]], MORE).gaussians(), held_out, settings))
         studies.write_rows(store, done)
         print(name, len(done["after"]), "of", len(left), flush=True)
     return done
-
-
-def ause(g, train: list, held_out: list, settings) -> dict:
-    """Area between the sparsification curves of the variance map and of the error itself; 0 is perfect.
-
-    Root of the mean squared error of what is left when the fraction of pixels called most uncertain is taken out, both
-    curves divided by the error of all pixels; also of a random order and of 1 - alpha. Once more for the pixels that
-    the Gaussians cover: about others the information says nothing.
-    """
-    weights = variances(fisher.diagonal(g, train, settings), Prior(1e-3, relative=True))
-    maps, wrong, covered = {"variance": [], "1 - alpha": [], "random": []}, [], []
-    generator = torch.Generator().manual_seed(0)
-    for frame in held_out:
-        camera = frame.camera
-        with torch.no_grad():
-            out = drgs.render(g, camera, settings, outputs=())
-        keep = torch.ones(camera.height, camera.width, dtype=torch.bool) if frame.mask is None else frame.mask > 0.5
-        wrong.append((out.rgb.clamp(0, 1) - frame.image()).square().mean(2)[keep])
-        covered.append(out.alpha[keep] > 0.5)
-        maps["variance"].append(fisher.variance_map(g, camera, weights, settings)[keep])
-        maps["1 - alpha"].append(1 - out.alpha[keep])
-        maps["random"].append(torch.rand(int(keep.sum()), generator=generator))
-    wrong, covered = torch.cat(wrong).double(), torch.cat(covered)
-    maps = {name: torch.cat(x) for name, x in maps.items()}
-    result = {"covered": float(covered.double().mean())}
-    for label, part in (("", torch.ones_like(covered)), (COVERED, covered)):
-        best = curve(wrong[part], wrong[part])
-        for name, x in maps.items():
-            result[name + label] = float((curve(wrong[part], x[part]) - best).mean())
-    return result | {COVERED: True}
-
-
-def curve(wrong: torch.Tensor, order: torch.Tensor, points: int = 100) -> torch.Tensor:
-    """RMSE of the pixels left after removing the share k / points with the largest `order`, relative to all."""
-    sums = wrong[order.argsort()].cumsum(0)
-    kept = torch.tensor([max(1, round(len(wrong) * (1 - k / points))) for k in range(points)])
-    rmse = (sums[kept - 1] / kept).sqrt()
-    return rmse / rmse[0]
 
 
 def report(result: dict, made: str) -> str:
@@ -166,23 +127,15 @@ def report(result: dict, made: str) -> str:
             "picked by fisher, logdet",
             lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, logdet']))]):.2f}",
         ),
+        (
+            "picked by fisher, v_opt, with background",
+            lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, v_opt, with background']))]):.2f}",
+        ),
         ("picked by fisherrf", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisherrf']))]):.2f}"),
         ("picked by coverage", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['coverage']))]):.2f}"),
         ("picked by farthest", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['farthest']))]):.2f}"),
     ):
         lines.append(f"| {label} | " + " | ".join(of(result[name]) for name in names) + " |")
-    lines += [
-        "",
-        "AUSE of the predictive variance per pixel on the held-out views (RMSE; 0 is the order of the true error):",
-        "",
-        "| map | " + " | ".join(names) + " |",
-        "|---|" + "---|" * len(names),
-    ]
-    lines.append(
-        "| (pixels with alpha > 0.5) | " + " | ".join(f"{result[n]['ause']['covered']:.0%}" for n in names) + " |"
-    )
-    for label in [x + y for y in ("", COVERED) for x in ("variance", "1 - alpha", "random")]:
-        lines.append(f"| {label} | " + " | ".join(f"{result[name]['ause'][label]:.3f}" for name in names) + " |")
     return "\n".join(lines)
 
 
