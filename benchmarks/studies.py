@@ -151,6 +151,7 @@ def command(
     report: Callable[[Study, list[dict]], str],
     seeds: int = 3,
     sets: Mapping[str, Sequence[str]] | None = None,
+    only: Mapping[str, Sequence[str]] | None = None,
 ) -> int:
     """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl.
 
@@ -164,6 +165,7 @@ def command(
         report: Study, its rows -> tables.
         seeds: The default of --seeds.
         sets: --set -> its scenes, the first the default; None: all scenes, and no such option.
+        only: Policy -> scenes, of policies that are not run on all of them.
     Returns:
         The exit code.
     """
@@ -194,6 +196,7 @@ def command(
     shard, shards = map(int, args.shard.split("/"))
     units = units_of(study, args.seeds, scenes) if scenes else units_of(study, args.seeds)
     cells = [cell for cell in study.cells(units) if cell.policy in (args.policies or [cell.policy])]
+    cells = [cell for cell in cells if cell.scene in (only or {}).get(cell.policy, [cell.scene])]
     cells = cells[shard::shards]
     taken, failed = run_cells(study, cells, args.runs, results, say=lambda line: print(line, flush=True))
     print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {stamp(script)}")
