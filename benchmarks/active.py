@@ -50,8 +50,10 @@ POLICIES = {
         for criterion in ("eig", "block_logdet", "v_opt")
     },
 }
-ONLY = {SCRATCH: ("head", "room-3", "still-5", "office", "room-5", "still-1")}
-"""As FisherRF's own code does, after each pick; on fewer scenes."""
+ONLY = {
+    SCRATCH: ("head", "room-3", "still-5", "office", "room-5", "still-1")
+}  # as FisherRF's own code, after each pick
+POLICIES |= {f"{label}, lambda 1e-2": {**POLICIES[label], "prior": 1e-2} for label in ("v_opt, with background",)}
 METRICS = (
     Metric("psnr", "PSNR", 2),
     Metric("ssim", "SSIM"),
