@@ -504,9 +504,10 @@ def test_a_page_comes_from_its_rows(monkeypatch):
     root = Path(__file__).parents[1]
     monkeypatch.syspath_prepend(root / "benchmarks")
     active = importlib.import_module("active")
-    text = active.page_of("small", "first")
+    rows = [row for row in read_study(root / "benchmarks" / "active.jsonl") if row["scene"] in active.REPORT]
+    assert rows
+    text = study_report(active.study_of("small", root / "runs"), rows)
     assert text in (root / "docs" / "active-static.md").read_text()
-    assert "72 fits" in text
 
 
 def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
