@@ -44,16 +44,13 @@ POLICIES = {
     **{name: {"policy": name} for name in PLAIN},
     SCRATCH: {"policy": "fisherrf", "restart": "always"},
     **{f"{criterion}": _fisher(criterion) for criterion in ("eig", "logdet", "block_logdet", "v_opt")},
-    "v_opt, background": _fisher("v_opt", "background"),
-    **{
-        f"{criterion}, with background": _fisher(criterion, "geometry", "background")
-        for criterion in ("eig", "block_logdet", "v_opt")
-    },
+    "v_opt, backdrop": _fisher("v_opt", "backdrop"),
+    **{f"{criterion}, with backdrop": _fisher(criterion, "geometry", "backdrop") for criterion in ("eig", "v_opt")},
 }
 ONLY = {
     SCRATCH: ("head", "room-3", "still-5", "office", "room-5", "still-1")
 }  # as FisherRF's own code, after each pick
-POLICIES |= {f"{label}, lambda 1e-2": {**POLICIES[label], "prior": 1e-2} for label in ("v_opt, with background",)}
+POLICIES |= {f"{label}, lambda 1e-2": {**POLICIES[label], "prior": 1e-2} for label in ("v_opt, with backdrop",)}
 METRICS = (
     Metric("psnr", "PSNR", 2),
     Metric("ssim", "SSIM"),
@@ -93,7 +90,7 @@ def study_of(scale: str, runs: Path) -> Study:
         reference="random",
         comparisons=tuple(
             (label, other)
-            for label in ("v_opt, background", "v_opt, with background")
+            for label in ("v_opt, backdrop", "v_opt, with backdrop")
             for other in ("farthest", "uniform", "fisherrf")
         ),
     )

@@ -25,7 +25,7 @@ from drgs.select import Cache, select
 
 VIEWS, STEPS, MORE = 6, 1000, 200
 RELATIVE = {"policy": "fisher", "prior": Prior(1e-3, relative=True)}
-BOTH = ("geometry", "background")
+BOTH = ("geometry", "backdrop")
 SCORES = {
     "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
     "fisher, logdet, relative 1e-3": {**RELATIVE, "criterion": "logdet"},
@@ -35,9 +35,9 @@ SCORES = {
     "fisher, trace_cov, relative 1e-3": {**RELATIVE, "criterion": "trace_cov"},
     "fisher, block_logdet": {"policy": "fisher", "criterion": "block_logdet"},
     "fisher, v_opt": {"policy": "fisher", "criterion": "v_opt"},
-    "fisher, eig, with background": {"policy": "fisher", "criterion": "eig", "blocks": BOTH},
-    "fisher, v_opt, with background": {"policy": "fisher", "criterion": "v_opt", "blocks": BOTH},
-    "fisher, v_opt, background alone": {"policy": "fisher", "criterion": "v_opt", "blocks": ("background",)},
+    "fisher, eig, with backdrop": {"policy": "fisher", "criterion": "eig", "blocks": BOTH},
+    "fisher, v_opt, with backdrop": {"policy": "fisher", "criterion": "v_opt", "blocks": BOTH},
+    "fisher, v_opt, backdrop alone": {"policy": "fisher", "criterion": "v_opt", "blocks": ("backdrop",)},
     "facility": {"policy": "facility"},
     "fisherrf": {"policy": "fisherrf"},
     "coverage": {"policy": "coverage"},
@@ -128,8 +128,8 @@ def report(result: dict, made: str) -> str:
             lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, logdet']))]):.2f}",
         ),
         (
-            "picked by fisher, v_opt, with background",
-            lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, v_opt, with background']))]):.2f}",
+            "picked by fisher, v_opt, with backdrop",
+            lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, v_opt, with backdrop']))]):.2f}",
         ),
         ("picked by fisherrf", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisherrf']))]):.2f}"),
         ("picked by coverage", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['coverage']))]):.2f}"),

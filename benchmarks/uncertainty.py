@@ -37,9 +37,9 @@ POLICY = "random"
 MAPS = {
     "variance, Gaussians alone": ("geometry", Prior(1e-3, relative=True)),
     "variance, Gaussians alone, lambda 1": ("geometry", Prior(1.0)),
-    "variance with background, lambda 1e-6": ("both", Prior(1e-6)),
-    "variance with background, lambda 1e-2": ("both", Prior(1e-2)),
-    "variance with background, lambda 1": ("both", Prior(1.0)),
+    "variance with backdrop, lambda 1e-6": ("both", Prior(1e-6)),
+    "variance with backdrop, lambda 1e-2": ("both", Prior(1e-2)),
+    "variance with backdrop, lambda 1": ("both", Prior(1.0)),
 }
 PLAIN = ("1 - alpha", "random order")
 VIEWS = 12  # of those held out at most, evenly spaced
@@ -50,10 +50,10 @@ def ause(scene: drgs.Gaussians, train: list[Frame], held_out: list[Frame], setti
     """Map -> AUSE; and `covered`, the share of held-out pixels with alpha above 0.5."""
     cameras, masks = [frame.camera for frame in train], [frame.mask for frame in train]
     H = fisher.diagonal(scene, cameras, settings, masks=masks)
-    H["background"] = fisher.background(scene, cameras, settings)
+    H["backdrop"] = fisher.backdrop(scene, cameras, settings)
     weights = {}
     for name, (which, prior) in MAPS.items():
-        counted = {group: x for group, x in H.items() if group != "background" or which == "both"}
+        counted = {group: x for group, x in H.items() if group != "backdrop" or which == "both"}
         weights[name] = variances(counted, prior)
     maps: dict[str, list[torch.Tensor]] = {name: [] for name in (*MAPS, *PLAIN)}
     wrong, covered, generator = [], [], torch.Generator().manual_seed(0)

@@ -32,7 +32,7 @@ from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import Masks, camera_list, check_any_scene, check_scene, check_view, gaussians_at, mask_list
-from drgs.information.background import CELLS, background_information, background_variance
+from drgs.information.backdrop import CELLS, backdrop_information, backdrop_variance
 from drgs.information.columns import by_columns, jacobian_columns
 from drgs.information.groups import GROUPS, Group, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
@@ -52,7 +52,7 @@ __all__ = [
     "Information",
     "Prior",
     "SemanticMetric",
-    "background",
+    "backdrop",
     "blocks",
     "coverage",
     "diagonal",
@@ -254,20 +254,21 @@ def coverage(
 
 
 @alone
-def background(
+def backdrop(
     gaussians: Scene,
     cameras: Camera | Sequence[Camera],
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    masks: Masks = None,
 ) -> torch.Tensor:
     """(1536, 3) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything,
-    a row for each cell of directions. See `drgs.information.background`; arguments as of `diagonal`.
+    a row for each cell of directions. See `drgs.information.backdrop`; arguments as of `diagonal`.
     """
-    cameras = _cameras_of("fisher.background", gaussians, cameras, settings)
+    cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
     settings, weights = settings or RenderSettings.preset("exact"), _weights(channel_weights)
     total = torch.zeros(CELLS, 3, dtype=torch.float64)
-    for camera in cameras:
-        total += background_information(gaussians, camera, settings, weights)
+    for camera, mask in zip(cameras, mask_list("fisher.backdrop", masks, cameras), strict=True):
+        total += backdrop_information(gaussians, camera, settings, weights, mask)
     return total
 
 
@@ -287,7 +288,7 @@ def variance_map(
 
     Args:
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
-        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `background`,
+        weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `backdrop`,
             (1536, 3), is that of the color behind what the Gaussians leave open.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
@@ -297,23 +298,24 @@ def variance_map(
     if semantics is not None:
         semantics.check("fisher.variance_map", seen)
     known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
-    behind, factors = weights.get("background"), _weights(channel_weights)
-    weights = {name: x for name, x in weights.items() if name != "background"}
-    if behind is not None and tuple(behind.shape) != (CELLS, 3):
-        raise ValueError(
-            f"fisher.variance_map: weights of background must have shape {(CELLS, 3)}, got {tuple(behind.shape)}"
-        )
+    shapes = {"backdrop": (CELLS, 3)} | {name: group.shape(seen) for name, group in known.items()}
     for name, x in weights.items():
-        if name not in known:
-            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(known)}, got {name!r}")
-        shape = known[name].shape(seen)
-        if tuple(x.shape) != shape:
-            raise ValueError(f"fisher.variance_map: weights of {name} must have shape {shape}, got {tuple(x.shape)}")
+        if name not in shapes:
+            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(shapes)}, got {name!r}")
+        must_be("fisher.variance_map", f"weights of {name}", x, torch.Tensor, "as fisher.diagonal returns")
+        if tuple(x.shape) != shapes[name]:
+            raise ValueError(
+                f"fisher.variance_map: weights of {name} must have shape {shapes[name]}, got {tuple(x.shape)}"
+            )
+    behind = weights.get("backdrop")
+    if behind is not None and not bool(torch.isfinite(behind).all()):
+        raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
+    weights, factors = {name: x for name, x in weights.items() if name != "backdrop"}, _weights(channel_weights)
     found = torch.zeros(camera.height, camera.width)
     if len(seen) and weights:
         found = Replay(seen, camera, settings, semantics=semantics).variance(weights, factors)
     if behind is not None:
-        found = found + background_variance(seen, camera, behind, settings, factors).float()
+        found = found + backdrop_variance(seen, camera, behind, settings, factors).float()
     return found
 
 

@@ -178,7 +178,7 @@ def scorer(
             raise ValueError(
                 f"information_gain: weights must be None for block_logdet, got {dict(weights)}; a block has no parts"
             )
-        return _blocks_and_others(train, prior)
+        return _Blocks(train[BLOCKS], prior, BLOCK_LAYOUT)
     return _Diagonal(train, criterion, prior, dict(weights or {}), pool)
 
 
@@ -295,23 +295,6 @@ def _check_alike(what: str, information: Information, train: Information) -> Non
 
 
 # -------------------------------------------------- one block a Gaussian
-
-
-def _blocks_and_others(train: Information, prior: Prior) -> Callable[[Information], Gain]:
-    """Gains of blocks, and by `logdet` of parameters that are of no Gaussian."""
-    others = {name: x for name, x in train.items() if name != BLOCKS}
-    theirs = {name: x for name, x in prior.groups.items() if name in others}
-    own = {name: x for name, x in prior.groups.items() if name not in others}
-    of_blocks = _Blocks(train[BLOCKS], dataclasses.replace(prior, groups=own), BLOCK_LAYOUT)
-    if not others:
-        return of_blocks
-    of_others = _Diagonal(others, "logdet", dataclasses.replace(prior, groups=theirs), {})
-
-    def score(candidate: Information) -> Gain:
-        a, b = of_blocks(candidate), of_others({name: x for name, x in candidate.items() if name != BLOCKS})
-        return Gain(a.total + b.total, a.parts | b.parts, a.left_out | b.left_out, a.unseen | b.unseen, a.repaired)
-
-    return score
 
 
 def block_gain(

@@ -55,6 +55,7 @@ def select(
     scoring: Scoring | None = None,
     rng: torch.Generator | None = None,
     masks: Masks = None,
+    empty_outside: bool = False,
     cache: Cache | None = None,
     lazy: bool = True,
     progress: Callable[[int, int], object] | None = None,
@@ -77,8 +78,10 @@ def select(
         policy: A name in `POLICIES`.
         scoring: How views are scored; default `Scoring()`.
         rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
-        masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside of an object's mask
-            was not learned from. Nothing is known of candidates'.
+        masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside was not learned from.
+            Nothing is known of candidates'. Of `fisher`, `coverage` and what is made of them.
+        empty_outside: Nothing is outside of the masks, as of an object's: what these views leave open there is known
+            to be empty (block `backdrop`).
         cache: Where to look for and keep information of single views.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
             Not done where scores can rise (a relative lambda, or lambda = 0).
@@ -102,6 +105,8 @@ def select(
         raise ValueError(f"select: policy must be one of {', '.join(POLICIES)}, got {policy!r}; choose one")
     if rng is not None and not isinstance(rng, torch.Generator):
         raise ValueError(f"select: rng must be a torch.Generator that is kept between calls, got {rng!r}; make one")
+    if masks is not None and information is not None:
+        raise ValueError("select: masks must be None with information, got both; it knows by itself what views tell")
     pool = Pool(
         scene=gaussians,
         candidates=candidates,
@@ -110,6 +115,7 @@ def select(
         scoring=_scoring(scoring, fields),
         rng=rng or _GENERATOR,
         masks=mask_list("select", masks, train),
+        empty_outside=empty_outside,
         cache=cache,
         lazy=lazy,
         progress=progress,

@@ -247,10 +247,21 @@ def test_views_add_up_and_a_view_twice_is_twice_as_much(seen):
 
 @pytest.mark.parametrize("estimate", ["diagonal", "trace", "paper"])
 def test_masks_weigh_rows(seen, estimate):
-    """With the same random signs half of the light is a quarter of the information, and none is none."""
-    scene, cam, _ = seen
+    """With the same random signs half of the light is a quarter of the information, none is none, and one channel of
+    one pixel is one row of J.
+    """
+    scene, cam, J = seen
     ask = lambda **x: fisher.network(scene, cam, estimate=estimate, probes=2, **x)  # noqa: E731
     whole, power = ask(), 4 if estimate == "paper" else 2
+    row = torch.zeros(cam.height * cam.width)
+    brightest = int(torch.cat([x.square().sum((1, 2))[None] for x in J.values()]).sum(0).argmax())
+    row[brightest] = 0.5
+    one = {"channel_weights": (1.0, 0.0, 0.0), "masks": [row.reshape(cam.height, cam.width)]}
+    for name, x in ask(**one).items():
+        own = 0.25 * J[name][brightest, 0].square()
+        if estimate == "paper":  # tr(H^2) of a single row g is |g|^4
+            continue
+        close(x, own if estimate == "diagonal" else own.sum())
     for value in (0.5, 0.0):
         found = ask(masks=[torch.full((cam.height, cam.width), value)])
         for name, x in whole.items():

@@ -272,7 +272,7 @@ def test_the_cache_knows_the_metric(world):
         (lambda g, c: select(g.replace(features=None), c, c, blocks=("semantic",)), "semantic for Gaussians without"),
         (
             lambda g, c: select(g, c, c, blocks=("color",)),
-            "blocks must be among geometry, semantic, deformation, background, got 'color",
+            "blocks must be among geometry, semantic, deformation, backdrop, got 'color",
         ),
         (lambda g, c: select(g, c, c, blocks=()), "blocks must be a tuple of one or more"),
         (lambda g, c: select(g, c, c, blocks=("geometry",), groups=("features",)), "groups must have one that blocks"),
@@ -361,7 +361,7 @@ def test_select_names_blocks(folder, monkeypatch, capsys):
     capsys.readouterr()
     for bad, message in (
         ("plain.ply --blocks geometry,semantic", "got semantic for Gaussians without features"),
-        ("scene.ply --blocks colors", "blocks must be among geometry, semantic, deformation, background, got 'colors"),
+        ("scene.ply --blocks colors", "blocks must be among geometry, semantic, deformation, backdrop, got 'colors"),
     ):
         for command, other in (("select", "--candidates cameras.json -o no.json"), ("fisher", "-o no")):
             assert cli.main(f"{command} {bad} --train train.json {other}".split()) == 2

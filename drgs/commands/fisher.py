@@ -47,10 +47,10 @@ __all__ = ["KINDS", "Told", "added", "map_weights", "run"]
 KINDS = ("variance", "share")  # of maps
 # Block -> groups that it says nothing about.
 _OTHERS = {
-    "geometry": ("features", "background", *NETWORK_GROUPS),
-    "semantic": ("sh", "background", *NETWORK_GROUPS),
-    "deformation": (*GROUPS, "background"),
-    "background": (*GROUPS, *NETWORK_GROUPS),
+    "geometry": ("features", "backdrop", *NETWORK_GROUPS),
+    "semantic": ("sh", "backdrop", *NETWORK_GROUPS),
+    "deformation": (*GROUPS, "backdrop"),
+    "backdrop": (*GROUPS, *NETWORK_GROUPS),
 }
 
 
@@ -176,8 +176,8 @@ class Told:
             if block == "deformation":
                 found[block] = fisher.network(self.scene, camera, self.settings, **options)
                 continue
-            if block == "background":
-                found[block] = {block: fisher.background(self.scene, camera, self.settings)}
+            if block == "backdrop":
+                found[block] = {block: fisher.backdrop(self.scene, camera, self.settings)}
                 continue
             if self.method == "probes":
                 options["probes"] = self.probes

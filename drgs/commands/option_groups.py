@@ -171,7 +171,7 @@ class Informed(Settings):
     """Information is computed on views of at most this many pixels; default as in the fit."""
     blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
     """What of an image tells: geometry (its colors), semantic (its features), deformation (about what moves),
-    background (where no Gaussian is)."""
+    backdrop (where no Gaussian is)."""
     probes: int = ActiveConfig.probes
     """Random probes of each view, for what it tells about a deformation field, and for --method probes."""
 

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 __all__ = ["print_picks", "run"]
 
-_SHORT = {"rotations": "rot.", "log_scales": "scales", "logit_opacities": "opac."}  # a table has 80 columns
+_SHORT = {
+    "rotations": "rot.",
+    "log_scales": "scales",
+    "logit_opacities": "opac.",
+    "backdrop": "back.",
+}  # a table has 80 columns
 
 
 def run(args: Select) -> None:

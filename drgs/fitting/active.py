@@ -252,6 +252,7 @@ class ActiveViews:
                 scoring=active.scoring(self._config.settings, semantics),
                 rng=self._generator,
                 masks=[_reduced(frame.mask, camera) for frame, camera in zip(frames, seen, strict=True)],
+                empty_outside=all(frame.is_object for frame in frames if frame.mask is not None),
                 progress=bar.update,
             )
         best = selection.picks[0]

@@ -49,7 +49,7 @@ Method = Literal["exact", "columns", "probes", "fisherrf"]
 
 METHODS: tuple[Method, ...] = typing.get_args(Method)
 
-Block = Literal["geometry", "semantic", "deformation", "background"]
+Block = Literal["geometry", "semantic", "deformation", "backdrop"]
 """What is asked of a view: what its colors and its features tell about the Gaussians, what the image tells about the
 network that moves them, and about what stands behind them, where they leave a pixel open."""
 
@@ -99,10 +99,11 @@ COMBINES: tuple[Combine, ...] = typing.get_args(Combine)
 
 def check_combined(where: str, blocks: Sequence[str] | None, criterion: str, network: str, combine: str | None) -> None:
     """Raise ValueError if these blocks (None: all there are) cannot be scored so, or not together."""
-    if "deformation" in (blocks or ()) and criterion == "block_logdet":
+    others = [name for name in ("deformation", "backdrop") if name in (blocks or ())]
+    if others and criterion == "block_logdet":
         raise ValueError(
-            f"{where}: blocks must be geometry or semantic with criterion block_logdet, got deformation; a network has "
-            "no blocks of single Gaussians, use eig"
+            f"{where}: blocks must be geometry or semantic with criterion block_logdet, got {others[0]}; only "
+            "Gaussians have blocks of their own, use eig"
         )
     beside = blocks is None or ("deformation" in blocks and len(blocks) > 1)
     if network != NETWORK_SCORES[0] and combine == "sum" and beside:

@@ -56,7 +56,7 @@ class Asked:
     def __call__(
         self, scene: Scene, camera: Camera, settings: RenderSettings, mask: torch.Tensor | None = None
     ) -> Information:
-        """What one view says; the emptiness beside an object is known, whatever its mask."""
+        """What one view says."""
         from drgs import fisher  # loads Dr.Jit, which policies that ask nothing need not have
 
         options: dict[str, Any] = dict(self.options)
@@ -64,7 +64,7 @@ class Asked:
         own = self.function == "diagonal" and (options.get("groups") is None or options["method"] in _OF_SCENES)
         with torch.no_grad():  # information is a number
             seen = scene if own or self.function == "network" else scene.at(camera.time)
-            if mask is not None and self.function != "background":
+            if mask is not None:
                 options["masks"] = [mask]
             found = getattr(fisher, self.function)(seen, camera, settings, **options)
         if isinstance(found, torch.Tensor):
@@ -95,7 +95,7 @@ class Combination:
     @property
     def pooled(self) -> bool:
         """Whether scores ask for the information of all views together, known ones and candidates."""
-        return self.scoring.criterion == "v_opt"
+        return self.scoring.criterion == "v_opt" and (bool(self.apart) or not self.traced)
 
     def scorer(self, H: Information, pool: Information | None = None) -> Callable[[Information], Gain]:
         """Gains of candidates against H, that of the known views.
@@ -202,8 +202,11 @@ def asked_of(
     """
     combined = scoring.combined_of(blocks)
     network = [name for name in scoring.groups or () if name in NETWORK_GROUPS]
-    named = (*network, "background")
-    theirs = None if scoring.groups is None else tuple(x for x in scoring.groups if x not in named)
+    if "backdrop" in (scoring.groups or ()) and "backdrop" not in blocks:
+        raise ValueError(
+            f"select: groups must be of blocks {', '.join(blocks)}, got backdrop; add its block or drop it"
+        )
+    theirs = None if scoring.groups is None else tuple(x for x in scoring.groups if x not in (*network, "backdrop"))
     traced = "deformation" if "deformation" in blocks and scoring.network != "ratio" else ""
     apart = blocks if combined == "zscore" else ()
     parts: list[Sequence[str]] = [[block] for block in apart] or [blocks]
@@ -214,8 +217,8 @@ def asked_of(
         options = {"estimate": estimate, "probes": scoring.probes, **rows}
         name = "deformation" if apart else ""
         made.append(Asked("network", (), tuple(sorted(options.items())), name, tuple(network) or None, not traced))
-    if "background" in blocks and (scoring.groups is None or "background" in scoring.groups):
-        made.append(Asked("background", block="background" if apart else ""))
+    if "backdrop" in blocks and (scoring.groups is None or "backdrop" in scoring.groups):
+        made.append(Asked("backdrop", block="backdrop" if apart else ""))
     asked = [one for one in made if one is not None]
     if not asked:
         raise ValueError(

@@ -191,6 +191,7 @@ class Pool:
         candidates: Cameras to choose from, at least `k`; a policy names them by their place in this list.
         train: Cameras whose views are known; may be empty.
         masks: Of these, where they have some; see `drgs.fisher.diagonal`.
+        empty_outside: Whether it is known that nothing is outside of the masks, as of an object's.
         k: How many to pick.
         scoring: How views are scored, where the policy scores them by information.
         rng: Where policies that draw take their numbers from.
@@ -207,6 +208,7 @@ class Pool:
     scoring: Scoring
     rng: torch.Generator
     masks: Sequence[torch.Tensor | None] | None = None
+    empty_outside: bool = False
     cache: Cache | None = None
     lazy: bool = True
     progress: Callable[[int, int], object] | None = None

@@ -16,6 +16,7 @@ import numpy as np
 
 from drgs.information.pool import Pool, Selection
 from drgs.policies.places import Places, Sight, places, sight_of
+from drgs.policies.turns import in_turn
 
 __all__ = ["facility", "overlap"]
 
@@ -46,14 +47,9 @@ def facility(pool: Pool) -> Selection:
     for sight in sights[: len(pool.train)]:
         covered = np.maximum(covered, overlap(sight, at))
     offered = np.stack([overlap(sight, at) for sight in sights[len(pool.train) :]])
-    picks, scores, left = [], [], list(range(len(offered)))
-    for _ in range(pool.k):
-        gains = (at.weights * (offered[left] - covered).clip(min=0)).sum(1)
-        order = np.argsort(-gains, kind="stable")
-        if not scores:
-            scores = gains.tolist()
-        margin = float(gains[order[0]] - gains[order[1]]) if len(order) > 1 else None
-        best = left.pop(int(order[0]))
-        picks.append(pool.pick(best, gains[order[0]], margin=margin))
-        covered = np.maximum(covered, offered[best])
+
+    def take(i: int) -> None:
+        np.maximum(covered, offered[i], out=covered)
+
+    picks, scores = in_turn(pool, lambda left: (at.weights * (offered[left] - covered).clip(min=0)).sum(1), take)
     return Selection(picks, scores, evaluations=pool.k * len(offered), computed=len(views))

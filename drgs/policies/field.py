@@ -24,6 +24,7 @@ import torch
 
 from drgs.information.pool import Pool, Selection
 from drgs.policies.places import Places, Sight, places, sight_of
+from drgs.policies.turns import in_turn
 
 __all__ = ["precision", "prior_field", "wrong"]
 
@@ -72,17 +73,10 @@ def prior_field(pool: Pool) -> Selection:
     for part in told[: len(pool.train)]:
         known = known + part
     weights = torch.from_numpy(at.weights)
-    picks, scores, left = [], [], list(range(len(pool.candidates)))
-    for _ in range(pool.k):
+
+    def gains_of(left: list[int]) -> np.ndarray:
         before = weights @ wrong(known, seen)
-        gains = [float(before - weights @ wrong(known + told[len(pool.train) + i], seen)) for i in left]
-        scores = scores or gains
-        order = sorted(range(len(left)), key=lambda j: -gains[j])  # stable: ties by index
-        margin = gains[order[0]] - gains[order[1]] if len(order) > 1 else None
-        best = left[order[0]]
-        picks.append(pool.pick(best, gains[order[0]], margin=margin))
-        left.pop(order[0])
-        known = known + told[len(pool.train) + best]
-    return Selection(
-        picks, scores, evaluations=sum(len(pool.candidates) - j for j in range(pool.k)), computed=len(views)
-    )
+        return np.array([float(before - weights @ wrong(known + told[len(pool.train) + i], seen)) for i in left])
+
+    picks, scores = in_turn(pool, gains_of, lambda i: known.add_(told[len(pool.train) + i]))
+    return Selection(picks, scores, evaluations=pool.k * len(pool.candidates), computed=len(views))

@@ -56,7 +56,8 @@ def fisherrf(pool: Pool) -> Selection:
     prior, weights = pool.scoring.prior, _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
     asked = Asked("diagonal", ("features",), (("method", "fisherrf"),))
-    return _greedy(_scored(pool, criterion="eig", prior=prior, weights=weights), [asked])
+    plain = dataclasses.replace(pool, masks=None)  # of which FisherRF knows nothing
+    return _greedy(_scored(plain, criterion="eig", prior=prior, weights=weights), [asked])
 
 
 def coverage(pool: Pool) -> Selection:
@@ -79,7 +80,8 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
         def compute(camera: Camera, mask: torch.Tensor | None) -> Information:
             found: dict[str, torch.Tensor] = {}
             for one in asked:
-                found |= one(pool.scene, camera, settings, mask)
+                empty = one.function == "backdrop" and pool.empty_outside  # which the view has shown
+                found |= one(pool.scene, camera, settings, None if empty else mask)
             return found
 
         return compute, (settings, *asked)

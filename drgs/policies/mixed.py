@@ -10,6 +10,7 @@ from drgs.information.pool import Pool, Selection
 from drgs.policies.informed import fisher
 from drgs.policies.places import sight_of
 from drgs.policies.spread import farthest, pose_distances
+from drgs.policies.turns import in_turn
 
 __all__ = ["diverse", "switch"]
 
@@ -35,17 +36,12 @@ def diverse(pool: Pool) -> Selection:
     found = fisher(dataclasses.replace(pool, k=1))
     views = [*pool.train, *pool.candidates]
     kernel = np.exp(-0.5 * pose_distances(views) ** 2)
-    gains, picks, scores, known = np.array(found.scores), [], [], list(range(len(pool.train)))
-    left = list(range(len(pool.candidates)))
-    for _ in range(pool.k):
-        rest = [len(pool.train) + i for i in left]
-        across = kernel[np.ix_(rest, known)]
+    gains, known = np.array(found.scores), list(range(len(pool.train)))
+
+    def gains_of(left: list[int]) -> np.ndarray:
+        across = kernel[np.ix_([len(pool.train) + i for i in left], known)]
         solved = np.linalg.solve(kernel[np.ix_(known, known)] + 1e-6 * np.eye(len(known)), across.T)
-        values = gains[left] * (1 - (across * solved.T).sum(1)).clip(min=0)
-        scores = scores or values.tolist()
-        order = np.argsort(-values, kind="stable")
-        margin = float(values[order[0]] - values[order[1]]) if len(order) > 1 else None
-        best = left.pop(int(order[0]))
-        picks.append(pool.pick(best, values[order[0]], margin=margin))
-        known.append(len(pool.train) + best)
+        return gains[left] * (1 - (across * solved.T).sum(1)).clip(min=0)
+
+    picks, scores = in_turn(pool, gains_of, lambda i: known.append(len(pool.train) + i))
     return dataclasses.replace(found, picks=picks, scores=scores)

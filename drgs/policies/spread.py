@@ -12,6 +12,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.information.pool import Pool, Selection
 from drgs.information.spacetime import by_number, farthest_in_time, has_times, uniform_in_time
+from drgs.policies.turns import in_turn
 
 __all__ = ["farthest", "pose_distances", "poses", "random", "uniform"]
 
@@ -30,15 +31,12 @@ def poses(pool: Pool) -> Selection:
     views = [*pool.train, *pool.candidates]
     near, known = np.exp(-0.5 * pose_distances(views) ** 2), len(pool.train)
     covered = near[:known].max(0) if known else np.zeros(len(views))
-    picks, scores, left = [], [], list(range(len(pool.candidates)))
-    for _ in range(pool.k):
-        gains = [float((near[known + i] - covered).clip(min=0).mean()) for i in left]
-        scores = scores or gains
-        order = sorted(range(len(left)), key=lambda j: -gains[j])
-        margin = gains[order[0]] - gains[order[1]] if len(order) > 1 else None
-        best = left.pop(order[0])
-        picks.append(pool.pick(best, gains[order[0]], margin=margin))
-        covered = np.maximum(covered, near[known + best])
+
+    def take(i: int) -> None:
+        np.maximum(covered, near[known + i], out=covered)
+
+    gains_of = lambda left: (near[[known + i for i in left]] - covered).clip(min=0).mean(1)  # noqa: E731
+    picks, scores = in_turn(pool, gains_of, take)
     return Selection(picks, scores, evaluations=pool.k * len(pool.candidates))
 
 
@@ -55,16 +53,13 @@ def farthest(pool: Pool) -> Selection:
         distance = np.minimum(distance, np.linalg.norm(centers - camera.center, axis=1))
     if not pool.train:
         distance[:] = 0.0
-    scores, picks, left = distance.tolist(), [], np.ones(len(centers), bool)
-    for _ in range(pool.k):
-        order = np.argsort(np.where(left, -distance, np.inf), kind="stable")
-        best, margin = order[0], None
-        if left.sum() > 1:
-            margin = float(distance[best] - distance[order[1]])
-        picks.append(pool.pick(best, distance[best], margin=margin))
-        left[best] = False
-        reach = np.linalg.norm(centers - centers[best], axis=1)
-        distance = reach if len(picks) == 1 and not pool.train else np.minimum(distance, reach)
+
+    def take(i: int) -> None:
+        nonlocal distance
+        reach = np.linalg.norm(centers - centers[i], axis=1)
+        distance = np.minimum(distance, reach) if pool.train or distance.any() else reach
+
+    picks, scores = in_turn(pool, lambda left: distance[left], take)
     return Selection(picks, scores, evaluations=pool.k * len(centers))
 
 

@@ -12,7 +12,7 @@ import drgs
 from drgs import fisher
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.gain import Prior, information_gain, variances
-from drgs.information.background import CELLS, background_cells
+from drgs.information.backdrop import CELLS, backdrop_cells
 from drgs.select import select
 from drgs.settings import RenderSettings
 
@@ -41,14 +41,14 @@ def test_cells_are_about_as_large():
     axes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
     cameras = [Camera(K, look_at((0, 0, 0), axis, np.roll(np.abs(axis), 1)), size, size) for axis in axes]
     solid = np.concatenate([(1 / np.linalg.norm(rays_of(c), axis=-1) ** 3).ravel() for c in cameras])
-    areas = np.bincount(np.concatenate([background_cells(c).numpy().ravel() for c in cameras]), solid, CELLS)
+    areas = np.bincount(np.concatenate([backdrop_cells(c).numpy().ravel() for c in cameras]), solid, CELLS)
     assert areas.min() > 0
     assert areas.max() < 2 * areas.min()
     tilted = Camera(K, look_at((0, 0, 0), (1, 0.4, 0.2), (0, 0, 1)), size, size)
     direction = tilted.pixel_directions()[40, 70]
     pixel, _ = cameras[0].project(direction[None])
     column, row = np.floor(pixel[0]).astype(int)
-    assert int(background_cells(tilted)[40, 70]) == int(background_cells(cameras[0])[row, column])
+    assert int(backdrop_cells(tilted)[40, 70]) == int(backdrop_cells(cameras[0])[row, column])
 
 
 def rays_of(camera):
@@ -62,40 +62,76 @@ def test_information_is_the_squared_derivative(blob, ring):
     camera, lit = ring[0], SETTINGS.replace(background=(1.0, 1.0, 1.0))
     with torch.no_grad():
         slope = (drgs.render(blob, camera, lit).rgb - drgs.render(blob, camera, SETTINGS).rgb)[..., 0].double()
-    H = fisher.background(blob, camera, SETTINGS)
-    cells = background_cells(camera)
+    H = fisher.backdrop(blob, camera, SETTINGS)
+    cells = backdrop_cells(camera)
     truth = torch.zeros(CELLS, dtype=torch.float64).index_add_(0, cells.flatten(), slope.square().flatten())
     torch.testing.assert_close(H, truth[:, None].expand(-1, 3), rtol=1e-4, atol=1e-5)
     assert 0.1 < float(H.sum()) / (3 * cells.numel()) < 1
-    both = fisher.background(blob, ring[:2], SETTINGS)
-    torch.testing.assert_close(both, H + fisher.background(blob, ring[1], SETTINGS))
-    weighted = fisher.background(blob, camera, SETTINGS, channel_weights=(1.0, 0.5, 0.0))
+    both = fisher.backdrop(blob, ring[:2], SETTINGS)
+    torch.testing.assert_close(both, H + fisher.backdrop(blob, ring[1], SETTINGS))
+    weighted = fisher.backdrop(blob, camera, SETTINGS, channel_weights=(1.0, 0.5, 0.0))
     torch.testing.assert_close(weighted, H * torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64))
 
 
 def test_variance_is_high_where_nothing_was_seen(blob, ring):
     """A pixel's variance adds up to `eig` of the group; what a known view has looked through is known."""
     known, new = ring[0], ring[4]
-    H, prior = {"background": fisher.background(blob, known, SETTINGS)}, Prior(1e-2)
+    H, prior = {"backdrop": fisher.backdrop(blob, known, SETTINGS)}, Prior(1e-2)
     found = fisher.variance_map(blob, new, variances(H, prior), SETTINGS)
-    Hc = {"background": fisher.background(blob, new, SETTINGS)}
+    Hc = {"backdrop": fisher.backdrop(blob, new, SETTINGS)}
     assert float(found.double().sum()) == pytest.approx(information_gain(Hc, H, "eig", prior).total, rel=1e-5)
     again = fisher.variance_map(blob, known, variances(H, prior), SETTINGS)
     assert float(again.max()) < 0.1 * float(found.max())
     assert found[9, 12] < found[0, 0], "the blob hides what is behind it"
 
 
-@pytest.mark.parametrize("criterion", ["eig", "logdet", "v_opt", "block_logdet"])
+@pytest.mark.parametrize("criterion", ["eig", "logdet", "trace_cov", "v_opt"])
 def test_empty_views_are_wanted(blob, ring, criterion):
     """Of views of a direction that was seen and of one that was not, the latter; of Gaussians alone they are alike."""
     train, candidates = ring[:1], [dataclasses.replace(ring[0], name="again"), ring[4]]
-    found = select(blob, candidates, train, blocks=("geometry", "background"), criterion=criterion, prior=Prior(1e-2))
+    found = select(blob, candidates, train, blocks=("geometry", "backdrop"), criterion=criterion, prior=Prior(1e-2))
     assert found.picks[0].name == "4"
-    assert found.parts[1]["background"] > 2 * found.parts[0]["background"]
-    assert found.blocks == ["geometry", "background"]
+    assert found.parts[1]["backdrop"] > 2 * found.parts[0]["backdrop"]
+    assert found.blocks == ["geometry", "backdrop"]
+    alone = select(blob, candidates, train, criterion=criterion, prior=Prior(1e-2))
+    assert alone.scores[1] < 2 * alone.scores[0]
+
+
+def test_masks_hide_what_is_behind(blob, ring):
+    """A known view has not looked where its mask is 0, unless that is known to be empty."""
+    train, candidates, blocks = ring[:1], [dataclasses.replace(ring[0], name="again"), ring[4]], ("backdrop",)
+    left = torch.zeros(18, 24)
+    left[:, :12] = 1
+    part = fisher.backdrop(blob, train, SETTINGS, masks=[left])
+    torch.testing.assert_close(
+        part + fisher.backdrop(blob, train, SETTINGS, masks=[1 - left]), fisher.backdrop(blob, train)
+    )
+    ask = lambda **x: select(blob, candidates, train, blocks=blocks, prior=Prior(1e-2), **x).scores  # noqa: E731
+    assert ask(masks=[left])[0] > 10 * ask()[0]
+    assert ask(masks=[left], empty_outside=True) == ask()
 
 
 def test_wrong_weights_are_refused(blob, ring):
     """Of another number of cells."""
-    with pytest.raises(ValueError, match=r"weights of background must have shape \(1536, 3\), got \(3,\)"):
-        fisher.variance_map(blob, ring[0], {"background": torch.ones(3)})
+    with pytest.raises(ValueError, match=r"weights of backdrop must have shape \(1536, 3\), got \(3,\)"):
+        fisher.variance_map(blob, ring[0], {"backdrop": torch.ones(3)})
+    with pytest.raises(ValueError, match="weights must be finite, got NaN or Inf"):
+        fisher.variance_map(blob, ring[0], {"backdrop": torch.full((CELLS, 3), torch.inf)})
+    with pytest.raises(ValueError, match="weights must be of backdrop, means"):
+        fisher.variance_map(blob, ring[0], {"background": torch.ones(CELLS, 3)})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"blocks": ("backdrop",), "criterion": "block_logdet"}, "got backdrop; only Gaussians have blocks"),
+        ({"groups": ("means", "backdrop")}, "groups must be of blocks geometry, got backdrop"),
+        ({"blocks": ("backdrop",), "method": "fisherrf"}, "got backdrop; use method exact"),
+        ({"masks": [torch.ones(18, 24)], "information": dict}, "masks must be None with information"),
+        ({"masks": []}, "one for each of 1 cameras, got 0"),
+    ],
+)
+def test_wrong_questions_are_refused(blob, ring, options, message):
+    """In one line."""
+    with pytest.raises(ValueError, match=message):
+        select(blob, ring[1:], ring[:1], **options)

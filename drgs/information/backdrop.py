@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 
-__all__ = ["CELLS", "background_cells", "background_information", "background_variance"]
+__all__ = ["CELLS", "backdrop_cells", "backdrop_information", "backdrop_variance"]
 
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
 
 
-def background_cells(camera: Camera) -> torch.Tensor:
+def backdrop_cells(camera: Camera) -> torch.Tensor:
     """(H, W) int64: the cell of each pixel's direction in the world."""
     rays = camera.pixel_directions().reshape(-1, 3)
     axis = np.abs(rays).argmax(1)
@@ -55,18 +55,24 @@ def _open(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tenso
     return (1 - alpha.double().cpu()).clamp(min=0).square()
 
 
-def background_information(
-    scene: Scene, camera: Camera, settings: RenderSettings, channel_weights: Sequence[float]
+def backdrop_information(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    channel_weights: Sequence[float],
+    mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """(1536, 3) float64 H_c of a view in each channel, times the channel's weight."""
-    total = torch.zeros(CELLS, dtype=torch.float64)
-    total.index_add_(0, background_cells(camera).flatten(), _open(scene, camera, settings).flatten())
+    """(1536, 3) float64 H_c of a view in each channel, times the channel's weight; with a mask (H, W) of its square."""
+    total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(scene, camera, settings)
+    if mask is not None:
+        open_ = open_ * mask.detach().double().cpu().square()
+    total.index_add_(0, backdrop_cells(camera).flatten(), open_.flatten())
     return total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
 
 
-def background_variance(
+def backdrop_variance(
     scene: Scene, camera: Camera, weights: torch.Tensor, settings: RenderSettings, channel_weights: Sequence[float]
 ) -> torch.Tensor:
     """(H, W) float64 (1 - alpha)^2 times the weights (1536, 3) of the pixel's cell, summed over weighted channels."""
     each = weights.double().cpu() @ torch.tensor(channel_weights, dtype=torch.float64)
-    return _open(scene, camera, settings) * each[background_cells(camera)]
+    return _open(scene, camera, settings) * each[backdrop_cells(camera)]
