@@ -64,7 +64,8 @@ def select(
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
 
-    With k = 1 one candidate's information is held at a time; with k > 1 that of all, 4 bytes a parameter and view.
+    With k = 1 one candidate's information is held at a time (criterion `v_opt`: that of all, where it fits); with k > 1
+    that of all, 4 bytes a parameter and view.
     k picks at once are those of k calls in a row that move each pick from `candidates` to `train` (`uniform` and
     `random` aside: they plan, or draw, all k at once). Every view's information is rounded to float32 once; sums and
     scores are float64. Ties go to the lower index. Duplicates among the cameras are views of their own: a second one

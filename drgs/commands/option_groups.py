@@ -170,8 +170,7 @@ class Informed(Settings):
     info_pixels: int | None = ActiveConfig.info_pixels
     """Information is computed on views of at most this many pixels; default as in the fit."""
     blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
-    """What of an image tells: geometry (its colors), semantic (its features), deformation (about what moves),
-    backdrop (where no Gaussian is)."""
+    """What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop (gaps)."""
     probes: int = ActiveConfig.probes
     """Random probes of each view, for what it tells about a deformation field, and for --method probes."""
 

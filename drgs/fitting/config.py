@@ -263,7 +263,7 @@ class ActiveConfig:
             FisherRF's code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth
             maps, and where next to none can be triangulated.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
-            None: all that the fit has.
+            None: all that the fit has, without `backdrop`.
         measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
             picked; selection.json has the averages. What all picks lead to is in metrics.json as ever.
     """

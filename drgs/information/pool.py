@@ -43,7 +43,8 @@ class Scoring:
         blocks: What of an image tells about what: `geometry`, its colors, about all but the features; `semantic`, its
             decoded features, about the features and, coupled, about the geometry; `deformation`, both as far as the
             other two blocks are named, else its colors, about the network that moves the Gaussians, groups `grid` and
-            `mlp`. None: all that the scene has (method `fisherrf` knows colors only). Of `fisher` only.
+            `mlp`; `backdrop`, its opacity, about what is behind all Gaussians. None: all that the scene has, without
+            `backdrop` (method `fisherrf` knows colors only). Of `fisher` only.
         semantics: The metric of the block `semantic`; None: that of features as they are stored, all channels alike.
         network: How the block `deformation` scores: `ratio`, its diagonal by `criterion` against that of the known
             views, like all other groups; `trace` and `paper`, by what a candidate says itself, whatever is known.
