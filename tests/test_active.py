@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -360,6 +361,35 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
     assert {view["name"] for view in json.loads((tmp_path / "run/metrics.json").read_text())["views"]} == set(names)
     assert result.run.config()["active"]["criterion"] == "eig"
     assert set(result.run.config()["pool"]) >= set(names)
+
+
+@pytest.mark.parametrize(("mask", "empty"), [("object", True), ("valid", False), ("ignore", True)])
+def test_scores_know_masks(still, tmp_path, monkeypatch, mask, empty):
+    """Known views are asked within their masks, reduced as their cameras are; outside of an object is emptiness."""
+    asked, real = [], drgs.select.select
+
+    def spied(*args, **options):
+        asked.append((args, options))
+        return real(*args, **options)
+
+    monkeypatch.setattr("drgs.select.select", spied)
+    options = plan(policy="fisher", blocks=("geometry", "backdrop"), info_pixels=SIZE * SIZE // 4, add=1)
+    fit(lazily(still), tmp_path / "run", config(mask=mask), active=options, progress=False)
+    (_, candidates, known, *_), given = asked[0]
+    assert given["empty_outside"] is empty
+    assert len(given["masks"]) == len(known) == 2
+    for camera, found in zip(known, given["masks"], strict=True):
+        assert camera.width * camera.height <= SIZE * SIZE // 4
+        if mask == "ignore":
+            assert found is None
+            continue
+        assert tuple(found.shape) == (camera.height, camera.width)
+        whole = cv2.imread(str(still / f"masks/{camera.name}.png"), cv2.IMREAD_GRAYSCALE) / 255
+        assert float(found.mean()) == pytest.approx(whole.mean(), abs=0.02)
+        assert 0 < float(found.mean()) < 1
+    pick = json.loads((tmp_path / "run/selection.json").read_text())["picks"][0]
+    assert pick["blocks"] == ["geometry", "backdrop"]
+    assert all(row["parts"]["backdrop"] >= 0 for row in pick["candidates"])
 
 
 def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):

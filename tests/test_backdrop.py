@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from test_network_information import drawn
 
 import drgs
 from drgs import fisher
@@ -109,6 +110,29 @@ def test_masks_hide_what_is_behind(blob, ring):
     ask = lambda **x: select(blob, candidates, train, blocks=blocks, prior=Prior(1e-2), **x).scores  # noqa: E731
     assert ask(masks=[left])[0] > 10 * ask()[0]
     assert ask(masks=[left], empty_outside=True) == ask()
+
+
+def test_z_scores_know_the_backdrop(blob, ring):
+    """Scored alone, it is compared with the other candidates like any block."""
+    ask = {"prior": Prior(1e-2), "settings": SETTINGS}
+    both = select(blob, ring[1:], ring[:1], blocks=("geometry", "backdrop"), combine="zscore", **ask)
+    alone = select(blob, ring[1:], ring[:1], blocks=("backdrop",), **ask)
+    scores = np.array(alone.scores)
+    parts = [part["backdrop.backdrop"] for part in both.parts]
+    np.testing.assert_allclose(parts, (scores - scores.mean()) / scores.std(), rtol=1e-4)
+    assert both.combine == "zscore"
+
+
+def test_views_look_past_what_moves_at_their_time():
+    """Of a scene that moves: the opacity at the camera's time."""
+    scene, cam = drawn()
+    for time in (0.0, 1.0):
+        at = dataclasses.replace(cam, time=time)
+        with torch.no_grad():
+            frozen = scene.at(time)
+        torch.testing.assert_close(fisher.backdrop(scene, at, SETTINGS), fisher.backdrop(frozen, at, SETTINGS))
+    one, other = (fisher.backdrop(scene, dataclasses.replace(cam, time=t), SETTINGS) for t in (0.0, 1.0))
+    assert not torch.equal(one, other)
 
 
 def test_wrong_weights_are_refused(blob, ring):

@@ -245,6 +245,10 @@ def test_errors(rng):
     bad["means"][7, 2] = -1
     with pytest.raises(ValueError, match=r"train: information must be finite and >= 0, got -1 in means at \(7, 2\)"):
         information_gain(Hc, bad)
+    with pytest.raises(
+        ValueError, match=r"information_gain: pool: information must be finite and >= 0, got -1 in means"
+    ):
+        information_gain(Hc, H, "v_opt", pool=bad)
     bad["means"][7, 2] = math.inf
     with pytest.raises(ValueError, match=r"got inf in means at \(7, 2\) \(1 of 120 entries\)"):
         check("here", bad)

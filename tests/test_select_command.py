@@ -56,6 +56,27 @@ def test_unused_views_of_a_run(place, monkeypatch, capsys):
     assert all(word in text for word in ("means", "rot.", "scales", "opac.", "sh", "margin"))
 
 
+def test_commands_know_the_backdrop(place, monkeypatch, capsys):
+    """`drgs select` and `drgs fisher` name the block as they name the others; scores are those of `drgs.fisher`."""
+    line = "run --candidates data --preset fast --blocks geometry,backdrop --criterion v_opt --prior 1e-2"
+    report, text = select(line, place, monkeypatch, capsys)
+    assert report["blocks"] == ["geometry", "backdrop"]
+    assert "back. %" in text
+    views = {view.name: view.camera for view in load(place / "data").views}
+    g, settings = load_ply(place / "run/point_cloud.ply"), drgs.RenderSettings.preset("fast")
+    ask = lambda names: fisher.backdrop(g, [views[name] for name in names], settings).double()  # noqa: E731
+    names = [row["name"] for row in report["candidates"]]
+    H, everything = ask(report["known"]["names"]), ask([*report["known"]["names"], *names])
+    for row in report["candidates"]:
+        want = (everything * (1 / (H + 1e-2) - 1 / (H + 1e-2 + ask([row["name"]])))).sum()
+        assert row["parts"]["backdrop"] == pytest.approx(float(want), rel=1e-4)
+    line = "fisher run --limit 2 --preset fast --blocks geometry,backdrop --maps -o fisher"
+    assert cli.main(line.split()) == 0
+    told = json.loads((place / "fisher/fisher.json").read_text())
+    assert told["blocks"] == ["geometry", "backdrop"]
+    assert told["groups"]["backdrop"]["sum"] > 0
+
+
 def _selection(place) -> dict:
     return json.loads((place / "run/selection.json").read_text())
 
