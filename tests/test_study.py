@@ -423,8 +423,8 @@ def test_how_often_intervals_hold_the_truth(rng, sizes, spread, share):
     assert abs(held / studies - share) < 4 * np.sqrt(share * (1 - share) / studies) + 0.005
 
 
-def told(rows):
-    study = dataclasses.replace(small(Path("x")), policies={"p": {}, "Random, 1": {}})
+def told(rows, **fields):
+    study = dataclasses.replace(small(Path("x")), policies={"p": {}, "Random, 1": {}}, **fields)
     return study_report(study, rows)
 
 
@@ -471,6 +471,13 @@ def test_the_report_says_gain_and_loss(tmp_path):
         fill_between(page, "y", "new")
 
 
+def test_medians_stand_beside_means():
+    """Where rows have them: of test views, on average over units."""
+    rows = [row_of(policy="p", seed=seed, psnr=20.0 + seed) | {"medians": {"psnr": 30.0 + seed}} for seed in range(2)]
+    assert "| p | 20.50 (30.50) |" in told(rows)
+    assert "| p | 20.50 |" in told([{**row, "medians": {"psnr": None}} for row in rows])
+
+
 def test_curves_are_of_the_metrics_of_then(tmp_path):
     """Means, differences and their intervals at each number of views that was measured, the end among them; rows that
     were not measured on the way count at the end only; the picture has a panel a scene.
@@ -489,6 +496,10 @@ def test_curves_are_of_the_metrics_of_then(tmp_path):
     text = told(rows)
     assert "| p | 13.00 | 14.00 | 30.00 |" in text
     assert "| p | +3.00 [+3.00, +3.00] **gain**, 6 of 6 | +4.00 [+4.00, +4.00] **gain**, 6 of 6 | +1.00 " in text
+    assert "Other pairs:" not in text
+    pairs = told(rows, comparisons=(("p", "Random, 1"), ("p", "other"))).partition("Other pairs:")[2]
+    assert "| p against Random, 1 | +3.00 [+3.00, +3.00] **gain**, 6 of 6 | +4.00 " in pairs
+    assert "other" not in pairs
     assert "Against the number of views" not in told(rows[-1:])
     study = dataclasses.replace(small(tmp_path), policies={"p": {}, "Random, 1": {}})
     assert not draw_curves(study, rows[-1:], METRICS[0], tmp_path / "none.png")

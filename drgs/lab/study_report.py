@@ -101,7 +101,8 @@ def _size(rows: StudyRows) -> str:
     fits = f"{len(rows)} fit{'s' if len(rows) > 1 else ''}, on commits {', '.join(commits)}"
     return (
         f"{fits}. {_kind(rows)}: {', '.join(each)}. "
-        f"Fits of one unit that differ by the seed alone are averaged.{_mixed(rows)}"
+        "Fits of one unit that differ by the seed alone are averaged. Tables of a scene have means over its units, of "
+        f"the mean over test views and, in brackets, of the median over them.{_mixed(rows)}"
     )
 
 
@@ -135,18 +136,25 @@ def _table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def _means(study: Study, rows: StudyRows) -> str:
-    """Policies against metrics: means over the units."""
+    """Policies against metrics: means over the units, of means over test views and, in brackets, of medians."""
     lines = []
     for label in _labels(study, rows):
         cells = []
         for metric in study.metrics:
             values = values_of(rows, metric.key, label)
-            cells.append(f"{np.mean(list(values.values())):.{metric.digits}f}" if values else "none")
+            middle = values_of(_by_median(rows), metric.key, label)
+            mean = f"{np.mean(list(values.values())):.{metric.digits}f}" if values else "none"
+            cells.append(f"{mean} ({np.mean(list(middle.values())):.{metric.digits}f})" if middle else mean)
         seconds = [x for row in rows if row["policy"] == label and (x := row["pick_seconds"]) is not None]
         count = len({unit_of(row) for row in rows if row["policy"] == label})
         lines.append([label, *cells, f"{np.mean(seconds):.2f}" if seconds else "none", str(count)])
     heads = ["policy", *(_title(metric) for metric in study.metrics), "seconds a pick", "units"]
     return _table(heads, lines)
+
+
+def _by_median(rows: StudyRows) -> list[dict[str, Any]]:
+    """The rows that say so with medians over test views for metrics."""
+    return [{**row, "metrics": row["medians"]} for row in rows if row.get("medians")]
 
 
 def _title(metric: Metric) -> str:
@@ -198,22 +206,26 @@ def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
         "Measured with so many views, on the way just before the next one is picked, with the last number at the end; "
         "every scene counts alike."
     )
+    heads, labels = ["policy", *(f"{count} views" for count in counts)], _labels(study, rows)
+    against = [(label, label, study.reference) for label in labels if label != study.reference]
+    pairs = [(f"{policy} against {reference}", policy, reference) for policy, reference in study.comparisons]
     parts = [_wrapped(told)]
     for metric in study.metrics:
-        means, others = [], []
-        for label in _labels(study, rows):
+        means = []
+        for label in labels:
             values = [values_of(at_views(rows, count), metric.key, label) for count in counts]
             averages = [estimate(found).mean if found else None for found in values]
             means.append([label, *("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)])
-            if label == study.reference:
-                continue
-            found = [_estimates(study, at_views(rows, count), label, study.reference)[metric.key] for count in counts]
-            if any(found):
-                others.append([label, *(_difference(metric, one) if one else "none" for one in found)])
-        heads = ["policy", *(f"{count} views" for count in counts)]
         parts += [f"{_title(metric)}:", _table(heads, means)]
-        if others:
-            parts += [f"The same, less that of `{study.reference}`:", _table(heads, others)]
+        for said, wanted in ((f"The same, less that of `{study.reference}`:", against), ("Other pairs:", pairs)):
+            lines = []
+            for name, *pair in wanted:
+                values = [differences(at_views(rows, count), metric.key, *pair) for count in counts]
+                if any(values):
+                    cells = [_difference(metric, estimate(found)) if found else "none" for found in values]
+                    lines.append([name, *cells])
+            if lines:
+                parts += [said, _table(heads, lines)]
     return "\n\n".join(parts)
 
 
