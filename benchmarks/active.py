@@ -60,8 +60,8 @@ METRICS = (
 PAGE = ROOT / "docs" / "active-static.md"
 CURVES = ROOT / "docs" / "pictures" / "active-curves.png"
 SPLITS = {"banana": ((7, 0), (7, 3)), "captures": ((4, 0), (4, 2)), "room": ((3, 0),), "still": ((4, 0),)}
-"""What is held out, by scene; seeds take the splits in turn. Not every third view of a still life: its cameras take three
-elevations in turn, and the lowest would be held out whole.
+"""What is held out, by scene; seeds take the splits in turn. Not every third view of a still life: its cameras take
+three elevations in turn, and the lowest would be held out whole.
 """
 SCALES = {
     "small": (FitConfig(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, semantics="ignore"), 40, (160, 120)),
