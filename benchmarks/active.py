@@ -51,6 +51,9 @@ ONLY = {
     SCRATCH: ("head", "room-3", "still-5", "office", "room-5", "still-1")
 }  # as FisherRF's own code, after each pick
 POLICIES |= {f"{label}, lambda 1e-2": {**POLICIES[label], "prior": 1e-2} for label in ("v_opt, with backdrop",)}
+POLICIES |= {
+    f"{label}, sphere": POLICIES[label] for label in ("v_opt, with backdrop, lambda 1e-2", "eig, with backdrop")
+}
 METRICS = (
     Metric("psnr", "PSNR", 2),
     Metric("ssim", "SSIM"),

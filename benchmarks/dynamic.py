@@ -147,7 +147,7 @@ def pick(scene: DynamicGaussians, shown: list[Frame]) -> dict[str, float]:
     spent = {}
     for blocks in (("geometry",), ("geometry", "deformation")):
         began = time.process_time()
-        scoring = Scoring(settings=drgs.RenderSettings.preset("fast"), blocks=blocks)
+        scoring = Scoring("eig", settings=drgs.RenderSettings.preset("fast"), blocks=blocks)
         select(held, later, known, 1, "fisher", scoring=scoring)
         spent["+".join(blocks)] = time.process_time() - began
     return spent

@@ -43,7 +43,7 @@ BLOCKS = {
     "geometry+deformation": ("geometry", "deformation"),
     "joint": ("geometry", "semantic", "deformation"),
 }
-CRITERIA = {name: {"policy": "fisher", "blocks": blocks} for name, blocks in BLOCKS.items()}
+CRITERIA = {name: {"policy": "fisher", "criterion": "eig", "blocks": blocks} for name, blocks in BLOCKS.items()}
 LAMBDAS = {f"joint, lambda {text}": {**CRITERIA["joint"], "prior": float(text)} for text in ("0", "1e-7", "1e-5")}
 POLICIES = {**BASELINES, **CRITERIA, "all views": None, **LAMBDAS}
 TABLES = (

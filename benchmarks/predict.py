@@ -24,17 +24,18 @@ from drgs.lab.study_report import fill_between
 from drgs.select import Cache, select
 
 VIEWS, STEPS, MORE = 6, 1000, 200
-RELATIVE = {"policy": "fisher", "prior": Prior(1e-3, relative=True)}
+ALONE = {"policy": "fisher", "blocks": ("geometry",)}
+RELATIVE = {**ALONE, "prior": Prior(1e-3, relative=True)}
 BOTH = ("geometry", "backdrop")
 SCORES = {
-    "fisher, logdet": {"policy": "fisher", "criterion": "logdet"},
+    "fisher, logdet": {**ALONE, "criterion": "logdet"},
     "fisher, logdet, relative 1e-3": {**RELATIVE, "criterion": "logdet"},
-    "fisher, eig": {"policy": "fisher", "criterion": "eig"},
+    "fisher, eig": {**ALONE, "criterion": "eig"},
     "fisher, eig, relative 1e-3": {**RELATIVE, "criterion": "eig"},
-    "fisher, trace_cov": {"policy": "fisher", "criterion": "trace_cov"},
+    "fisher, trace_cov": {**ALONE, "criterion": "trace_cov"},
     "fisher, trace_cov, relative 1e-3": {**RELATIVE, "criterion": "trace_cov"},
-    "fisher, block_logdet": {"policy": "fisher", "criterion": "block_logdet"},
-    "fisher, v_opt": {"policy": "fisher", "criterion": "v_opt"},
+    "fisher, block_logdet": {**ALONE, "criterion": "block_logdet"},
+    "fisher, v_opt": {**ALONE, "criterion": "v_opt"},
     "fisher, eig, with backdrop": {"policy": "fisher", "criterion": "eig", "blocks": BOTH},
     "fisher, v_opt, with backdrop": {"policy": "fisher", "criterion": "v_opt", "blocks": BOTH},
     "fisher, v_opt, backdrop alone": {"policy": "fisher", "criterion": "v_opt", "blocks": ("backdrop",)},

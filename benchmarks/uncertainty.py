@@ -50,7 +50,8 @@ def ause(scene: drgs.Gaussians, train: list[Frame], held_out: list[Frame], setti
     """Map -> AUSE; and `covered`, the share of held-out pixels with alpha above 0.5."""
     cameras, masks = [frame.camera for frame in train], [frame.mask for frame in train]
     H = fisher.diagonal(scene, cameras, settings, masks=masks)
-    H["backdrop"] = fisher.backdrop(scene, cameras, settings)
+    sphere = fisher.backdrop_sphere(scene, [*cameras, *(frame.camera for frame in held_out)])
+    H["backdrop"] = fisher.backdrop(scene, cameras, settings, sphere=sphere)
     weights = {}
     for name, (which, prior) in MAPS.items():
         counted = {group: x for group, x in H.items() if group != "backdrop" or which == "both"}
@@ -65,7 +66,7 @@ def ause(scene: drgs.Gaussians, train: list[Frame], held_out: list[Frame], setti
         wrong.append((out.rgb.clamp(0, 1) - frame.image()).square().mean(2)[keep])
         covered.append(out.alpha[keep] > 0.5)
         for name, weight in weights.items():
-            maps[name].append(fisher.variance_map(scene, camera, weight, settings)[keep])
+            maps[name].append(fisher.variance_map(scene, camera, weight, settings, sphere=sphere)[keep])
         maps["1 - alpha"].append(1 - out.alpha[keep])
         maps["random order"].append(torch.rand(int(keep.sum()), generator=generator))
     error = torch.cat(wrong).double()

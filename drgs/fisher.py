@@ -32,7 +32,7 @@ from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.doors import Masks, camera_list, check_any_scene, check_scene, check_view, gaussians_at, mask_list
-from drgs.information.backdrop import CELLS, backdrop_information, backdrop_variance
+from drgs.information.backdrop import CELLS, Sphere, backdrop_information, backdrop_sphere, backdrop_variance
 from drgs.information.columns import by_columns, jacobian_columns
 from drgs.information.groups import GROUPS, Group, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
@@ -53,6 +53,7 @@ __all__ = [
     "Prior",
     "SemanticMetric",
     "backdrop",
+    "backdrop_sphere",
     "blocks",
     "coverage",
     "diagonal",
@@ -260,15 +261,21 @@ def backdrop(
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     masks: Masks = None,
+    sphere: Sphere | None = None,
 ) -> torch.Tensor:
     """(1536, 3) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything,
-    a row for each cell of directions. See `drgs.information.backdrop`; arguments as of `diagonal`.
+    a row for each cell. See `drgs.information.backdrop`.
+
+    Args:
+        gaussians, cameras, settings, channel_weights, masks: As for `diagonal`.
+        sphere: What the color is painted on, the same for all views that are compared, as `backdrop_sphere` makes it;
+            None: infinitely far away.
     """
     cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
     settings, weights = settings or RenderSettings.preset("exact"), _weights(channel_weights)
     total = torch.zeros(CELLS, 3, dtype=torch.float64)
     for camera, mask in zip(cameras, mask_list("fisher.backdrop", masks, cameras), strict=True):
-        total += backdrop_information(gaussians, camera, settings, weights, mask)
+        total += backdrop_information(gaussians, camera, settings, weights, mask, sphere)
     return total
 
 
@@ -280,6 +287,7 @@ def variance_map(
     settings: RenderSettings | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     semantics: SemanticMetric | None = None,
+    sphere: Sphere | None = None,
 ) -> torch.Tensor:
     """(H, W) float32: sum over channels and parameters k of J_pk^2 weights_k.
 
@@ -290,6 +298,7 @@ def variance_map(
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `backdrop`,
             (1536, 3), is that of the color behind what the Gaussians leave open.
+        sphere: As for `backdrop`.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
     check_view("fisher.variance_map", seen, camera, settings)
@@ -315,7 +324,7 @@ def variance_map(
     if len(seen) and weights:
         found = Replay(seen, camera, settings, semantics=semantics).variance(weights, factors)
     if behind is not None:
-        found = found + backdrop_variance(seen, camera, behind, settings, factors).float()
+        found = found + backdrop_variance(seen, camera, behind, settings, factors, sphere).float()
     return found
 
 

@@ -82,6 +82,17 @@ class Prior:
             if not (isinstance(value, (int, float)) and 0 <= value < math.inf):
                 raise ValueError(f"Prior: lambda ({name}) must be in [0, inf), got {value!r}; try 1e-6")
 
+    @classmethod
+    def given(cls, value: float | None, relative: bool) -> Prior | None:
+        """As options name it; None where they leave it to the criterion."""
+        if value is None:
+            return cls(relative=True) if relative else None
+        return cls(value, relative)
+
+    def to_json(self) -> dict:
+        """As files hold it."""
+        return {"value": self.value, "relative": self.relative}
+
     def per_group(self, train: Information) -> dict[str, float]:
         """lambda of every group of H.
 
@@ -231,9 +242,9 @@ def _trace_cov(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
 
 # Criterion -> what a parameter adds, of Hc / (H + l), which it may overwrite, and 1 / (H + l); float64. Of `v_opt` the
 # second is P / (H + l).
-_TERMS = {"eig": _eig, "logdet": _logdet, "trace_cov": _trace_cov, "v_opt": _trace_cov}
+_TERMS = {"v_opt": _trace_cov, "eig": _eig, "logdet": _logdet, "trace_cov": _trace_cov}
 CRITERIA = (*_TERMS, "block_logdet")
-"""Names of the criteria; the first is the default everywhere."""
+"""Names of the criteria; `drgs.select` chooses by the first unless told otherwise."""
 
 
 class _Diagonal:

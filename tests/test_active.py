@@ -335,7 +335,7 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
         return choose(gaussians, candidates, train, *rest, **options)
 
     monkeypatch.setattr(drgs.select, "select", select)
-    active = plan(policy="fisher", criterion="eig", prior=1e-3, info_pixels=100)
+    active = plan(policy="fisher", criterion="eig", prior=1e-3, blocks=("geometry",), info_pixels=100)
     result = fit(lazily(still), tmp_path / "run", config(), active=active, progress=False)
     assert sizes == [({(10, 10)}, {(10, 10)}, 2), ({(10, 10)}, {(10, 10)}, 3)]
     record = json.loads((tmp_path / "run/selection.json").read_text())

@@ -13,7 +13,7 @@ import drgs
 from drgs import fisher
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.gain import Prior, information_gain, variances
-from drgs.information.backdrop import CELLS, backdrop_cells
+from drgs.information.backdrop import CELLS, Sphere, backdrop_cells, backdrop_sphere
 from drgs.select import select
 from drgs.settings import RenderSettings
 
@@ -58,6 +58,54 @@ def rays_of(camera):
     return rays / (rays @ camera.c2w[:3, 2])[..., None]
 
 
+def test_cells_of_a_sphere():
+    """Cameras that look at one place of it from elsewhere agree about its cell; very far away only directions count,
+    and from its center as well; a camera outside has cells, too.
+    """
+    sphere, place = Sphere((0.5, -0.2, 0.1), 2.0), np.array([0.5, -0.2, 0.1]) + 2.0 * np.array([0.48, 0.6, 0.64])
+    K = intrinsics_from_fov(40.0, 9, 9)
+    eyes = [(0.5, -0.2, 0.1), (0.9, 0.4, -0.3), (-0.7, -0.5, 0.8)]
+    cameras = [Camera(K, look_at(eye, place, (0, 0, 1)), 9, 9) for eye in eyes]
+    assert len({int(backdrop_cells(camera, sphere)[4, 4]) for camera in cameras}) == 1
+    assert len({int(backdrop_cells(camera)[4, 4]) for camera in cameras}) == 3
+    torch.testing.assert_close(backdrop_cells(cameras[0], sphere), backdrop_cells(cameras[0]))
+    torch.testing.assert_close(backdrop_cells(cameras[2], Sphere(sphere.center, 1e9)), backdrop_cells(cameras[2]))
+    away = Camera(K, look_at((9.0, 0, 0), (20.0, 0, 0), (0, 0, 1)), 9, 9)
+    assert int(backdrop_cells(away, sphere).min()) >= 0
+
+
+def test_the_sphere_is_behind_what_is_seen(blob, ring):
+    """As far away as surfaces are, cameras inside; where none are to be seen, infinitely far away."""
+    wall = drgs.Gaussians.from_arrays([[0.0, 0, 0]], [[1.0, 0, 0, 0]], [[0.8] * 3], [0.999], np.zeros((1, 1, 3)))
+    found = backdrop_sphere(wall, ring)
+    centers = np.stack([camera.center for camera in ring])
+    np.testing.assert_allclose(found.center, centers.mean(0))
+    outermost = np.linalg.norm(centers - found.center, axis=1).max()
+    assert found.radius == pytest.approx(1.05 * outermost), "surfaces are nearer than the cameras are to each other"
+    assert backdrop_sphere(wall, [ring[0], ring[0]]).radius < 3
+    moved = wall.replace(means=wall.means + torch.tensor([0.0, 0, 30.0]))
+    looks = [Camera(ring[0].K, look_at((x, 0, 0), (0, 0, 30.0), (0, 1, 0)), 24, 18) for x in (-1.0, 1.0)]
+    assert 25 < backdrop_sphere(moved, looks).radius < 31
+    assert backdrop_sphere(blob.replace(logit_opacities=blob.logit_opacities - 9), ring) is None
+
+
+def test_the_policy_paints_on_the_sphere(blob, ring):
+    """Scores are those of `drgs.fisher.backdrop` on the sphere of all views of the pool."""
+    solid = blob.replace(logit_opacities=blob.logit_opacities + 5)
+    sphere = fisher.backdrop_sphere(solid, ring)
+    H, pool = (fisher.backdrop(solid, views, SETTINGS, sphere=sphere) for views in (ring[:2], ring))
+    found = select(solid, ring[2:], ring[:2], blocks=("backdrop",))
+    for camera, score in zip(ring[2:], found.scores, strict=True):
+        Hc = fisher.backdrop(solid, camera, SETTINGS, sphere=sphere)
+        want = (pool * (1 / (H + 1e-2) - 1 / (H + Hc + 1e-2))).sum()
+        assert score == pytest.approx(float(want), rel=1e-5)
+    weights = {"backdrop": torch.rand(CELLS, 3, dtype=torch.float64)}
+    on = fisher.variance_map(solid, ring[3], weights, SETTINGS, sphere=sphere)
+    total = (fisher.backdrop(solid, ring[3], SETTINGS, sphere=sphere) * weights["backdrop"]).sum()
+    assert float(on.double().sum()) == pytest.approx(float(total), rel=1e-5)
+    assert not torch.equal(on, fisher.variance_map(solid, ring[3], weights, SETTINGS))
+
+
 def test_information_is_the_squared_derivative(blob, ring):
     """An image is linear in the background, with 1 - alpha; what a view says adds up over its pixels and over views."""
     camera, lit = ring[0], SETTINGS.replace(background=(1.0, 1.0, 1.0))
@@ -94,7 +142,10 @@ def test_empty_views_are_wanted(blob, ring, criterion):
     assert found.picks[0].name == "4"
     assert found.parts[1]["backdrop"] > 2 * found.parts[0]["backdrop"]
     assert found.blocks == ["geometry", "backdrop"]
-    alone = select(blob, candidates, train, criterion=criterion, prior=Prior(1e-2))
+    assert select(blob, candidates, train, criterion=criterion, prior=Prior(1e-2)) == dataclasses.replace(
+        found, seconds=pytest.approx(0, abs=100)
+    ), "it counts unless told otherwise"
+    alone = select(blob, candidates, train, blocks=("geometry",), criterion=criterion, prior=Prior(1e-2))
     assert alone.scores[1] < 2 * alone.scores[0]
 
 
@@ -149,7 +200,7 @@ def test_wrong_weights_are_refused(blob, ring):
     ("options", "message"),
     [
         ({"blocks": ("backdrop",), "criterion": "block_logdet"}, "got backdrop; only Gaussians have blocks"),
-        ({"groups": ("means", "backdrop")}, "groups must be of blocks geometry, got backdrop"),
+        ({"groups": ("means", "backdrop"), "blocks": ("geometry",)}, "groups must be of blocks geometry, got backdrop"),
         ({"blocks": ("backdrop",), "method": "fisherrf"}, "got backdrop; use method exact"),
         ({"masks": [torch.ones(18, 24)], "information": dict}, "masks must be None with information"),
         ({"masks": []}, "one for each of 1 cameras, got 0"),

@@ -39,7 +39,7 @@ def run(line: str, place, monkeypatch, capsys) -> tuple[dict, str]:
 
 def test_information_of_a_run(place, monkeypatch, capsys):
     """The file holds the sum over the run's views, group by group; maps are drawn for them."""
-    report, text = run("run --limit 3 --preset fast", place, monkeypatch, capsys)
+    report, text = run("run --limit 3 --preset fast --blocks geometry", place, monkeypatch, capsys)
     tensors, header = load_state(place / "out/information.safetensors")
     from drgs.settings import RenderSettings
 
@@ -118,7 +118,7 @@ def test_views_that_see_nothing(place, monkeypatch, capsys):
         load(place / "data").views[0].camera.K, look_at((0, 0, 50), (0, 0, 60), (0, 1, 0)), SIZE, SIZE, name="away"
     )
     save_cameras_json(place / "away.json", [away])
-    report, _ = run("run --cameras away.json --pose", place, monkeypatch, capsys)
+    report, _ = run("run --cameras away.json --pose --blocks geometry", place, monkeypatch, capsys)
     (row,) = report["views"]
     assert row["gain"] == {"logdet": 0, "eig": 0}
     assert row["pose"]["eigenvalues"] == [0] * 6

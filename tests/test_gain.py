@@ -254,7 +254,7 @@ def test_errors(rng):
         check("here", bad)
     with pytest.raises(ValueError, match=r"eig must be finite, got .*means.*inf"):
         scorer(H)(bad)
-    with pytest.raises(ValueError, match="criterion must be one of eig, logdet"):
+    with pytest.raises(ValueError, match="criterion must be one of v_opt, eig"):
         information_gain(Hc, H, "D-opt")
     with pytest.raises(ValueError, match="pool must be given with criterion v_opt and no other, got eig with one"):
         information_gain(Hc, H, "eig", pool=H)
@@ -355,7 +355,9 @@ def test_independent_parameters_are_exact(rng):
 
 
 def test_one_default_criterion():
-    """Everything that scores views does so by `eig` unless asked otherwise, from Python and on the command line."""
+    """Everything that chooses views does so by `v_opt` unless asked otherwise, from Python and on the command line;
+    what scores one view, without a pool, by `eig`.
+    """
     import inspect
 
     from drgs.commands.options import Fit, Select
@@ -363,6 +365,22 @@ def test_one_default_criterion():
     from drgs.gain import check
     from drgs.select import Scoring
 
-    scoring = (information_gain, scorer, check, Scoring)
-    defaults = {inspect.signature(function).parameters["criterion"].default for function in scoring}
-    assert {*defaults, ActiveConfig().criterion, Fit.criterion, Select.criterion} == {CRITERIA[0]} == {"eig"}
+    of_one = (information_gain, scorer, check)
+    assert {inspect.signature(function).parameters["criterion"].default for function in of_one} == {"eig"}
+    defaults = {Scoring().criterion, ActiveConfig().criterion, Fit.criterion, Select.criterion}
+    assert defaults == {CRITERIA[0]} == {"v_opt"}
+
+
+def test_lambda_is_of_the_criterion():
+    """1e-2 of `v_opt`, 1e-6 of the others and of other policies; what is given goes before."""
+    from drgs.fitting.config import ActiveConfig
+    from drgs.select import Scoring
+    from drgs.settings import RenderSettings
+
+    assert Scoring().prior_of() == Scoring("v_opt").prior_of("fisher") == Prior(1e-2)
+    assert all(Scoring(x).prior_of() == Prior(1e-6) == Scoring().prior_of("fisherrf") for x in CRITERIA[1:])
+    assert Scoring(prior=Prior(0.5)).prior_of() == Scoring(prior=Prior(0.5)).prior_of("coverage") == Prior(0.5)
+    of = lambda **fields: ActiveConfig(**fields).scoring(RenderSettings.preset("fast")).prior_of()  # noqa: E731
+    assert of() == Prior(1e-2)
+    assert of(prior=1e-4) == Prior(1e-4)
+    assert of(relative_prior=True) == Prior(1e-6, relative=True)

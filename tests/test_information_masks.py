@@ -88,8 +88,8 @@ def test_known_views_tell_less(rng):
     cameras = [camera(rng, (12, 10)) for _ in range(3)]
     known, candidates = cameras[:1], cameras[1:]
     mask = soft(rng, known[0])
-    plain = select(g, candidates, known, cache=cache)
-    masked = select(g, candidates, known, cache=cache, masks=[mask])
+    ask = {"criterion": "eig", "blocks": ("geometry",), "cache": cache}
+    plain, masked = select(g, candidates, known, **ask), select(g, candidates, known, masks=[mask], **ask)
     assert masked.computed == 1
     assert all(a >= b for a, b in zip(masked.scores, plain.scores, strict=True))
     H = fisher.diagonal(g, known, masks=[mask])

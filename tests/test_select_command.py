@@ -37,7 +37,9 @@ def select(line: str, folder, monkeypatch, capsys) -> tuple[dict, str]:
 
 def test_unused_views_of_a_run(place, monkeypatch, capsys):
     """Candidates are what the run has not been fitted to; scores are information_gain's, parts add up."""
-    report, text = select("run --candidates data -k 2 --preset fast", place, monkeypatch, capsys)
+    report, text = select(
+        "run --candidates data -k 2 --preset fast --criterion eig --blocks geometry", place, monkeypatch, capsys
+    )
     seen = report["known"]["names"]
     assert seen == [view["name"] for key in ("start", "picks") for view in _selection(place)[key]]
     assert sorted(row["name"] for row in report["candidates"]) == sorted(set("012345678") - set(seen))
@@ -57,21 +59,21 @@ def test_unused_views_of_a_run(place, monkeypatch, capsys):
 
 
 def test_commands_know_the_backdrop(place, monkeypatch, capsys):
-    """`drgs select` and `drgs fisher` name the block as they name the others; scores are those of `drgs.fisher`."""
-    line = "run --candidates data --preset fast --blocks geometry,backdrop --criterion v_opt --prior 1e-2"
-    report, text = select(line, place, monkeypatch, capsys)
+    """Unless told otherwise `drgs select` counts it, by `v_opt` and lambda 1e-2; `drgs fisher` as well."""
+    report, text = select("run --candidates data --preset fast", place, monkeypatch, capsys)
     assert report["blocks"] == ["geometry", "backdrop"]
     assert "back. %" in text
     views = {view.name: view.camera for view in load(place / "data").views}
     g, settings = load_ply(place / "run/point_cloud.ply"), drgs.RenderSettings.preset("fast")
-    ask = lambda names: fisher.backdrop(g, [views[name] for name in names], settings).double()  # noqa: E731
     names = [row["name"] for row in report["candidates"]]
+    sphere = fisher.backdrop_sphere(g, [views[name] for name in (*report["known"]["names"], *names)])
+    ask = lambda names: fisher.backdrop(g, [views[name] for name in names], settings, sphere=sphere)  # noqa: E731
     H, everything = ask(report["known"]["names"]), ask([*report["known"]["names"], *names])
     for row in report["candidates"]:
         want = (everything * (1 / (H + 1e-2) - 1 / (H + 1e-2 + ask([row["name"]])))).sum()
         assert row["parts"]["backdrop"] == pytest.approx(float(want), rel=1e-4)
-    line = "fisher run --limit 2 --preset fast --blocks geometry,backdrop --maps -o fisher"
-    assert cli.main(line.split()) == 0
+    assert (report["criterion"], report["prior"]) == ("v_opt", {"value": 1e-2, "relative": False})
+    assert cli.main(["fisher", "run", "--limit", "2", "--preset", "fast", "--maps", "-o", "fisher"]) == 0
     told = json.loads((place / "fisher/fisher.json").read_text())
     assert told["blocks"] == ["geometry", "backdrop"]
     assert told["groups"]["backdrop"]["sum"] > 0
@@ -139,7 +141,7 @@ def test_cameras_that_see_nothing_have_a_defined_answer(place, monkeypatch, caps
     away = look_at((0, 0, 50), (0, 0, 60), (0, 1, 0))
     K = load(place / "data").views[0].camera.K
     save_cameras_json(place / "away.json", [Camera(K, away, SIZE, SIZE, name=f"away{i}") for i in range(2)])
-    report, text = select("run --candidates away.json", place, monkeypatch, capsys)
+    report, text = select("run --candidates away.json --blocks geometry", place, monkeypatch, capsys)
     assert [row["score"] for row in report["candidates"]] == [0, 0]
     assert (report["picks"][0]["name"], report["picks"][0]["margin"]) == ("away0", 0)
     assert "every score is 0" in text

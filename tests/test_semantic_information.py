@@ -21,7 +21,7 @@ from drgs.fisher import SemanticMetric
 from drgs.fitting.config import ActiveConfig
 from drgs.information.moments import moments_map
 from drgs.oracle import sh_colors
-from drgs.select import POLICIES, Cache, select
+from drgs.select import CRITERIA, POLICIES, Cache, select
 from drgs.settings import RenderSettings
 from drgs.tracing.weights import Weights
 
@@ -233,12 +233,13 @@ def test_every_policy_takes_semantic_scenes(world):
         if policy not in ("fisher", "switch", "diverse", "moments", "random"):
             plain = select(g.replace(features=None), candidates, train, 2, policy)
             assert found.scores == plain.scores
-    for criterion in ("eig", "logdet", "trace_cov", "block_logdet"):
-        assert select(g, candidates, train, 1, criterion=criterion).blocks == ["geometry", "semantic"]
+    for criterion in CRITERIA:
+        behind = [] if criterion == "block_logdet" else ["backdrop"]
+        assert select(g, candidates, train, 1, criterion=criterion).blocks == ["geometry", "semantic", *behind]
 
 
 def test_blocks_that_are_scored(world):
-    """Geometry alone is the score without features; both is the default; results name blocks and metric."""
+    """Geometry alone is the score without features; all there is is the default; results name blocks and metric."""
     g, train, candidates = world
     m = metric(3, estimate="collapsed", samples=2, seed=7)
     scores = {}
@@ -249,9 +250,10 @@ def test_blocks_that_are_scored(world):
         assert ("features" in found.parts[0], "sh" in found.parts[0]) == ("semantic" in blocks, "geometry" in blocks)
         told = {"estimate": "collapsed", "samples": 2, "seed": 7, "gamma": 0.7, "width": 3}
         assert found.semantics == (told if "semantic" in blocks else None)
-    plain = select(g.replace(features=None), candidates, train)
+    plain = select(g.replace(features=None), candidates, train, blocks=("geometry",))
     assert scores["geometry",] == plain.scores
-    assert scores["semantic", "geometry"] == select(g, candidates, train, semantics=m).scores
+    everything = select(g, candidates, train, blocks=("geometry", "semantic", "backdrop"), semantics=m)
+    assert everything.scores == select(g, candidates, train, semantics=m).scores
     latent = select(g, candidates, train).semantics
     assert latent["width"] == 3
     assert latent["gamma"] == 1
@@ -328,7 +330,7 @@ def test_maps_of_blocks(folder, monkeypatch, capsys):
     1e-4: sums of float32 maps against float64 sums over parameters (measured: 1e-7).
     """
     monkeypatch.chdir(folder)
-    line = "fisher scene.ply --train train.json --cameras cameras.json --limit 1 -o out"
+    line = "fisher scene.ply --train train.json --cameras cameras.json --limit 1 -o out --blocks geometry,semantic"
     assert cli.main(line.split()) == 0
     report, text = json.loads((folder / "out/fisher.json").read_text()), capsys.readouterr().out
     assert report["blocks"] == ["geometry", "semantic"]
@@ -353,7 +355,7 @@ def test_select_names_blocks(folder, monkeypatch, capsys):
     """`drgs select`: blocks, estimate and gamma are in the report; a scene without features has no semantic block."""
     monkeypatch.chdir(folder)
     line = "select scene.ply --train train.json --candidates cameras.json"
-    for option, blocks in (("", ["geometry", "semantic"]), (" --blocks semantic", ["semantic"])):
+    for option, blocks in (("", ["geometry", "semantic", "backdrop"]), (" --blocks semantic", ["semantic"])):
         assert cli.main((line + option + " -o picks.json").split()) == 0
         report = json.loads((folder / "picks.json").read_text())
         assert report["blocks"] == blocks

@@ -36,10 +36,13 @@ from drgs.information.semantics import SemanticMetric
 from drgs.select import Scoring
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drgs.cameras import Camera
     from drgs.commands.options import Fisher
     from drgs.commands.viewpoints import Known
     from drgs.ellipsoids import Scene
+    from drgs.information.backdrop import Sphere
     from drgs.settings import RenderSettings
 
 __all__ = ["KINDS", "Told", "added", "map_weights", "run"]
@@ -58,7 +61,7 @@ def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
     check_counts(args)
     args.settings()  # refuses what cannot be, before anything is read
-    prior = Prior(value=args.prior, relative=args.relative_prior)
+    prior = Scoring(prior=Prior.given(args.prior, args.relative_prior)).prior_of()
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = Given.of(args)
@@ -77,7 +80,7 @@ def run(args: Fisher) -> None:
         views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(timed(views, args, given), args.limit)
     names = pictures.file_names([camera.name for camera in views])
-    told = Told.of(given, args, settings)
+    told = Told.of(given, args, settings, [*known.cameras, *views])
     rivals = Rivals(told, prior) if args.maps else None
     output.check(f"{name}.{kind}.png" for name in names for kind in (*told.kinds, *(["maps"] if rivals else [])))
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
@@ -105,7 +108,7 @@ def run(args: Fisher) -> None:
         "scene": str(args.scene),
         "gaussians": len(given.gaussians),
         "method": args.method,
-        "prior": {"value": args.prior, "relative": args.relative_prior},
+        "prior": prior.to_json(),
         "blocks": list(told.blocks),
         "semantics": told.metric.to_json() if told.metric else None,
         "probes": args.probes if "deformation" in told.blocks or args.method == "probes" else None,
@@ -129,6 +132,7 @@ class Told:
         scene, settings, method, probes: As for `drgs.fisher.diagonal` and `drgs.fisher.network`.
         blocks: The blocks that count.
         metric: In which features count, where `semantic` is among them.
+        sphere: What the block `backdrop` is painted on.
     """
 
     scene: Scene
@@ -137,16 +141,18 @@ class Told:
     probes: int
     blocks: tuple[str, ...]
     metric: SemanticMetric | None
+    sphere: Sphere | None
 
     @classmethod
-    def of(cls, given: Given, args: Fisher, settings: RenderSettings) -> Told:
-        """As the options say, of a run in the metric of its decoder."""
+    def of(cls, given: Given, args: Fisher, settings: RenderSettings, cameras: Sequence[Camera]) -> Told:
+        """As the options say, of a run in the metric of its decoder, and of all these cameras."""
         g, scoring = given.gaussians, Scoring(method=args.method, blocks=args.blocks)
         blocks, metric = scoring.blocks_of(g, "fisher", given.scene), None
         if "semantic" in blocks:
             assert g.features is not None  # else there is no such block
             metric = given.semantics() or SemanticMetric.of(None, g.features.shape[1])
-        return cls(given.scene, settings, args.method, args.probes, blocks, metric)
+        sphere = fisher.backdrop_sphere(given.scene, cameras) if "backdrop" in blocks else None
+        return cls(given.scene, settings, args.method, args.probes, blocks, metric, sphere)
 
     @property
     def kinds(self) -> list[str]:
@@ -156,6 +162,8 @@ class Told:
 
     def options(self, block: str) -> dict[str, Any]:
         """Of what `drgs.fisher` computes, for the rows of one block; of the deformation for those of the others."""
+        if block == "backdrop":
+            return {"sphere": self.sphere}
         rows: dict[str, Any] = {"probes": self.probes} if block == "deformation" else {}
         counted = self.blocks if block == "deformation" else (block,)
         if "semantic" in counted:
@@ -177,7 +185,7 @@ class Told:
                 found[block] = fisher.network(self.scene, camera, self.settings, **options)
                 continue
             if block == "backdrop":
-                found[block] = {block: fisher.backdrop(self.scene, camera, self.settings)}
+                found[block] = {block: fisher.backdrop(self.scene, camera, self.settings, **options)}
                 continue
             if self.method == "probes":
                 options["probes"] = self.probes

@@ -163,8 +163,8 @@ class Informed(Settings):
 
     method: Method = ActiveConfig.method
     """How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does."""
-    prior: float = ActiveConfig.prior
-    """How firmly every parameter counts as known beforehand (lambda); 0 leaves out what no training view has seen."""
+    prior: float | None = ActiveConfig.prior
+    """How firmly every parameter counts as known beforehand (lambda), default 1e-2 with v_opt, else 1e-6."""
     relative_prior: bool = ActiveConfig.relative_prior
     """lambda is --prior times the median information of a parameter's group, where it is not 0."""
     info_pixels: int | None = ActiveConfig.info_pixels
@@ -182,7 +182,7 @@ class Choosing(Informed):
     policy: Policy = ActiveConfig.policy
     """How the next view is chosen (docs/information.md)."""
     criterion: Criterion = ActiveConfig.criterion
-    """Score of policy fisher; eig chose better views than logdet where views were few (docs/active-static.md)."""
+    """Score of policy fisher; v_opt chose the best views where views were few (docs/active-static.md)."""
     network: NetworkScore = ActiveConfig.network
     """How the block deformation scores: against what known views say of the field (ratio), or by a trace without it."""
     combine: Combine | None = ActiveConfig.combine

@@ -36,7 +36,7 @@ def run(args: Select) -> None:
     check_counts(args)
     args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
-    prior = Prior(value=args.prior, relative=args.relative_prior)
+    prior = Prior.given(args.prior, args.relative_prior)
     given = Given.of(args)
     settings = given.settings(args.preset)
     semantics = given.semantics()
@@ -75,7 +75,7 @@ def run(args: Select) -> None:
         "policy": args.policy,
         "criterion": args.criterion if args.policy == "fisher" else None,
         "method": args.method,
-        "prior": {"value": args.prior, "relative": args.relative_prior},
+        "prior": scoring.prior_of(args.policy).to_json(),
         "blocks": selection.blocks,
         "semantics": selection.semantics,
         "network": selection.network,

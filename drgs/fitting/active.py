@@ -241,6 +241,7 @@ class ActiveViews:
         left = self.timetable.left(len(self.picks), self.chosen)
         pixels = active.info_pixels or self._config.max_pixels
         semantics = None if decoder is None else SemanticMetric(decoder.metric())
+        scoring = active.scoring(self._config.settings, semantics)
         seen = [at_most(frame.camera, pixels) for frame in frames]
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
@@ -249,7 +250,7 @@ class ActiveViews:
                 seen,
                 1,
                 active.policy,
-                scoring=active.scoring(self._config.settings, semantics),
+                scoring=scoring,
                 rng=self._generator,
                 masks=[_reduced(frame.mask, camera) for frame, camera in zip(frames, seen, strict=True)],
                 empty_outside=all(frame.is_object for frame in frames if frame.mask is not None),
@@ -271,7 +272,7 @@ class ActiveViews:
             "seconds": selection.seconds,
             "policy": active.policy,
             "criterion": active.criterion if active.policy == "fisher" else None,
-            "prior": {"value": active.prior, "relative": active.relative_prior},
+            "prior": scoring.prior_of(active.policy).to_json(),
             "blocks": selection.blocks,
             "semantics": selection.semantics,
             "network": selection.network,

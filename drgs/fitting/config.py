@@ -252,7 +252,7 @@ class ActiveConfig:
         every: Steps between two of them, and before the first, in the dynamic stage; None: 200, and of `times` and
             `pairs` that part of 17,000 of `max_steps`, as in arXiv 2512.22771.
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
-        prior: lambda, the prior precision of every parameter.
+        prior: lambda, the prior precision of every parameter; None: as in `drgs.select.Scoring`.
         relative_prior: lambda is `prior` times the median of the group's positive information.
         pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
             Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
@@ -263,13 +263,13 @@ class ActiveConfig:
             FisherRF's code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth
             maps, and where next to none can be triangulated.
         blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
-            None: all that the fit has, without `backdrop`.
+            None: all that the fit has.
         measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
             picked; selection.json has the averages. What all picks lead to is in metrics.json as ever.
     """
 
     policy: Policy = "fisher"
-    criterion: Criterion = "eig"
+    criterion: Criterion = "v_opt"
     method: Method = "exact"
     schedule: Schedule = "auto"
     initial: int = 2
@@ -277,7 +277,7 @@ class ActiveConfig:
     add: int | None = None
     every: int | None = None
     info_pixels: int | None = None
-    prior: float = 1e-6
+    prior: float | None = None
     relative_prior: bool = False
     pick_points: PickPoints = "auto"
     blocks: tuple[Block, ...] | None = None
@@ -298,7 +298,7 @@ class ActiveConfig:
         ranges = dict.fromkeys(("initial", "add", "every", "info_pixels", "probes", "measure"), count)
         check_fields("active", self, ranges)
         check_combined("active", self.blocks, self.criterion, self.network, self.combine)
-        Prior(value=self.prior)
+        Prior.given(self.prior, self.relative_prior)
 
     @classmethod
     def recorded(cls, config: Mapping[str, Any]) -> dict:
@@ -314,7 +314,7 @@ class ActiveConfig:
             criterion=self.criterion,
             settings=settings,
             method=self.method,
-            prior=Prior(value=self.prior, relative=self.relative_prior),
+            prior=Prior.given(self.prior, self.relative_prior),
             blocks=self.blocks,
             semantics=semantics,
             network=self.network,

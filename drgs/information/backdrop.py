@@ -2,17 +2,19 @@
 
 Information is about Gaussians that exist. Where a view shows none, a pixel is as unknown as it can be, and its variance
 was 0. With a color b_c behind everything, one for each cell c of directions, known to a variance of 1 / lambda before
-any view, a pixel p of the direction c is S_p + (1 - alpha_p) b_c: linear, so that the information of a view about b_c
-is
+any view, a pixel p of the cell c is S_p + (1 - alpha_p) b_c: linear, so that the information of a view about b_c is
 
     H_c = sum_{p in c} (1 - alpha_p)^2
 
-in each of the three channels, whatever b is. Cells are those of a cube around the camera whose faces have 16x16 of
-them, spaced evenly in angle (Ronchi et al., "The 'cubed sphere'", 1996): 1,536, of 4 to 6 degrees.
+in each of the three channels, whatever b is. The colors are painted on a sphere around all cameras, about as far away
+as the farthest surfaces that they show: what one view has seen of it, another one from elsewhere need not see again.
+Cells are those of a cube around its center whose faces have 16x16 of them, spaced evenly in angle (Ronchi et al., "The
+'cubed sphere'", 1996): 1,536, of 4 to 6 degrees.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -20,21 +22,67 @@ import numpy as np
 import torch
 
 from drgs.ellipsoids import colors_only
+from drgs.settings import RenderSettings
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
-    from drgs.settings import RenderSettings
 
-__all__ = ["CELLS", "backdrop_cells", "backdrop_information", "backdrop_variance"]
+__all__ = ["CELLS", "Sphere", "backdrop_cells", "backdrop_information", "backdrop_sphere", "backdrop_variance"]
 
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
+_PIXELS = 1200  # of a view as its depth is looked at
+_SOLID = 0.5  # opacity from which on that is the depth of a surface
+_FARTHEST = 0.95  # of all depths
+_AROUND = 1.05  # of the distance of the outermost camera, which is inside
 
 
-def backdrop_cells(camera: Camera) -> torch.Tensor:
-    """(H, W) int64: the cell of each pixel's direction in the world."""
+@dataclasses.dataclass(frozen=True)
+class Sphere:
+    """What the colors are painted on, in world units.
+
+    Attributes:
+        center: x, y, z.
+        radius: > 0.
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+
+
+def backdrop_sphere(scene: Scene, cameras: Sequence[Camera]) -> Sphere | None:
+    """Around all cameras, as far away as nearly all surfaces that they show, each at its time; None: infinitely far
+    away, where they show none.
+    """
+    from drgs.integrator import render
+
+    centers = np.stack([camera.center for camera in cameras])
+    center, depths = centers.mean(0), []
+    for camera in cameras:
+        with torch.no_grad():
+            plain, small = colors_only(scene, camera.time), at_most(camera, _PIXELS)
+            # `fast` measures depth along the ray, `ewa` along the axis of the camera.
+            out = render(plain, small, RenderSettings.preset("fast"), outputs=("median_depth",))
+        assert out.median_depth is not None
+        depths.append(out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu().numpy())
+    solid = np.concatenate(depths)
+    if not len(solid):
+        return None
+    outermost = float(np.linalg.norm(centers - center, axis=1).max())
+    radius = max(float(np.quantile(solid, _FARTHEST)), _AROUND * outermost)
+    return Sphere((float(center[0]), float(center[1]), float(center[2])), radius)
+
+
+def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor:
+    """(H, W) int64: the cell that each pixel's ray leaves the sphere through; of None, that of its direction."""
     rays = camera.pixel_directions().reshape(-1, 3)
+    if sphere:
+        start = (camera.center - np.array(sphere.center)) / sphere.radius
+        along = rays @ start
+        # Of a camera that is outside, a ray that misses: where it is nearest.
+        rays = start + rays * (np.sqrt(np.maximum(along**2 + 1 - start @ start, 0.0)) - along)[:, None]
     axis = np.abs(rays).argmax(1)
     rows = np.arange(len(rays))
     along = rays[rows, axis]
@@ -61,18 +109,24 @@ def backdrop_information(
     settings: RenderSettings,
     channel_weights: Sequence[float],
     mask: torch.Tensor | None = None,
+    sphere: Sphere | None = None,
 ) -> torch.Tensor:
     """(1536, 3) float64 H_c of a view in each channel, times the channel's weight; with a mask (H, W) of its square."""
     total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(scene, camera, settings)
     if mask is not None:
         open_ = open_ * mask.detach().double().cpu().square()
-    total.index_add_(0, backdrop_cells(camera).flatten(), open_.flatten())
+    total.index_add_(0, backdrop_cells(camera, sphere).flatten(), open_.flatten())
     return total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
 
 
 def backdrop_variance(
-    scene: Scene, camera: Camera, weights: torch.Tensor, settings: RenderSettings, channel_weights: Sequence[float]
+    scene: Scene,
+    camera: Camera,
+    weights: torch.Tensor,
+    settings: RenderSettings,
+    channel_weights: Sequence[float],
+    sphere: Sphere | None = None,
 ) -> torch.Tensor:
     """(H, W) float64 (1 - alpha)^2 times the weights (1536, 3) of the pixel's cell, summed over weighted channels."""
     each = weights.double().cpu() @ torch.tensor(channel_weights, dtype=torch.float64)
-    return _open(scene, camera, settings) * each[backdrop_cells(camera)]
+    return _open(scene, camera, settings) * each[backdrop_cells(camera, sphere)]

@@ -25,8 +25,8 @@ __all__ = [
     "checked_blocks",
 ]
 
-Criterion = Literal["eig", "logdet", "trace_cov", "v_opt", "block_logdet"]
-"""The names in `drgs.gain.CRITERIA`, where the functions are; the first is the default everywhere."""
+Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
+"""The names in `drgs.gain.CRITERIA`, where the functions are; views are chosen by the first unless told otherwise."""
 
 Policy = Literal[
     "fisher",

@@ -23,6 +23,7 @@ from drgs.information.network_groups import NETWORK_GROUPS
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
+    from drgs.information.backdrop import Sphere
     from drgs.information.choices import Block
     from drgs.information.pool import Scoring
     from drgs.information.semantics import SemanticMetric
@@ -110,9 +111,9 @@ class Combination:
         if not self.apart:
             if self.traced:
                 return _Trace(scoring.weights)
-            return scorer(H, scoring.criterion, scoring.prior, scoring.weights, pool)
-        known = {name.partition(".")[2] for name in H}
-        for what, names in (("Prior: groups", scoring.prior.groups), ("information_gain: weights", scoring.weights)):
+            return scorer(H, scoring.criterion, scoring.prior_of(), scoring.weights, pool)
+        known, lambdas = {name.partition(".")[2] for name in H}, scoring.prior_of()
+        for what, names in (("Prior: groups", lambdas.groups), ("information_gain: weights", scoring.weights)):
             for name in names:
                 if name not in known:
                     raise ValueError(f"{what} must be of {', '.join(sorted(known))}, got {name!r}; correct or drop it")
@@ -120,13 +121,13 @@ class Combination:
         for block in self.apart:
             own = _own(H, block)
             weights = {name: x for name, x in scoring.weights.items() if name in own}
-            lambdas = {name: x for name, x in scoring.prior.groups.items() if name in own}
-            prior = dataclasses.replace(scoring.prior, groups=lambdas)
+            theirs = {name: x for name, x in lambdas.groups.items() if name in own}
+            prior = dataclasses.replace(lambdas, groups=theirs)
             if block == self.traced:
                 by_block[block] = _Trace(weights)
             else:
-                theirs = None if pool is None else _own(pool, block)
-                by_block[block] = scorer(own, scoring.criterion, prior, weights, theirs)
+                everything = None if pool is None else _own(pool, block)
+                by_block[block] = scorer(own, scoring.criterion, prior, weights, everything)
 
         def score(candidate: Information) -> Gain:
             gains = {block: one(_own(candidate, block)) for block, one in by_block.items()}
@@ -189,7 +190,7 @@ def _own(information: Information, block: str) -> dict[str, torch.Tensor]:
 
 
 def asked_of(
-    scoring: Scoring, blocks: tuple[Block, ...], metric: SemanticMetric | None
+    scoring: Scoring, blocks: tuple[Block, ...], metric: SemanticMetric | None, sphere: Sphere | None = None
 ) -> tuple[list[Asked], Combination]:
     """What views are asked, and how they are scored by it.
 
@@ -197,6 +198,7 @@ def asked_of(
         scoring: As `drgs.select` takes it.
         blocks: `scoring.blocks_of` the scene; empty where it is unknown what the information is about.
         metric: Of the block `semantic`.
+        sphere: Of the block `backdrop`.
     Raises:
         ValueError: If `scoring` names groups that no block tells about, or blocks that cannot be combined.
     """
@@ -218,7 +220,7 @@ def asked_of(
         name = "deformation" if apart else ""
         made.append(Asked("network", (), tuple(sorted(options.items())), name, tuple(network) or None, not traced))
     if "backdrop" in blocks and (scoring.groups is None or "backdrop" in scoring.groups):
-        made.append(Asked("backdrop", block="backdrop" if apart else ""))
+        made.append(Asked("backdrop", options=(("sphere", sphere),), block="backdrop" if apart else ""))
     asked = [one for one in made if one is not None]
     if not asked:
         raise ValueError(

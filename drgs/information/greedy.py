@@ -92,7 +92,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         information: Of single views.
         combination: How a score is made of it; default by that scoring, all groups together.
     """
-    combination, prior = combination or Combination(pool.scoring), pool.scoring.prior
+    combination, prior = combination or Combination(pool.scoring), pool.scoring.prior_of()
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
     H, everything, scores, kept = _first_round(pool, information, combination)

@@ -13,6 +13,7 @@ from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
 from drgs.information.cache import Cache
 from drgs.information.choices import (
+    BLOCK_NAMES,
     COMBINES,
     NETWORK_SCORES,
     Block,
@@ -27,6 +28,8 @@ from drgs.settings import RenderSettings
 
 __all__ = ["Pick", "Pool", "Scoring", "Selection"]
 
+_KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
+
 
 @dataclasses.dataclass(frozen=True)
 class Scoring:
@@ -36,15 +39,16 @@ class Scoring:
         criterion: One of `drgs.gain.CRITERIA`; of policy `fisher` only.
         settings: Of the renderer.
         method: Of `drgs.fisher.diagonal`; of `fisher` only, not of `block_logdet`.
-        prior: lambda. `coverage` takes its `value`, not its `groups`.
+        prior: lambda. `coverage` takes its `value`, not its `groups`. None: 1e-2 of criterion `v_opt`, for colors that
+            are known to 0.3 beforehand and photographs to 0.03; else 1e-6, as in FisherRF.
         weights: Group -> factor, 1 where none is given; of `fisher` and `fisherrf` only.
         groups: Of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that Gaussians have. Of
             `fisher` only, not of `block_logdet`. Those of a scene's network need method `columns` or `probes`.
         blocks: What of an image tells about what: `geometry`, its colors, about all but the features; `semantic`, its
             decoded features, about the features and, coupled, about the geometry; `deformation`, both as far as the
             other two blocks are named, else its colors, about the network that moves the Gaussians, groups `grid` and
-            `mlp`; `backdrop`, its opacity, about what is behind all Gaussians. None: all that the scene has, without
-            `backdrop` (method `fisherrf` knows colors only). Of `fisher` only.
+            `mlp`; `backdrop`, its opacity, about what is behind all Gaussians. None: all that the scene has (method
+            `fisherrf` knows colors of Gaussians only, `block_logdet` these and features). Of `fisher` only.
         semantics: The metric of the block `semantic`; None: that of features as they are stored, all channels alike.
         network: How the block `deformation` scores: `ratio`, its diagonal by `criterion` against that of the known
             views, like all other groups; `trace` and `paper`, by what a candidate says itself, whatever is known.
@@ -61,7 +65,7 @@ class Scoring:
     criterion: str = CRITERIA[0]
     settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("exact"))
     method: str = METHODS[0]
-    prior: Prior = dataclasses.field(default_factory=Prior)
+    prior: Prior | None = None
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
     groups: tuple[str, ...] | None = None
     blocks: tuple[Block, ...] | None = None
@@ -76,7 +80,8 @@ class Scoring:
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
         must_be("select", "settings", self.settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')
-        must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
+        if self.prior is not None:
+            must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
         must_be("select", "weights", self.weights, Mapping, 'e.g. {"means": 0.5}')
         if self.groups is not None:
             must_be("select", "groups", self.groups, (tuple, list), 'e.g. ("means", "sh")')
@@ -108,16 +113,21 @@ class Scoring:
         if self.blocks is None:
             if self.method == "fisherrf":
                 return ("geometry",)
-            if self.criterion == "block_logdet":  # which a network has none of
-                del missing["deformation"]
-            there: tuple[Block, ...] = ("semantic", "deformation")
-            return ("geometry", *(block for block in there if missing.get(block) == ""))
+            if self.criterion == "block_logdet":  # which only Gaussians have
+                return ("geometry", *(("semantic",) if not missing["semantic"] else ()))
+            return tuple(block for block in BLOCK_NAMES if not missing.get(block))
         for block in self.blocks:
             if missing.get(block):
                 raise ValueError(
                     f"{where}: blocks must be of what the scene has, got {block} {missing[block]}, or use geometry"
                 )
         return self.blocks
+
+    def prior_of(self, policy: str = "fisher") -> Prior:
+        """lambda of a policy by this scoring."""
+        if self.prior is not None:
+            return self.prior
+        return Prior(_KNOWN) if policy == "fisher" and self.criterion == "v_opt" else Prior()
 
     def combined_of(self, blocks: tuple[Block, ...]) -> Combine:
         """How the scores of these blocks become one."""

@@ -14,6 +14,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.gain import Information
+from drgs.information.backdrop import backdrop_sphere
 from drgs.information.combine import Asked, Combination, asked_of
 from drgs.information.greedy import InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pool, Selection
@@ -35,7 +36,10 @@ def fisher(pool: Pool) -> Selection:
     if "semantic" in blocks:
         assert seen.features is not None  # else there is no such block
         metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
-    asked, combination = asked_of(scoring, blocks, metric)
+    sphere = None
+    if "backdrop" in blocks:
+        sphere = backdrop_sphere(pool.scene, [*pool.train, *pool.candidates])
+    asked, combination = asked_of(scoring, blocks, metric, sphere)
     selection = _greedy(pool, asked, combination)
     selection.blocks, selection.semantics = list(blocks), metric.to_json() if metric else None
     if "deformation" in blocks:
@@ -53,7 +57,7 @@ def fisher(pool: Pool) -> Selection:
 
 def fisherrf(pool: Pool) -> Selection:
     """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations and no features."""
-    prior, weights = pool.scoring.prior, _without_rotations(pool.scoring.weights)
+    prior, weights = pool.scoring.prior_of("fisherrf"), _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
     asked = Asked("diagonal", ("features",), (("method", "fisherrf"),))
     plain = dataclasses.replace(pool, masks=None)  # of which FisherRF knows nothing
@@ -62,7 +66,7 @@ def fisherrf(pool: Pool) -> Selection:
 
 def coverage(pool: Pool) -> Selection:
     """Largest sum Wc / (W + lambda), W = sum over pixels of w^2."""
-    prior = dataclasses.replace(pool.scoring.prior, groups={})
+    prior = dataclasses.replace(pool.scoring.prior_of("coverage"), groups={})
     return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), [Asked("coverage")])
 
 
