@@ -80,9 +80,10 @@ def test_the_sphere_is_behind_what_is_seen(blob, ring):
     found = backdrop_sphere(wall, ring)
     centers = np.stack([camera.center for camera in ring])
     np.testing.assert_allclose(found.center, centers.mean(0))
-    outermost = np.linalg.norm(centers - found.center, axis=1).max()
-    assert found.radius == pytest.approx(1.05 * outermost), "surfaces are nearer than the cameras are to each other"
-    assert backdrop_sphere(wall, [ring[0], ring[0]]).radius < 3
+    assert found.radius == pytest.approx(3, rel=0.01)
+    aside = Camera(ring[0].K, look_at((0, 0, 43.0), (0, 0, 99.0), (0, 1, 0)), 24, 18)
+    apart = np.linalg.norm(aside.center - ring[0].center)
+    assert backdrop_sphere(wall, [ring[0], aside]).radius == pytest.approx(1.05 * apart / 2)
     moved = wall.replace(means=wall.means + torch.tensor([0.0, 0, 30.0]))
     looks = [Camera(ring[0].K, look_at((x, 0, 0), (0, 0, 30.0), (0, 1, 0)), 24, 18) for x in (-1.0, 1.0)]
     assert 25 < backdrop_sphere(moved, looks).radius < 31
