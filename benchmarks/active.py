@@ -34,26 +34,20 @@ REPORT = ("office", "statue", "room-5", "room-6", "room-7", "still-1", "still-2"
 SETS = {"report": REPORT, "choice": CHOICE}
 
 
-def _fisher(criterion: str, *blocks: str) -> dict:
-    return {"policy": "fisher", "criterion": criterion, "blocks": blocks or ("geometry",)}
+def _fisher(criterion: str, *blocks: str, prior: float = 1e-6) -> dict:
+    return {"policy": "fisher", "criterion": criterion, "blocks": ("geometry", *blocks), "prior": prior}
 
 
-PLAIN = ("random", "uniform", "farthest", "poses", "fisherrf", "facility", "field", "switch", "diverse")
-SCRATCH = "fisherrf, from scratch"
+WINNER = "v_opt, with backdrop"
+SCRATCH = "fisherrf, from scratch"  # as FisherRF's own code, after each pick
 POLICIES = {
-    **{name: {"policy": name} for name in PLAIN},
+    **{name: {"policy": name} for name in ("random", "uniform", "farthest", "moments", "coverage", "fisherrf")},
     SCRATCH: {"policy": "fisherrf", "restart": "always"},
-    **{f"{criterion}": _fisher(criterion) for criterion in ("eig", "logdet", "block_logdet", "v_opt")},
-    "v_opt, backdrop": _fisher("v_opt", "backdrop"),
-    **{f"{criterion}, with backdrop": _fisher(criterion, "geometry", "backdrop") for criterion in ("eig", "v_opt")},
+    **{criterion: _fisher(criterion) for criterion in ("eig", "logdet", "block_logdet", "v_opt")},
+    "eig, with backdrop": _fisher("eig", "backdrop"),
+    WINNER: _fisher("v_opt", "backdrop", prior=1e-2),
 }
-ONLY = {
-    SCRATCH: ("head", "room-3", "still-5", "office", "room-5", "still-1")
-}  # as FisherRF's own code, after each pick
-POLICIES |= {f"{label}, lambda 1e-2": {**POLICIES[label], "prior": 1e-2} for label in ("v_opt, with backdrop",)}
-POLICIES |= {
-    f"{label}, sphere": POLICIES[label] for label in ("v_opt, with backdrop, lambda 1e-2", "eig, with backdrop")
-}
+ONLY = {SCRATCH: ("office", "room-5", "still-1")}
 METRICS = (
     Metric("psnr", "PSNR", 2),
     Metric("ssim", "SSIM"),
@@ -94,9 +88,7 @@ def study_of(scale: str, runs: Path) -> Study:
         metrics=METRICS,
         reference="random",
         comparisons=tuple(
-            (label, other)
-            for label in ("v_opt, backdrop", "v_opt, with backdrop")
-            for other in ("farthest", "uniform", "fisherrf")
+            (WINNER, other) for other in ("farthest", "uniform", "fisherrf", "eig", "eig, with backdrop")
         ),
     )
 

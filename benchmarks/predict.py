@@ -39,7 +39,6 @@ SCORES = {
     "fisher, eig, with backdrop": {"policy": "fisher", "criterion": "eig", "blocks": BOTH},
     "fisher, v_opt, with backdrop": {"policy": "fisher", "criterion": "v_opt", "blocks": BOTH},
     "fisher, v_opt, backdrop alone": {"policy": "fisher", "criterion": "v_opt", "blocks": ("backdrop",)},
-    "facility": {"policy": "facility"},
     "fisherrf": {"policy": "fisherrf"},
     "coverage": {"policy": "coverage"},
     "farthest": {"policy": "farthest"},

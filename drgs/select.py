@@ -7,11 +7,6 @@ A policy is a function from a `Pool` to a `Selection`; adding one is writing it 
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
     moments     variance of the features along the rays (Magic Moments), averaged over pixels
     coverage    sum_i Wc_i / (W_i + lambda), W = sum over pixels of w^2: how much is seen that was seen little
-    field       drop of the expected error about where things are or may be, over the views of the pool
-    facility    places that the pool's views will show, each seen by a chosen view from near its ray
-    switch      `farthest` while candidates show emptiness, `fisher` after that
-    diverse     `fisher`'s gain times what a pose does not share with known ones
-    poses       k-medoids of the pool's camera centers and directions
     farthest    the camera center farthest from those there are; of several times, the center and the time
     uniform     evenly spaced among the views sorted by name; of several times, among the times and the cameras
     random      drawn without replacement, from one generator for the whole process or run
@@ -33,11 +28,8 @@ from drgs.guards.arguments import must_be
 from drgs.guards.doors import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.cache import Cache
 from drgs.information.pool import Pick, Pool, Scoring, Selection
-from drgs.policies.facility import facility
-from drgs.policies.field import prior_field
 from drgs.policies.informed import coverage, fisher, fisherrf, moments
-from drgs.policies.mixed import diverse, switch
-from drgs.policies.spread import farthest, poses, random, uniform
+from drgs.policies.spread import farthest, random, uniform
 
 __all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
 
@@ -145,11 +137,6 @@ POLICIES: dict[str, Callable[[Pool], Selection]] = {
     "fisherrf": fisherrf,
     "coverage": coverage,
     "moments": moments,
-    "field": prior_field,
-    "facility": facility,
-    "switch": switch,
-    "diverse": diverse,
-    "poses": poses,
     "farthest": farthest,
     "uniform": uniform,
     "random": random,

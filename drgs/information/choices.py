@@ -28,20 +28,7 @@ __all__ = [
 Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
 """The names in `drgs.gain.CRITERIA`, where the functions are; views are chosen by the first unless told otherwise."""
 
-Policy = Literal[
-    "fisher",
-    "fisherrf",
-    "coverage",
-    "moments",
-    "field",
-    "facility",
-    "switch",
-    "diverse",
-    "poses",
-    "farthest",
-    "uniform",
-    "random",
-]
+Policy = Literal["fisher", "fisherrf", "coverage", "moments", "farthest", "uniform", "random"]
 """The names in `drgs.select.POLICIES`, where the functions are."""
 
 Method = Literal["exact", "columns", "probes", "fisherrf"]

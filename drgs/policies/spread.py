@@ -4,40 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from drgs.cameras import Camera
 from drgs.information.pool import Pool, Selection
 from drgs.information.spacetime import by_number, farthest_in_time, has_times, uniform_in_time
-from drgs.policies.turns import in_turn
 
-__all__ = ["farthest", "pose_distances", "poses", "random", "uniform"]
-
-
-def pose_distances(views: Sequence[Camera]) -> np.ndarray:
-    """(V, V) distances of camera centers, in those from their middle, and of directions, in half radians."""
-    centers = np.array([camera.center for camera in views])
-    size = np.linalg.norm(centers - centers.mean(0), axis=1).mean() or 1.0
-    forward = np.array([camera.c2w[:3, 2] for camera in views])
-    angles = np.arccos((forward @ forward.T).clip(-1, 1))
-    return np.hypot(np.linalg.norm(centers[:, None] - centers, axis=2) / size, 0.5 * angles)
-
-
-def poses(pool: Pool) -> Selection:
-    """k-medoids on camera centers and directions: the pool's views, each by the chosen one nearest to it."""
-    views = [*pool.train, *pool.candidates]
-    near, known = np.exp(-0.5 * pose_distances(views) ** 2), len(pool.train)
-    covered = near[:known].max(0) if known else np.zeros(len(views))
-
-    def take(i: int) -> None:
-        np.maximum(covered, near[known + i], out=covered)
-
-    gains_of = lambda left: (near[[known + i for i in left]] - covered).clip(min=0).mean(1)  # noqa: E731
-    picks, scores = in_turn(pool, gains_of, take)
-    return Selection(picks, scores, evaluations=pool.k * len(pool.candidates))
+__all__ = ["farthest", "random", "uniform"]
 
 
 def farthest(pool: Pool) -> Selection:
@@ -53,13 +27,16 @@ def farthest(pool: Pool) -> Selection:
         distance = np.minimum(distance, np.linalg.norm(centers - camera.center, axis=1))
     if not pool.train:
         distance[:] = 0.0
-
-    def take(i: int) -> None:
-        nonlocal distance
-        reach = np.linalg.norm(centers - centers[i], axis=1)
-        distance = np.minimum(distance, reach) if pool.train or distance.any() else reach
-
-    picks, scores = in_turn(pool, lambda left: distance[left], take)
+    scores, picks, left = distance.tolist(), [], np.ones(len(centers), bool)
+    for _ in range(pool.k):
+        order = np.argsort(np.where(left, -distance, np.inf), kind="stable")
+        best, margin = order[0], None
+        if left.sum() > 1:
+            margin = float(distance[best] - distance[order[1]])
+        picks.append(pool.pick(best, distance[best], margin=margin))
+        left[best] = False
+        reach = np.linalg.norm(centers - centers[best], axis=1)
+        distance = reach if len(picks) == 1 and not pool.train else np.minimum(distance, reach)
     return Selection(picks, scores, evaluations=pool.k * len(centers))
 
 
