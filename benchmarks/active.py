@@ -43,7 +43,8 @@ SCRATCH = "fisherrf, from scratch"  # as FisherRF's own code, after each pick
 POLICIES = {
     **{name: {"policy": name} for name in ("random", "uniform", "farthest", "moments", "coverage", "fisherrf")},
     SCRATCH: {"policy": "fisherrf", "restart": "always"},
-    **{criterion: _fisher(criterion) for criterion in ("eig", "logdet", "block_logdet", "v_opt")},
+    **{criterion: _fisher(criterion) for criterion in ("eig", "logdet", "block_logdet")},
+    "v_opt": _fisher("v_opt", prior=1e-2),
     "eig, with backdrop": _fisher("eig", "backdrop"),
     WINNER: _fisher("v_opt", "backdrop", prior=1e-2),
 }
