@@ -266,7 +266,7 @@ def test_nothing_to_see():
         (lambda g, c: fisher.diagonal(g, c, channel_weights=(1, -1, 1)), "channel_weights must be 3"),
         (lambda g, c: fisher.blocks(g, c, channel_weights=(1, -1, 1)), "channel_weights must be 3"),
         (lambda g, c: fisher.diagonal(g, c, method="probes", probes=0), "probes must be >= 1"),
-        (lambda g, c: fisher.variance_map(g, c, {"features": torch.ones(5)}), "weights must be of means"),
+        (lambda g, c: fisher.variance_map(g, c, {"features": torch.ones(5)}), "weights must be of backdrop, means"),
         (lambda g, c: fisher.jacobian_columns(g, c, {"means": [(9, 0)]}), "index of means must be rows of 2"),
         (lambda g, c: fisher.jacobian_columns(g, c, {"scales": [(0, 0)]}), "must be one of means"),
         (

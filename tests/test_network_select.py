@@ -45,10 +45,12 @@ def cache():
 
 
 def test_ratio_joins_the_groups(views, cache):
-    """By default a field's groups are scored like all others, and their parts are logged beside them."""
+    """A field's groups are scored like all others, by default, too, and their parts are logged beside them."""
     scene, cams = views
     train, candidates = cams[:1], cams[2:5]
-    found = pick(scene, candidates, train, cache=cache)
+    assert pick(scene, candidates, train, cache=cache).blocks == ["geometry", "deformation", "backdrop"]
+    told_by = {"blocks": ("geometry", "deformation"), "criterion": "eig"}
+    found = pick(scene, candidates, train, cache=cache, **told_by)
     assert found.blocks == ["geometry", "deformation"]
     assert found.network == {"score": "ratio", "probes": K}
     assert found.combine == "sum"
@@ -61,7 +63,7 @@ def test_ratio_joins_the_groups(views, cache):
         for name, x in parts.items():
             assert x == pytest.approx(want[name], rel=1e-4), name  # information is kept in float32
         assert found.scores[i - 1] == pytest.approx(sum(parts.values()))
-    alone = pick(scene, candidates, train, cache=cache, blocks=("deformation",))
+    alone = pick(scene, candidates, train, cache=cache, blocks=("deformation",), criterion="eig")
     assert [list(x) for x in alone.parts] == [["grid", "mlp"]] * 3
     assert [x["mlp"] for x in alone.parts] == [x["mlp"] for x in found.parts]
     without = pick(scene, candidates, train, cache=cache, blocks=("geometry",))
@@ -72,7 +74,7 @@ def test_ratio_joins_the_groups(views, cache):
 def test_weights_lambda_and_groups_of_a_field(views, cache):
     """They go by the groups' names; lambda = 0 leaves out weights that no known view tells about."""
     scene, cams = views
-    run = lambda **fields: pick(scene, cams[2:5], cams[:1], cache=cache, **fields)  # noqa: E731
+    run = lambda **fields: pick(scene, cams[2:5], cams[:1], cache=cache, criterion="eig", **fields)  # noqa: E731
     plain = run(blocks=("deformation",))
     weighed = run(blocks=("deformation",), weights={"grid": 0.0, "mlp": 2.0})
     assert [x["mlp"] for x in weighed.parts] == [2 * x["mlp"] for x in plain.parts]
@@ -142,8 +144,9 @@ def test_a_trace_does_not_ask_known_views(views, monkeypatch, blocks):
 def test_zscores_over_the_candidates(views, cache, network):
     """Each block is scored by its own information, less the mean over the standard deviation of the candidates."""
     scene, cams = views
-    run = lambda **fields: pick(scene, cams[1:5], cams[:1], cache=cache, **fields)  # noqa: E731
-    fields = {} if network == "trace" else {"combine": "zscore"}  # with a trace it is the default
+    run = lambda **fields: pick(scene, cams[1:5], cams[:1], cache=cache, criterion="eig", **fields)  # noqa: E731
+    fields = {"blocks": ("geometry", "deformation")}
+    fields |= {} if network == "trace" else {"combine": "zscore"}  # with a trace it is the default
     found = run(network=network, k=2, **fields)
     assert found.combine == "zscore"
     assert any("z-scores of geometry, deformation" in note for note in found.notes)
@@ -159,7 +162,7 @@ def test_zscores_over_the_candidates(views, cache, network):
     # The second pick is by z-scores of those that are left, against what is known then.
     left = [i for i in range(4) if i != found.picks[0].index]
     known = [cams[0], cams[1 + found.picks[0].index]]
-    after = pick(scene, [cams[1 + i] for i in left], known, cache=cache, network=network, **fields)
+    after = pick(scene, [cams[1 + i] for i in left], known, cache=cache, criterion="eig", network=network, **fields)
     assert found.picks[1].index == left[after.picks[0].index]
     assert found.picks[1].score == pytest.approx(after.picks[0].score, rel=1e-6)
 
@@ -238,7 +241,7 @@ def test_still_scenes_have_no_such_block(views):
         ValueError, match="select: blocks must be of what the scene has, got deformation for a scene th"
     ):
         pick(scene.gaussians, cams[1:3], cams[:1], blocks=("deformation",))
-    assert pick(scene.gaussians, cams[1:3], cams[:1]).blocks == ["geometry"]
+    assert pick(scene.gaussians, cams[1:3], cams[:1]).blocks == ["geometry", "backdrop"]
 
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))

@@ -39,12 +39,12 @@ def test_fit_options_are_those_of_its_configs(config):
 
 @pytest.mark.parametrize("command", [options.Select, options.Fisher])
 def test_information_options_are_those_of_an_active_fit(command):
-    """`select` and `fisher` weigh views as an active fit does; Python's `Prior()` and `Scoring()` agree."""
+    """`select` and `fisher` weigh views as an active fit does; Python's `Scoring()` agrees."""
     for name in ("method", "prior", "relative_prior", "info_pixels", "policy", "criterion"):
         if hasattr(command, name):
             assert getattr(command, name) == getattr(ActiveConfig, name)
-    prior, scoring = gain.Prior(), select.Scoring()
-    assert (command.prior, command.relative_prior) == (prior.value, prior.relative)
+    scoring = select.Scoring()
+    assert gain.Prior.given(command.prior, command.relative_prior) == scoring.prior
     assert (command.method, ActiveConfig.criterion) == (scoring.method, scoring.criterion)
 
 

@@ -168,7 +168,7 @@ def test_terms_are_explained():
         "FLIP": "FLIP what an eye sees when it flips between two images",
         "Fisher information": "**Fisher information** about a parameter is the sum over the pixels",
         "`logdet`": "`logdet` adds up log(1 + that ratio)",
-        "`eig`": "`eig`, the default, adds up its information over that of the views so far",
+        "`eig`": "`eig`, as in FisherRF, adds up its information over that of the views so far",
         "oracle": "the oracle: float64, brute force",
     }.items():
         assert explanation in " ".join(README.split()), term

@@ -395,7 +395,7 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
     assert not torch.equal(metrics_of[0], metrics_of[1])
     report = json.loads((tmp_path / "run/selection.json").read_text())
     for pick in report["picks"]:
-        assert pick["blocks"] == ["geometry", "semantic"]
+        assert pick["blocks"] == ["geometry", "semantic", "backdrop"]
         told = pick["semantics"]
         assert (told["estimate"], told["gamma"], told["width"]) == ("principal", 1.0, WIDTH)
         assert "features" in pick["parts"]
