@@ -88,6 +88,8 @@ def test_the_sphere_is_behind_what_is_seen(blob, ring):
     looks = [Camera(ring[0].K, look_at((x, 0, 0), (0, 0, 30.0), (0, 1, 0)), 24, 18) for x in (-1.0, 1.0)]
     assert 25 < backdrop_sphere(moved, looks).radius < 31
     assert backdrop_sphere(blob.replace(logit_opacities=blob.logit_opacities - 9), ring) is None
+    with pytest.raises(ValueError, match="backdrop_sphere: there must be at least one camera, got none"):
+        backdrop_sphere(wall, [])
 
 
 def test_the_policy_paints_on_the_sphere(blob, ring):

@@ -58,6 +58,8 @@ def backdrop_sphere(scene: Scene, cameras: Sequence[Camera]) -> Sphere | None:
     """
     from drgs.integrator import render
 
+    if not cameras:
+        raise ValueError("fisher.backdrop_sphere: there must be at least one camera, got none")
     centers = np.stack([camera.center for camera in cameras])
     center, depths = centers.mean(0), []
     for camera in cameras:
