@@ -68,6 +68,17 @@ def test_maps_add_up_to_the_scores(place, monkeypatch, capsys):
         assert row["gain"]["logdet"] < row["gain"]["eig"]
 
 
+def test_lambda_is_one_unless_told_otherwise(place, monkeypatch, capsys):
+    """Not the one that views are chosen with; --relative-prior alone keeps its own, 1e-6 of the median."""
+    line = "run --limit 1 --preset fast --blocks geometry"
+    default, _ = run(line, place, monkeypatch, capsys)
+    given, _ = run(f"{line} --prior 1", place, monkeypatch, capsys)
+    assert default["prior"] == given["prior"] == {"value": 1.0, "relative": False}
+    assert default["views"][0]["gain"] == given["views"][0]["gain"]
+    relative, _ = run(f"{line} --relative-prior", place, monkeypatch, capsys)
+    assert relative["prior"] == {"value": 1e-6, "relative": True}
+
+
 def test_lambda_zero_leaves_unseen_parameters_out(place, monkeypatch, capsys):
     """One known view and lambda = 0: finite maps, and still the scores' sums."""
     known = load_cameras_json(place / "cameras.json")[:1]
