@@ -102,18 +102,20 @@ def test_nothing_ahead_of_the_bound(rng):
     g = around_camera(gaussians(rng, 30, 1, scale=0.3), cam).detach()
     settings = RenderSettings(order="ray", extent=3.0)
     _, lists = _scene(g, cam, settings)
-    ahead, start = lists.ahead.numpy(), lists.start.numpy()
+    ahead, start, end, index = (getattr(lists.blocks, name).numpy() for name in ("ahead", "start", "end", "index"))
     nearest = {}
     for i in range(len(g)):
         one = reference.render(g.take([i]), cam, settings)
         for y, x in (one.count > 0).nonzero().tolist():
             nearest[i, x, y] = float(one.depth[y, x])
     columns = -(-24 // TILE)
-    for tile, entries in enumerate(_listed(lists)):
-        pixels = [(x, y) for x in range(24) for y in range(16) if (y // TILE) * columns + x // TILE == tile]
+    for block in range(len(start)):
+        tile, entries = block // 4, index[start[block] : end[block]].tolist()
+        x0, y0 = (tile % columns) * TILE + block % 2 * 4, (tile // columns) * TILE + block % 4 // 2 * 4
+        pixels = [(x, y) for x in range(x0, x0 + 4) for y in range(y0, y0 + 4)]
         for k in range(len(entries)):
             later = [nearest.get((i, x, y), math.inf) for i in entries[k:] for x, y in pixels]
-            assert ahead[start[tile] + k] <= min(later) * (1 + 1e-6)
+            assert ahead[start[block] + k] <= min(later) * (1 + 1e-6)
 
 
 def test_nothing_listed(rng):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import drjit as dr
 
 from drgs.ellipsoids import Y_00
+from drgs.tracing.behind import Table, passed
 from drgs.tracing.derivatives import if_any_hit
 from drgs.tracing.kernels import Channels, HitModel, Ray
 from drgs.tracing.protocols import Float, Lib, Mask, Sink, UInt32
@@ -83,6 +84,7 @@ class Rows:
         finals: Per shared ray, the final state of the Primal pass.
         color: The color depends on the mean, through the direction.
         masks: Per shared ray, what its rows are multiplied by; None: nothing.
+        table: Says what there is of each hit, in whatever order they come; `finals` are not needed then.
     """
 
     def __init__(
@@ -94,52 +96,62 @@ class Rows:
         finals: list[dict],
         color: bool,
         masks: list[Float] | None = None,
+        table: Table | None = None,
     ) -> None:
         self.m, self.channels, self.sink, self.finals, self.masks = model, channels, sink, finals, masks
+        self.table = table
         self.buffer, self.color = buffer, color
         self.size = packed_size(_SHAPE + model.response.extra)
-        self.colors = buffer is not None or sink.needs_color
+        self.colors = buffer is not None or (sink is not None and sink.needs_color)
 
-    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
-        """State of shared ray k: what is left of each channel behind the last hit."""
-        lib, final = self.m.lib, self.finals[k]
-        D = lib.Float64
+    def rest(self, k: int) -> list[Float]:
+        """The whole sum of each channel of shared ray k; none without geometry."""
+        final, D = self.finals[k], self.m.lib.Float64
+        if self.buffer is None:
+            return []
         backgrounds = self.m.background if self.channels.color else []
         rest = [dr.fma(D(b), D(final["T"]), D(x)) for x, b in zip(final["sum"], backgrounds, strict=False)]
-        rest += [D(x) for x in final["sum"][len(rest) :]]
-        nothing = final["place"][0] == nowhere[0]
+        return rest + [D(x) for x in final["sum"][len(rest) :]]
+
+    def terms(self, k: int, values: list[Float], depth: Float, place: list, ok: Mask) -> list[Float]:
+        """The channels of a hit."""
+        return values if self.buffer is not None else []
+
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
+        """State of shared ray k: what is left of each channel behind the last hit."""
+        state = {}
+        if self.table is None:
+            alive = alive & (self.finals[k]["place"] != nowhere)
+            state = {"T": self.m.lib.Float(1), "rest": self.rest(k)}
         if self.masks:
-            nothing |= self.masks[k] <= 0
-        state = {"T": lib.Float(1), "rest": rest, "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0)}
-        return {**state, **self.sink.init()}
+            alive = alive & (self.masks[k] > 0)
+        return {**state, "alive": dr.select(alive, self.m.lib.UInt32(1), 0), **self.sink.init()}
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit of each of `rays`."""
+        if self.table is not None:
+            return self.table.if_any_hit(index, rays, states, places, active, self._take)
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
     def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Replay a hit that some ray of the packet has: B_c as in derivatives.py, exact as the sums are float64."""
         m, lib, rows, out = self.m, self.m.lib, [], []
-        D = lib.Float64
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         loaded = self.channels.load(lib, index, rays[0], going, only=None if self.colors else "record")
         record, hits = loaded["record"], lib.Bool(False)
         extra = None if self.buffer is None else load_packed(lib, self.buffer, self.size, index, going)
-        for k, (ray, st, final, place) in enumerate(zip(rays, states, self.finals, places, strict=True)):
-            a, _, ok = m.hit(record, ray, active & (st["alive"] != 0))
-            T, left, new, at_end = st["T"], 1 - a, dict(st), ok
-            w = dr.select(ok, T * a, 0)
-            new["T"] = dr.select(ok, T * left, T)
-            for p, q in zip(place, final["place"], strict=True):
-                at_end = at_end & (p == q)
-            new["alive"] = dr.select(at_end, 0, st["alive"])
-            slopes = g = turned = None
+        for k, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
+            a, depth, ok = m.hit(record, ray, active & (st["alive"] != 0))
             color: list[Float] | Any = self.channels.values(m, loaded, ray) if self.colors else None
+            if self.table is None:
+                terms = self.terms(k, color, depth, place, ok)
+                T, w, behind, new = passed(self.finals[k], st, a, terms, place, ok)
+            else:
+                T, w, behind, ok = self.table.read(k, place, a, active & (st["alive"] != 0))
+                new = dict(st)
+            slopes = g = turned = None
             if extra:
-                rest = [r - D(w) * D(c) for r, c in zip(st["rest"], color, strict=True)]
-                new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
-                share = dr.select(left > 0, dr.rcp(dr.select(left > 0, left, 1)), 0)
-                g = [dr.select(ok, dr.fma(T, c, -lib.Float(r) * share), 0) for c, r in zip(color, rest, strict=True)]
+                g = [dr.select(ok, dr.fma(T, c, -b), 0) for c, b in zip(color, behind, strict=True)]
                 moves = ok
                 if m.s.alpha_max < 1 and m.s.alpha_max_gradient != "pass":
                     moves = ok & (a < m.alpha_max)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,11 +11,13 @@ import torch
 
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
+from drgs.tracing.behind import Table, by_lists
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.pose import quaternion_product
 from drgs.tracing.protocols import Float
+from drgs.tracing.walk import together
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Replay"]
 
+_TABLED = 4  # channels whose tables are worth their memory
 _BESIDE = 16  # semantic channels of one traversal, beside the colors
 
 
@@ -38,6 +42,7 @@ class Walk(NamedTuple):
         weights: Of its channels: three colors, then semantic channels.
         channels: What it composited.
         part, finals: The rays, and their final states.
+        table: What is known of their hits, where final states are not needed.
     """
 
     first: bool
@@ -45,6 +50,7 @@ class Walk(NamedTuple):
     channels: Channels
     part: Part
     finals: list[dict]
+    table: Table | None
 
 
 class Replay:
@@ -170,18 +176,25 @@ class Replay:
             if number:
                 assert features is not None  # only the first slice may be none at all
                 channels, done = compositor.again(to_drjit(self.lib, features.reshape(-1)).array, count)
-            for part, finals in done:
-                yield Walk(
-                    number == 0, [*(weights if number == 0 else [0.0] * 3), *[gamma] * count], channels, part, finals
-                )
+            numbers = channels.outputs if self.extras is not None else 0
+            kernel = functools.partial(self._rows, channels)
+            own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
+            for group in together(done):
+                for part, finals, table in by_lists(self.lib, group, None if numbers > _TABLED else numbers, kernel):
+                    yield Walk(number == 0, own, channels, part, finals, table)
+
+    def _rows(
+        self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
+    ) -> Rows:
+        """The kernel for a part."""
+        masks = None
+        if self.mask is not None:
+            masks = [dr.gather(self.lib.Float, self.mask, *at) for at in zip(part.flat, part.inside, strict=True)]
+        return Rows(self.compositor.model, channels, self.extras, sink, finals, self.color, masks, table)
 
     def _replay(self, walk: Walk, sink: Sink) -> list[dict]:
         """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
-        part, masks = walk.part, None
-        if self.mask is not None:
-            masks = [dr.gather(self.lib.Float, self.mask, *at) for at in zip(part.flat, part.inside, strict=True)]
-        rows = Rows(self.compositor.model, walk.channels, self.extras, sink, walk.finals, self.color, masks)
-        return part.run(rows)
+        return walk.part.run(self._rows(walk.channels, walk.part, walk.finals, sink, walk.table))
 
     def _summed(
         self, sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks], width: int, weights: Sequence[float]

@@ -297,6 +297,14 @@ class _ProxyStream:
         """The number of candidates before."""
         return s[0]
 
+    def name(self, s: tuple, candidate: UInt32) -> UInt32:
+        """The Gaussian itself."""
+        return candidate
+
+    def named(self, name: UInt32, active: Mask) -> UInt32:
+        """Likewise."""
+        return name
+
     def of(self, lanes: UInt32) -> _ProxyStream:
         """The same for some of the rays."""
         carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]

@@ -9,17 +9,17 @@ traversal writes down (weights.py) where rays walk along lists of tiles; elsewhe
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import drjit as dr
 import torch
 
 from drgs.settings import RenderSettings
+from drgs.tracing.behind import Table, by_lists
 from drgs.tracing.derivatives import Adjoint, Tangent
 from drgs.tracing.kernels import Channels, HitModel, Primal
 from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
-from drgs.tracing.walk import Part
+from drgs.tracing.walk import Family, Part, together
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, emit_weights, in_rows, without_graph
 
 __all__ = ["CHUNK", "Compositor"]
@@ -194,10 +194,11 @@ class Compositor:
         part.inside = [part.inside[0] & ~failed]
         dr.eval(part.inside)
         self.certificate["rays"] = self.rays
-        self.certificate["redone"] = self.certificate.get("redone", 0) + dr.width(again)
+        if part.base is None:  # those walked a third time are among them
+            self.certificate["redone"] = self.certificate.get("redone", 0) + dr.width(again)
         if part.weights is not None and dr.width(again):
             part.weights.skip(dr.gather(self.lib.UInt32, part.flat[0], again))
-        return part.listed(again)
+        return part.again(again)
 
     @property
     def _held(self) -> bool:
@@ -234,27 +235,9 @@ class Compositor:
         dr.eval(g)
         slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
-            depth = "depth" in self.want and channels.color
-            for part, finals in done:
-                cotangents = [
-                    self._cotangent(g, channels, at, inside) for at, inside in zip(part.flat, part.inside, strict=True)
-                ]
-                # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
-                mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
+            for group in together(done):
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
-                    scalar = None
-                    if part.weights is not None and slopes is not None:
-                        scalar = self._products(
-                            part, part.weights, in_rows(g["features"], self.width), slopes, cotangents
-                        )
-                    if channels.channels and not self.couple:
-                        self._feature_gradient(grads["features"], channels, part, cotangents, mode)
-                        continue
-                    states = part.run(Adjoint(self.model, channels, grads, finals, cotangents, depth, mode, scalar))
-                    for st, at, inside in zip(states, part.flat, part.inside, strict=True):
-                        for total, x in zip(carried, st["carried"], strict=True):
-                            dr.scatter_add(total, x, at, inside)
-                    dr.eval(grads, carried)
+                    self._adjoint(g, channels, group, grads, carried, slopes)
         if slopes is not None:
             grads["features"] += lib.Float(slopes.view(-1))
         i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
@@ -266,10 +249,42 @@ class Compositor:
         ]
         return grads | ({"carried": carried} if carried else {})
 
+    def _adjoint(
+        self, g: dict, channels: Channels, group: Family, grads: dict, carried: list[Float], slopes: torch.Tensor | None
+    ) -> None:
+        """Of a part and of what of it is walked again: add to `grads`, `carried` and the `slopes` of features."""
+        depth, shared, of = "depth" in self.want and channels.color, None, {}
+        for part, _ in group:
+            of[part] = [self._cotangent(g, channels, *at) for at in zip(part.flat, part.inside, strict=True)]
+            if part.weights is not None and slopes is not None:  # the first part only
+                shared = self._products(part, part.weights, in_rows(g["features"], self.width), slopes, of[part])
+
+        def kernel(part: Part, finals: list[dict], table: Table | None = None) -> Adjoint:
+            # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
+            mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
+            if table is not None:
+                of[part] = [self._cotangent(g, channels, *at) for at in zip(part.flat, part.inside, strict=True)]
+            scalar = None
+            if shared is not None and (table is not None or part.weights is not None):
+                scalar = lambda k, place, ok: dr.gather(self.lib.Float, shared, part.slot(k, place), ok)  # noqa: E731
+            return Adjoint(self.model, channels, grads, finals, of[part], depth, mode, scalar, table)
+
+        if channels.channels and not self.couple:
+            for part, _ in group:
+                mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
+                self._feature_gradient(grads["features"], channels, part, of[part], mode)
+            return
+        for part, finals, table in by_lists(self.lib, group, 1, kernel):
+            states = part.run(kernel(part, finals, table))
+            for st, at, inside in zip(states, part.flat, part.inside, strict=True):
+                for total, x in zip(carried, st["carried"], strict=True):
+                    dr.scatter_add(total, x, at, inside)
+            dr.eval(grads, carried)
+
     def _products(
         self, part: Part, weights: Weights, g: torch.Tensor, slopes: torch.Tensor, cotangents: list[dict]
-    ) -> Callable[[int, list, Mask], Float] | None:
-        """Add the gradient of the features in a part to `slopes`; if coupled, the `scalar` of its `Adjoint`."""
+    ) -> Float | None:
+        """Add the gradient of the features in a part to `slopes`; if coupled, a table of what they add to s."""
         lib, buffer = self.lib, weights.kept
         if not bool(g.any()):
             return None
@@ -284,7 +299,7 @@ class Compositor:
         tile = dr.arange(lib.UInt32, dr.width(part.columns[0])) // (PIXELS // len(part.columns))
         for cotangent, column in zip(cotangents, part.columns, strict=True):
             cotangent["rest"] = dr.gather(lib.Float64, totals, tile * PIXELS + column)
-        return lambda k, place, ok: dr.gather(lib.Float, scalars, part.held(k, place), ok)
+        return scalars
 
     def _feature_gradient(
         self, grad: Float, channels: Channels, part: Part, cotangents: list[dict], mode: dr.ReduceMode

@@ -23,6 +23,7 @@ from collections.abc import Callable
 
 import drjit as dr
 
+from drgs.tracing.behind import Table, passed
 from drgs.tracing.harmonics import sh_color
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal, Ray
 from drgs.tracing.protocols import Float, Mask, UInt32
@@ -71,6 +72,7 @@ class Adjoint:
         depth: There is a depth cotangent.
         scalar: What the features add to s: `scalar(shared ray, place, is hit)`; None without features here. The
             cotangents then have `rest`, the sum of it over the ray's weights.
+        table: Filled for these cotangents: says what there is of each hit, in whatever order they come.
     """
 
     def __init__(
@@ -83,14 +85,15 @@ class Adjoint:
         depth: bool,
         mode: dr.ReduceMode,
         scalar: Callable[[int, list, Mask], Float] | None = None,
+        table: Table | None = None,
     ) -> None:
         self.m, self.channels, self.grads, self.mode, self.scalar = model, channels, grads, mode, scalar
+        self.table = table
         self.finals, self.cotangents, self.slots = finals, cotangents, set(model.slots(depth))
 
-    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
-        """State of shared ray k; `carried` collects the gradient of what the ray itself carries."""
-        lib, final, g = self.m.lib, self.finals[k], self.cotangents[k]
-        D = lib.Float64
+    def rest(self, k: int) -> list[Float]:
+        """The whole sum of shared ray k, of which each hit takes its own."""
+        D, final, g = self.m.lib.Float64, self.finals[k], self.cotangents[k]
         rest = D(final["depth"]) * D(g["depth"]) if "depth" in final else D(0)
         rest = dr.fma(D(g["alpha"]), D(final["alpha"]), rest)
         for x, c in zip(final["sum"], g["sum"], strict=True):
@@ -98,24 +101,33 @@ class Adjoint:
         if self.channels.color:
             for c, background in zip(g["sum"][:3], self.m.background, strict=True):
                 rest = dr.fma(D(c * background), D(final["T"]), rest)
-        if self.scalar is not None:
-            rest += g["rest"]
-        nothing = final["place"][0] == nowhere[0]
-        return {
-            "T": lib.Float(1),
-            "rest": rest,
-            "alive": dr.select(alive & ~nothing, lib.UInt32(1), 0),
-            "carried": [lib.Float(0) for _ in range(g["carried"])],
-        }
+        return [rest + g["rest"] if self.scalar is not None else rest]
+
+    def terms(self, k: int, values: list[Float], depth: Float, place: list, ok: Mask) -> list[Float]:
+        """s of a hit of shared ray k."""
+        D, g = self.m.lib.Float64, self.cotangents[k]
+        s = dr.fma(D(g["depth"]), D(dr.detach(depth)), D(g["alpha"]))  # a weight of the derivative: a number
+        for v, c in zip(values, g["sum"], strict=True):
+            s = dr.fma(D(dr.detach(v)), D(c), s)  # likewise
+        return [s if self.scalar is None else s + D(self.scalar(k, place, ok))]
+
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
+        """State of shared ray k; `carried` collects the gradient of what the ray itself carries."""
+        lib, state = self.m.lib, {"carried": [self.m.lib.Float(0) for _ in range(self.cotangents[k]["carried"])]}
+        if self.table is None:
+            alive = alive & (self.finals[k]["place"] != nowhere)
+            state |= {"T": lib.Float(1), "rest": self.rest(k)}
+        return state | {"alive": dr.select(alive, lib.UInt32(1), 0)}
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Back-propagate through Gaussian `index` what the primal pass composited of it."""
+        if self.table is not None:
+            return self.table.if_any_hit(index, rays, states, places, active, self._take)
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
     def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit of each ray: its local derivative by AD, weighted with dL/da and with w times the cotangents."""
         m, lib, out = self.m, self.m.lib, []
-        D = lib.Float64
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         with dr.resume_grad():
             # A graph of this hit only, from leaves of its own: the walk has suspended AD.
@@ -124,37 +136,26 @@ class Adjoint:
             }
             dr.enable_grad(fixed)
             total, hits, carried = lib.Float(0), lib.Bool(False), []
-            shared = zip(rays, states, self.cotangents, self.finals, places, strict=True)
-            for number, (ray, st, g, final, place) in enumerate(shared):
+            for number, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
+                g = self.cotangents[number]
                 ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])  # leaves, too
                 dr.enable_grad(ray.carried)
                 carried.append(ray.carried)
                 a, depth, ok = m.hit(fixed["record"], ray, active & (st["alive"] != 0))
                 values = self.channels.values(m, fixed, ray)
                 # Weights of the local derivative are numbers.
-                a0, depth0, T = dr.detach(a), dr.detach(depth), st["T"]
-                w = dr.select(ok, T * a0, 0)
-                s = dr.fma(D(g["depth"]), D(depth0), D(g["alpha"]))
-                for v, c in zip(values, g["sum"], strict=True):
-                    s = dr.fma(D(dr.detach(v)), D(c), s)  # a number, likewise
-                if self.scalar is not None:
-                    s += D(self.scalar(number, place, ok))
-                rest = st["rest"] - D(w) * s
-                left = 1 - a0
-                # Behind an a that rounds to 1 nothing was composited: there is no rest to share out.
-                behind = dr.select(left > 0, lib.Float(rest) / dr.select(left > 0, left, 1), 0)
+                a0 = dr.detach(a)
+                (s,) = self.terms(number, values, depth, place, ok)
+                if self.table is None:
+                    T, w, (behind,), new = passed(self.finals[number], st, a0, [s], place, ok)
+                else:
+                    T, w, (behind,), ok = self.table.read(number, place, a0, active & (st["alive"] != 0))
+                    new = dict(st)
                 local = dr.fma(dr.fma(T, lib.Float(s), -behind), a, w * g["depth"] * depth)
                 for v, c in zip(values, g["sum"], strict=True):
                     local = dr.fma(w * c, v, local)
                 total += dr.select(ok, local, 0)
                 hits |= ok
-                new = dict(st)
-                new["T"], new["rest"] = dr.select(ok, T * left, T), dr.select(ok, rest, st["rest"])
-                # The last composited hit ends the ray, whatever rule ended the primal pass.
-                at_end = ok
-                for p, q in zip(place, final["place"], strict=True):
-                    at_end = at_end & (p == q)
-                new["alive"] = dr.select(at_end, 0, st["alive"])
                 out.append(new)
             dr.backward_from(total)
             grads = {name: [dr.grad(x) for x in xs] for name, xs in fixed.items()}
@@ -193,7 +194,7 @@ class Tangent:
         self.primal, self.m, self.channels, self.emits = primal, primal.m, primal.channels, emits
         self.records, self.slots, self.tangents, self.carried = records, slots, tangents, carried
 
-    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray: the primal's, and `d` with a tangent of it for each column."""
         lib, state = self.m.lib, self.primal.init(k, alive, nowhere)
         names = ["T", *(["depth"] if "depth" in state else [])]  # sum w is 1 - T

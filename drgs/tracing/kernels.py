@@ -155,7 +155,7 @@ class Primal:
     def __init__(self, model: HitModel, channels: Channels, want: frozenset, emit: Emit | None = None) -> None:
         self.m, self.channels, self.want, self.emit = model, channels, want, emit
 
-    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray; the same for each shared one."""
         lib = self.m.lib
         Sum = lib.Float64 if "replay" in self.want else lib.Float
@@ -171,7 +171,7 @@ class Primal:
         if "count" in self.want or self.m.s.max_hits:
             state["count"] = lib.UInt32(0)
         if "replay" in self.want:
-            state["place"] = [type(x)(x) for x in nowhere]
+            state["place"] = type(nowhere)(nowhere)
         return state
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
@@ -203,7 +203,7 @@ class Primal:
                 if m.s.max_hits:
                     new["alive"] = dr.select(new["count"] >= m.max_hits, 0, new["alive"])
             if "place" in st:
-                new["place"] = [dr.select(ok, p, q) for p, q in zip(place, st["place"], strict=True)]
+                new["place"] = dr.select(ok, place[0], st["place"])
             if self.emit is not None:
                 self.emit(index, k, place, w, ok)
             out.append(new)

@@ -69,6 +69,12 @@ class Stream(Protocol):
     def next(self, state: Any, active: Mask) -> tuple[UInt32, Mask, Float, Any]:
         """(Gaussian, whether there is one, lower bound of its and all later order keys, new state)."""
 
+    def name(self, state: Any, candidate: UInt32) -> UInt32:
+        """Of the candidate that a state comes to: what orders hits with the same key, as Gaussians' indices do."""
+
+    def named(self, name: UInt32, active: Mask) -> UInt32:
+        """The Gaussian of a name."""
+
     def of(self, lanes: UInt32) -> Stream:
         """The same for some of the lanes."""
 
@@ -76,7 +82,7 @@ class Stream(Protocol):
 class Kernel(Protocol):
     """What happens at a hit; its states, one dictionary a ray, are part of that of Dr.Jit's loop."""
 
-    def init(self, k: int, alive: Mask, nowhere: list) -> dict:
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of shared ray k, with `alive` (UInt32); `nowhere`: the place of no hit."""
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:

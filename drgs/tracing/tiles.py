@@ -8,6 +8,8 @@ order sorts by (depth of the mean, index); `ray` order by t* at the tile's cente
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Iterator
 
 import drjit as dr
 import torch
@@ -20,12 +22,15 @@ from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.projection import Projected
 from drgs.tracing.protocols import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.responses import RESPONSES
-from drgs.tracing.walk import ListStream, Part
+from drgs.tracing.walk import ListStream, Part, Slots
 from drgs.tracing.weights import PIXELS, Weights, signed
 
-__all__ = ["TILE", "Lists", "TileTraversal", "build", "depth_order"]
+__all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 
 TILE = 8
+TABLES = 128 << 20
+"""Bytes of the tables that a derivative in exact order fills at once; more where the list of a single tile has more."""
+_BLOCK = 4  # pixels of a block's edge: four blocks are a tile
 _FAR = 3.0e38
 _NOWHERE = 2**64 - 1
 _LARGE = 8  # tiles of a box, on average
@@ -56,36 +61,58 @@ class TileTraversal:
         self.certificate["pairs"] = self.lists.pairs
 
     def parts(self, share: int) -> list[Part]:
-        """All pixels as one part."""
-        count = self.lists.columns * self.lists.rows
-        return [self._part(share, dr.arange(self.lib.UInt32, count * (TILE * TILE // share)) // (TILE * TILE // share))]
+        """All pixels as one part; in `ray` order as `weighed`, for tables of two numbers."""
+        if self.settings.order == "ray":
+            return [part for part, _ in self._bands(share, TABLES // 2)]
+        count, per_tile = self.lists.columns * self.lists.rows, TILE * TILE // share
+        return [self._part(share, dr.arange(self.lib.UInt32, count * per_tile) // per_tile, False)]
 
     def weighed(self, share: int, size: int) -> list[Part]:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
-        lib, per_tile, made, begin, first = self.lib, TILE * TILE // share, [], 0, 0
+        index, made = signed(self.lists.index), []
+        for part, (begin, end, first, lengths) in self._bands(share, size):
+            pixels = self._pixels(torch.arange(begin, end, device=lengths.device))
+            part.weights = Weights(self.lib, index[first : first + int(lengths.sum())], lengths, pixels)
+            made.append(part)
+        return made
+
+    def _bands(self, share: int, size: int) -> Iterator[tuple[Part, tuple]]:
+        """Parts of consecutive tiles whose entries, a float in each pixel, take `size` bytes, or a tile's more; and of
+        each its first tile, that behind it, its first entry and the (tiles,) lengths of its lists.
+        """
+        lib, pixels, begin, first = self.lib, PIXELS, 0, 0
+        per_tile = pixels // share
         lengths = signed(self.lists.end).long() - signed(self.lists.start).long()
-        ends, index = lengths.cumsum(0), signed(self.lists.index)
+        ends = lengths.cumsum(0)
         while begin < len(lengths):
-            end = int(torch.searchsorted(ends, first + size // (4 * PIXELS), right=True))
+            end = int(torch.searchsorted(ends, first + size // (4 * pixels), right=True))
             end = min(max(end, begin + 1), len(lengths))
             last = int(ends[end - 1])
             lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
-            part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin))
-            pixels = self._pixels(torch.arange(begin, end, device=lengths.device))
-            part.weights = Weights(lib, index[first:last], lengths[begin:end], first, pixels)
+            part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin), self.settings.order == "ray")
+            part.slots = Slots(dr.opaque(lib.UInt32, first), (last - first + 1) * PIXELS)
             part.columns = [lane % per_tile + 16 * k for k in range(share)]
-            made.append(part)
+            part.in_lists = functools.partial(self._in_lists, begin, end, part.slots)
+            yield part, (begin, end, first, lengths[begin:end])
             begin, first = end, last
-        return made
+
+    def _in_lists(self, begin: int, end: int, slots: Slots) -> Part:
+        """The pixels of tiles in the order of the tiles' lists, as many a lane as there is room for."""
+        lib, share = self.lib, 1 if self.basis else 4
+        per_tile = TILE * TILE // share
+        lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
+        part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin), False)
+        part.slots, part.columns = slots, [lane % per_tile + 16 * k for k in range(share)]
+        return part
 
     def _pixels(self, tiles: torch.Tensor) -> torch.Tensor:
-        """(tiles, 64) row-major pixels in the order of lanes, -1 outside of the image."""
+        """(tiles, pixels) row-major pixels in the order of lanes, -1 outside of the image."""
         k = torch.arange(TILE * TILE, device=tiles.device)
         x = (tiles % self.lists.columns)[:, None] * TILE + k // 16 % 2 * 4 + k % 4
         y = (tiles // self.lists.columns)[:, None] * TILE + k // 32 * 4 + k % 16 // 4
         return torch.where((x < self.width) & (y < self.height), y * self.width + x, -1)
 
-    def _part(self, share: int, tile: UInt32) -> Part:
+    def _part(self, share: int, tile: UInt32, ordered: bool) -> Part:
         """The pixels of tiles, one a lane, `share` a lane."""
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
@@ -105,10 +132,13 @@ class TileTraversal:
         some = inside[0]
         for other in inside[1:]:
             some = some | other
-        start = dr.gather(lib.UInt32, lists.start, tile)
-        end = dr.select(some, dr.gather(lib.UInt32, lists.end, tile), start)
-        stream = ListStream(lib, lists.index, start, end, lists.ahead)
-        return Part(lib, self.model, self.records, rays, flat, inside, stream, self.settings.order == "ray")
+        blocks = lists.blocks if ordered else None
+        of, group = (lists, tile) if blocks is None else (blocks, 4 * tile + block)
+        start = dr.gather(lib.UInt32, of.start, group)
+        end = dr.select(some, dr.gather(lib.UInt32, of.end, group), start)
+        names = () if blocks is None else (blocks.ahead, blocks.place, lists.index)
+        stream = ListStream(lib, of.index, start, end, *names)
+        return Part(lib, self.model, self.records, rays, flat, inside, stream, ordered)
 
     def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
@@ -127,18 +157,36 @@ class Lists:
     Attributes:
         index: (pairs,) Gaussian of each entry; a tile's entries are contiguous and ordered.
         start, end: (tiles,) range of each tile.
-        ahead: (pairs,) `ray` order only: no hit of this entry or a later one of its tile has a smaller key.
         columns, rows: Tiles in x and y.
         pairs: Number of entries.
+        blocks: `ray` order only: the same entries, block by block.
     """
 
     index: UInt32
     start: UInt32
     end: UInt32
-    ahead: Float | None
     columns: int
     rows: int
     pairs: int
+    blocks: BlockLists | None = None
+
+
+@dataclasses.dataclass
+class BlockLists:
+    """The entries of tiles' lists again, in the order of t* in the middle of each 4x4 block of a tile, four a tile.
+
+    Attributes:
+        index: (entries,) Gaussian of each.
+        place: (entries,) where it stands in the tiles' lists, which have Gaussians in the order of their indices.
+        start, end: (4 tiles,) range of each block.
+        ahead: (entries,) no hit of this entry or a later one of its block has a smaller key.
+    """
+
+    index: UInt32
+    place: UInt32
+    start: UInt32
+    end: UInt32
+    ahead: Float
 
 
 def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, height: int, record: Float) -> Lists:
@@ -164,21 +212,24 @@ def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, 
     count = dr.width(projected.key)
     gaussian = dr.arange(lib.UInt32, count)
     dr.eval(amount, tx0, tx1, ty0, ty1, projected.key)
-    order = gaussian
-    if settings.order != "ray":
+    order, exact = gaussian, settings.order == "ray"
+    if not exact:
         # Emitting in depth order leaves 32 bits for the rank, so ties fall by index and nothing is quantized.
         order = depth_order(lib, projected.key, gaussian)
         amount = dr.gather(lib.UInt32, amount, order)
     total64 = dr.sum(lib.UInt64(amount))[0]
-    if total64 >= 2**32:
+    if total64 >= 2 ** (most := 30 if exact else 32):  # in exact order there are up to four lanes an entry
         raise ValueError(
-            f"render: the tile lists must have fewer than 2^32 entries, got {total64}; lower extent or image size"
+            f"render: the tile lists must have fewer than 2^{most} entries, got {total64}; lower extent or image size"
         )
     pairs = int(total64)
     what = f"{pairs} entries of tile lists ({count} Gaussians, {width}x{height} pixels)"
-    memory.require("render", memory.PAIR * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
+    each = memory.PAIR + memory.BLOCKS * exact
+    memory.require("render", each * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
     start, end = dr.zeros(lib.UInt32, columns * rows), dr.zeros(lib.UInt32, columns * rows)
-    nothing = Lists(dr.zeros(lib.UInt32, 1), start, end, dr.zeros(lib.Float, 1), columns, rows, 0)
+    none, ends = dr.zeros(lib.UInt32, 1), dr.zeros(lib.UInt32, 4 * columns * rows)
+    blocks = BlockLists(none, none, ends, ends, dr.zeros(lib.Float, 1)) if exact else None
+    nothing = Lists(none, start, end, columns, rows, 0, blocks)
     if pairs == 0:
         return nothing
     offset = dr.cumsum(amount) - amount
@@ -186,11 +237,10 @@ def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, 
     # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera. Small
     # boxes hold few, and looking for them costs more than they do.
     large = pairs > _LARGE * int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
-    bits = max(1, (columns * rows - 1).bit_length()), max(1, (count - 1).bit_length())
     box = [dr.gather(lib.Int32, b, order) for b in (tx0, tx1, ty0, ty1)]
     loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.EXT2 + 1)]
     tiles = _Tiles(lib, settings, loaded)
-    _emit(lib, keys, gaussian, amount, offset, box, columns, bits, tiles, large, settings.order == "ray")
+    _emit(lib, keys, gaussian, amount, offset, box, columns, tiles, large)
     if large:
         kept = dr.compress(keys != _NOWHERE)
         pairs = dr.width(kept)
@@ -198,24 +248,67 @@ def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, 
             return nothing
         keys = dr.gather(lib.UInt64, keys, kept)
     keys = dr.sort(keys)
-    if settings.order == "ray":
-        tile = lib.UInt32(keys >> (64 - bits[0]))
-        index = lib.UInt32(keys & ((1 << bits[1]) - 1))
-    else:
-        tile = lib.UInt32(keys >> 32)
-        index = dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
+    tile, index = lib.UInt32(keys >> 32), dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
+    dr.eval(tile, index)
+    _ranges(lib, tile, start, end)
+    lists = Lists(index, start, end, columns, rows, pairs)
+    if exact:
+        lists.blocks = _blocks(lib, lists, settings, record, projected, tile)
+    return lists
+
+
+def _ranges(lib: Lib, group: UInt32, start: UInt32, end: UInt32) -> None:
+    """Write where each group of consecutive entries starts and ends."""
+    pairs = dr.width(group)
     entry = dr.arange(lib.UInt32, pairs)
-    before = dr.gather(lib.UInt32, tile, entry - 1, entry > 0)
-    after = dr.gather(lib.UInt32, tile, entry + 1, entry + 1 < pairs)
-    dr.scatter(start, entry, tile, (entry == 0) | (before != tile))
-    dr.scatter(end, entry + 1, tile, (entry + 1 == pairs) | (after != tile))
-    dr.eval(index, start, end)
-    ahead = None
-    if settings.order == "ray":
-        ahead = dr.gather(lib.Float, projected.lower, index)
-        dr.eval(ahead)
+    before = dr.gather(lib.UInt32, group, entry - 1, entry > 0)
+    after = dr.gather(lib.UInt32, group, entry + 1, entry + 1 < pairs)
+    dr.scatter(start, entry, group, (entry == 0) | (before != group))
+    dr.scatter(end, entry + 1, group, (entry + 1 == pairs) | (after != group))
+    dr.eval(start, end)
+
+
+def _blocks(
+    lib: Lib, lists: Lists, settings: RenderSettings, record: Float, projected: Projected, tile: UInt32
+) -> BlockLists:
+    """The entries of each block of a tile, by t* at the block's center.
+
+    Args:
+        lists: Of the tiles.
+        record: Flat record buffer.
+        projected: `Projected` of the view.
+        tile: (pairs,) of each entry.
+    """
+    lower = projected.lower
+    upper = 2 * projected.key - lower  # the mean's distance and the reach
+    lane = dr.arange(lib.UInt32, 4 * lists.pairs)
+    entry, corner = lane // 4, lane % 4
+    own = dr.gather(lib.UInt32, tile, entry)
+    x = (own % lists.columns) * 2 + corner % 2
+    y = (own // lists.columns) * 2 + corner // 2
+    index = dr.gather(lib.UInt32, lists.index, entry)
+    loaded = list(dr.gather(lib.ArrayXf, record, index, shape=(layout.RECORD, dr.width(index))))
+    tiles = _Tiles(lib, settings, loaded, _BLOCK)
+    dx, dy = tiles.center(lib.Int32(x), lib.Int32(y))
+    # What is sorted has 32 bits: a block, then the depth among all that there are, as far as there is room.
+    bits = 32 - max(1, (4 * lists.columns * lists.rows - 1).bit_length())
+    near, far = (dr.reinterpret_array(lib.UInt32, f(x)) for f, x in ((dr.min, lower), (dr.max, upper)))
+    depth = dr.clip(dr.reinterpret_array(lib.UInt32, tiles.depth(dx, dy)), near, far)
+    rank = lib.UInt32(lib.Float(depth - near) * (float((1 << bits) - 1) / dr.maximum(lib.Float(far - near), 1)))
+    key = ((4 * own + corner) << bits) | dr.minimum(rank, (1 << bits) - 1)
+    kept = dr.compress(tiles.may_hit(dx, dy))
+    key, place = dr.gather(lib.UInt32, key, kept), kept // 4
+    dr.eval(key, place)
+    order = dr.argsort(key)
+    place, block = dr.gather(lib.UInt32, place, order), dr.gather(lib.UInt32, key, order) >> bits
+    index = dr.gather(lib.UInt32, lists.index, place)
+    start, end = (dr.zeros(lib.UInt32, 4 * lists.columns * lists.rows) for _ in range(2))
+    ahead = dr.gather(lib.Float, lower, index)
+    dr.eval(place, block, index, ahead)
+    if dr.width(place):
+        _ranges(lib, block, start, end)
         ahead = _suffix_minimum(lib, ahead, start, end)
-    return Lists(index, start, end, ahead, columns, rows, pairs)
+    return BlockLists(index, place, start, end, ahead)
 
 
 def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
@@ -235,8 +328,8 @@ class _Tiles:
         loaded: The first entries of each lane's record.
     """
 
-    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float]) -> None:
-        self.lib, self.r, self.response = lib, loaded, RESPONSES[settings.response]
+    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], size: int = TILE) -> None:
+        self.size, self.lib, self.r, self.response = size, lib, loaded, RESPONSES[settings.response]
         self.limit = loaded[layout.EXT2]
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
@@ -247,7 +340,9 @@ class _Tiles:
     def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
         """Of tile (x, y), from the anchor."""
         r = self.r
-        return (self.lib.Float(x) + 0.5) * TILE - r[layout.AX], (self.lib.Float(y) + 0.5) * TILE - r[layout.AY]
+        return (self.lib.Float(x) + 0.5) * self.size - r[layout.AX], (self.lib.Float(y) + 0.5) * self.size - r[
+            layout.AY
+        ]
 
     def depth(self, dx: Float, dy: Float) -> Float:
         """t* there, at least 0: orders the list, decides nothing."""
@@ -255,7 +350,7 @@ class _Tiles:
 
     def may_hit(self, dx: Float, dy: Float) -> Mask:
         """False only where no pixel center of the tile around there has a hit."""
-        return self.response.may_hit(self.r, dx, dy, 0.5 * (TILE - 1), self.limit)
+        return self.response.may_hit(self.r, dx, dy, 0.5 * (self.size - 1), self.limit)
 
 
 def _emit(
@@ -266,26 +361,17 @@ def _emit(
     offset: UInt32,
     box: list[Int32],
     columns: int,
-    bits: tuple[int, int],
     tiles: _Tiles,
     large: bool,
-    by_depth: bool,
 ) -> None:
     """Write the sort key of every (tile, Gaussian) pair; of those that may have a hit, if boxes are `large`."""
     x0, x1, y0, _ = box
-    tile_bits, index_bits = bits
-    depth_bits = 64 - tile_bits - index_bits
 
     def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
         """Write one pair, and step to the next tile of the box, row by row."""
         tile = lib.UInt32(y * columns + x)
         dx, dy = tiles.center(x, y)
-        if by_depth:
-            quantized = lib.UInt64(dr.reinterpret_array(lib.UInt32, tiles.depth(dx, dy)))
-            quantized = quantized >> (31 - depth_bits) if depth_bits < 31 else quantized << (depth_bits - 31)
-            key = (lib.UInt64(tile) << (64 - tile_bits)) | (quantized << index_bits) | lib.UInt64(gaussian)
-        else:
-            key = (lib.UInt64(tile) << 32) | lib.UInt64(gaussian)
+        key = (lib.UInt64(tile) << 32) | lib.UInt64(gaussian)
         dr.scatter(keys, key, offset + k, tiles.may_hit(dx, dy) if large else True)
         wrap = x >= x1
         return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)

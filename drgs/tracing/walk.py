@@ -2,17 +2,19 @@
 
 A `Part` is a set of lanes with one or four rays each and a stream of candidate Gaussians. In `center` order on tiles
 the stream is in order already: 16 lanes work on a tile and each carries four pixels, so that a record is loaded once
-for 64 pixels. In every other case a lane has one ray and a sorted buffer of K hits (order key and index).
+for 64 pixels. In every other case a lane has one ray and a sorted buffer of its hits (order key and name in one word).
 
 Exact order with a finite buffer: hits enter as they come, and the nearest leaves when a new one needs its place. A ray
 goes wrong only if a hit arrives in front of one that has left; this is checked on every hit (the certificate), and such
-rays are redone from a sorted list of all their hits, so any depth is exact. A ray may stop at its transmittance limit
-only where nothing that is still to come can lie in front: streams bound the keys to come from below.
+rays are walked again, with a deeper buffer or along a sorted list of all their hits, so any depth is exact. A ray may
+stop at its transmittance limit only where nothing that is still to come can lie in front: streams bound the keys to
+come from below.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import drjit as dr
@@ -22,12 +24,16 @@ from drgs.tracing.protocols import Float, Kernel, Lib, Mask, Stream, UInt32
 from drgs.tracing.records import RECORD
 from drgs.tracing.weights import PIXELS, Weights
 
-__all__ = ["BUFFER", "EMPTY", "NOWHERE", "ListStream", "Part"]
+__all__ = ["BUFFER", "EMPTY", "NOWHERE", "Family", "ListStream", "Part", "Slots", "together"]
 
-BUFFER = 16
-EMPTY = -1.0  # order key of "no hit"; keys of hits are >= 0
+BUFFER = 20  # hits that a ray is sorted among
+_DEEP = 48  # of rays for which these were too few
+_MANY = 1000  # such rays, from which on a kernel of their own is worth compiling
+EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
-_LAST = 3.3e38  # a key behind all others
+_LEAST = 1.2e-38  # of keys: below, float32 is not normal
+_BEHIND = 1e308  # all words of hits
+_WORD = 32  # bits of a word beside the key: the lane and the Gaussian
 _MAX_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
 
 
@@ -38,10 +44,23 @@ class ListStream:
         index: (entries,) Gaussians.
         start, end: Per lane.
         ahead: (entries,) lower bound of the order key of this entry and all later ones of its lane; None without.
+        places: (entries,) where each stands in another list, in which each lane has its Gaussians in the order of their
+            indices; None: there is none.
+        listed: Gaussians of that list.
     """
 
-    def __init__(self, lib: Lib, index: UInt32, start: UInt32, end: UInt32, ahead: Float | None = None) -> None:
+    def __init__(
+        self,
+        lib: Lib,
+        index: UInt32,
+        start: UInt32,
+        end: UInt32,
+        ahead: Float | None = None,
+        places: UInt32 | None = None,
+        listed: UInt32 | None = None,
+    ) -> None:
         self.lib, self.index, self.start, self.end, self.ahead = lib, index, start, end, ahead
+        self.places, self.listed = places, listed
 
     def begin(self) -> UInt32:
         """The place of the first entry."""
@@ -61,10 +80,31 @@ class ListStream:
         bound = EMPTY if self.ahead is None else dr.gather(self.lib.Float, self.ahead, i, active)
         return index, active, bound, i + 1
 
+    def name(self, i: UInt32, candidate: UInt32) -> UInt32:
+        """The place in the other list, or the Gaussian."""
+        return candidate if self.places is None else dr.gather(self.lib.UInt32, self.places, i)
+
+    def named(self, name: UInt32, active: Mask) -> UInt32:
+        """The Gaussian of that name."""
+        return name if self.listed is None else dr.gather(self.lib.UInt32, self.listed, name, active)
+
     def of(self, lanes: UInt32) -> ListStream:
         """The entries of some lanes."""
         start, end = (dr.gather(self.lib.UInt32, x, lanes) for x in (self.start, self.end))
-        return ListStream(self.lib, self.index, start, end, self.ahead)
+        return ListStream(self.lib, self.index, start, end, self.ahead, self.places, self.listed)
+
+
+@dataclasses.dataclass
+class Slots:
+    """Where tables have the entries of some tiles' lists in each pixel of these tiles.
+
+    Attributes:
+        first: The first entry, of the lists of the whole view.
+        size: Of all of them.
+    """
+
+    first: UInt32
+    size: int
 
 
 class Part:
@@ -78,6 +118,10 @@ class Part:
         weights: Where the weights of these rays are held; None where they are not. A place in the order then ends
             with that in the list.
         columns: Per shared ray, its pixel of the tile.
+        slots: Of rays along the lists of tiles, where an entry and a pixel stand in tables; None for others.
+        in_lists: Makes a part with the rays of the tiles in the order of their lists; of rays with `slots`.
+        base: The part that these rays were in at first, where they are walked again.
+        buffer: Hits that its rays are sorted among.
     """
 
     def __init__(
@@ -98,57 +142,72 @@ class Part:
         self.failed = None
         self.weights: Weights | None = None
         self.columns: list[UInt32] = []
+        self.slots: Slots | None = None
+        self.base: Part | None = None
+        self.in_lists: Callable[[], Part] | Any = None
+        self.buffer = BUFFER
 
-    def held(self, k: int, place: list) -> UInt32:
-        """Where the weight of shared ray k at a place in its order is held."""
-        assert self.weights is not None
-        return (place[-1] - self.weights.first) * PIXELS + self.columns[k]
+    def slot(self, k: int, place: list) -> UInt32:
+        """Where a table has shared ray k at a place in its order, which ends with that in the list."""
+        assert self.slots is not None
+        return (place[-1] - self.slots.first) * PIXELS + self.columns[k]
 
-    def listed(self, again: UInt32) -> list[Part]:
-        """Parts that walk some of the rays again, given by their lanes, along sorted lists of all their hits."""
-        lib, count = self.lib, dr.width(again)
+    def again(self, lanes: UInt32) -> list[Part]:
+        """Parts that walk some of the rays again, given by their lanes: many with a deeper buffer, where some may fail
+        again; few along sorted lists of all their hits.
+        """
+        count = dr.width(lanes)
         if count == 0:
             return []
-        pick = lambda x: None if x is None else dr.gather(type(x), x, again)  # noqa: E731
+        pick = lambda x: None if x is None else dr.gather(type(x), x, lanes)  # noqa: E731
         rays = [Ray(pick(r.x), pick(r.y), pick(r.length), [pick(v) for v in r.carried], r.basis) for r in self.rays]
-        flat, stream = [pick(f) for f in self.flat], self.stream.of(again)
+        flat, stream = [pick(f) for f in self.flat], self.stream.of(lanes)
         dr.eval(rays, flat)
+        inside = [self.lib.Bool(True)]
+        part = Part(self.lib, self.model, self.records, rays, flat, inside, stream, True, self.center_key)
+        part.slots, part.columns = self.slots, [pick(x) for x in self.columns]
+        part.base, part.buffer = self.base or self, _DEEP
+        return [part] if count >= _MANY and self.buffer < _DEEP else part._listed(count)
+
+    def _listed(self, count: int) -> list[Part]:
+        """The same rays along sorted lists."""
+        lib = self.lib
         with dr.suspend_grad():  # lists say what to look at, and in which order: neither has a derivative
-            hits = self._each_hit(rays[0], stream, count, lambda *hit: None)
+            hits = self._each_hit(count, lambda *hit: None)
             dr.eval(hits)
             total = int(dr.sum(lib.UInt64(hits))[0])
-            if total > _MAX_HITS and count > 1:
+            gaussians = dr.width(self.records) // RECORD
+            bits = max(1, (gaussians - 1).bit_length())
+            if (total > _MAX_HITS or (count - 1) >> max(_WORD - bits, 0)) and count > 1:
                 half = dr.arange(lib.UInt32, count // 2)
                 rest = dr.arange(lib.UInt32, count - dr.width(half)) + dr.width(half)
-                return self.listed(dr.gather(lib.UInt32, again, half)) + self.listed(dr.gather(lib.UInt32, again, rest))
+                return [part for lanes in (half, rest) for part in self.again(lanes)]
             start = dr.cumsum(hits) - hits
-            index = self._sorted_hits(rays[0], stream, start, total)
+            index = self._sorted_hits(start, total, bits)
         stream = ListStream(lib, index, start, start + hits)
-        inside = [lib.Bool(True)] * len(rays)
-        return [Part(lib, self.model, self.records, rays, flat, inside, stream, False)]
+        part = Part(lib, self.model, self.records, self.rays, self.flat, self.inside, stream, False)
+        part.base = self.base
+        return [part]
 
-    def _sorted_hits(self, ray: Ray, stream: Stream, start: UInt32, total: int) -> UInt32:
-        """The hits of each ray, from its `start` on, by (key, index)."""
+    def _sorted_hits(self, start: UInt32, total: int, bits: int) -> UInt32:
+        """The hits of each ray, from its `start` on, by (key, Gaussian); indices of Gaussians have so many bits."""
         lib, count = self.lib, dr.width(start)
-        keys, index = dr.zeros(lib.UInt64, max(total, 1)), dr.zeros(lib.UInt32, max(total, 1))
-        own = lib.UInt64(dr.arange(lib.UInt32, count)) << 32
+        words = dr.zeros(lib.UInt64, max(total, 1))
+        own = lib.UInt64(dr.arange(lib.UInt32, count)) << (32 + bits)
 
         def write(k: UInt32, candidate: UInt32, key: Float, ok: Mask) -> None:
             # Keys are >= 0, where floats order like their bits.
-            dr.scatter(keys, own | lib.UInt64(dr.reinterpret_array(lib.UInt32, key)), start + k, ok)
-            dr.scatter(index, candidate, start + k, ok)
+            word = own | (lib.UInt64(dr.reinterpret_array(lib.UInt32, key)) << bits) | lib.UInt64(candidate)
+            dr.scatter(words, word, start + k, ok)
 
-        dr.eval(self._each_hit(ray, stream, count, write), keys, index)
-        # Sorts are stable: by index first, so that equal keys of a ray keep that order.
-        by_index = lib.UInt32(dr.argsort(index))
-        by_key = lib.UInt32(dr.argsort(dr.gather(lib.UInt64, keys, by_index)))
-        index = dr.gather(lib.UInt32, index, dr.gather(lib.UInt32, by_index, by_key))
+        dr.eval(self._each_hit(count, write), words)
+        index = lib.UInt32(dr.sort(words) & ((1 << bits) - 1))
         dr.eval(index, start)
         return index
 
-    def _each_hit(self, ray: Ray, stream: Stream, lanes: int, visit: Callable) -> UInt32:
+    def _each_hit(self, lanes: int, visit: Callable) -> UInt32:
         """Number of hits of every lane; `visit(number so far, Gaussian, key, is hit)` sees each candidate."""
-        lib = self.lib
+        lib, ray, stream = self.lib, self.rays[0], self.stream
 
         def body(s: Any, k: UInt32) -> tuple:
             candidate, valid, _, s = stream.next(s, lib.Bool(True))
@@ -168,7 +227,7 @@ class Part:
     def _in_order(self, kernel: Kernel) -> list[dict]:
         """Composite the candidates as they come."""
         lib, stream = self.lib, self.stream
-        states = [kernel.init(k, inside, [lib.UInt32(NOWHERE)]) for k, inside in enumerate(self.inside)]
+        states = [kernel.init(k, inside, lib.UInt32(NOWHERE)) for k, inside in enumerate(self.inside)]
         start = stream.begin()
 
         def body(s: Any, go: UInt32, states: list[dict]) -> tuple:
@@ -193,92 +252,74 @@ class Part:
 
     def _sorted(self, kernel: Kernel, check: bool) -> list[dict]:
         """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
-        lib, stream = self.lib, self.stream
-        F, U = lib.Float, lib.UInt32
-        # What a hit is known by: the Gaussian, and where weights are held its place in the list.
-        known = 1 if self.weights is None else 2
-        state = kernel.init(0, self.inside[0], [F(EMPTY), *(U(0) for _ in range(known))])
+        lib, stream, size = self.lib, self.stream, self.buffer
+        U, word = lib.UInt32, lib.Float64
+        state = kernel.init(0, self.inside[0], word(EMPTY))
         start = stream.begin()
-        keys, names = [F(EMPTY) for _ in range(BUFFER)], [[U(0) for _ in range(known)] for _ in range(BUFFER)]
 
-        def exchange(
-            enter: Float, name: list[UInt32], keys: list[Float], names: list[list[UInt32]], last: list, state: dict
-        ) -> tuple:
+        def exchange(enter: Float, buffer: list[Float], last: Float, state: dict) -> tuple:
             """Put a hit into the buffer and composite the one that leaves it."""
-            (key, at), keys, names = _push(enter, name, keys, names)
-            out = key != EMPTY
-            (state,) = kernel.shade(at[0], self.rays, [state], [[key, *at]], out)
-            return keys, names, [dr.select(out, key, last[0]), dr.select(out, at[0], last[1])], state
+            hit, buffer = _push(enter, buffer)
+            ok = (hit != EMPTY) & (hit < _BEHIND)
+            name = U(dr.reinterpret_array(lib.UInt64, hit) & 0xFFFFFFFF)
+            (state,) = kernel.shade(stream.named(name, ok), self.rays, [state], [[hit, name]], ok)
+            return buffer, dr.select(ok, hit, last), state
 
-        def body(
-            s: Any, go: UInt32, keys: list[Float], names: list[list[UInt32]], last: list, failed: UInt32, state: dict
-        ) -> tuple:
+        def body(s: Any, go: UInt32, buffer: list[Float], last: Float, failed: UInt32, state: dict) -> tuple:
             """Meet the next candidate; `last` left the buffer last, `failed` is 1 where a hit came too late."""
-            place = stream.place(s)
-            candidate, valid, bound, s = stream.next(s, lib.Bool(True))
+            before, there = s, stream.more(s)
+            candidate, valid, bound, s = stream.next(s, there)
             key, ok = self._probe(candidate, self.rays[0], valid)
+            hit = _word(lib, key, stream.name(before, candidate))
             if check:
-                failed = dr.select(ok & _less(key, candidate, *last), 1, failed)
-            enter = dr.select(ok & (state["alive"] != 0), key, EMPTY)
+                failed = dr.select(ok & (hit < last), 1, failed)
+            # When all have come, what is left in the buffer is pushed out.
+            alive = state["alive"] != 0
+            enter = dr.select(alive, dr.select(there, dr.select(ok, hit, EMPTY), _BEHIND), EMPTY)
             # Most candidates miss most packets of lanes: the branch skips the rest for these.
-            keys, names, last, state = dr.if_stmt(
-                (enter, [candidate, place][:known], keys, names, last, state),
-                enter != EMPTY,
-                exchange,
-                lambda _, __, *unchanged: unchanged,
+            buffer, last, state = dr.if_stmt(
+                (enter, buffer, last, state), enter != EMPTY, exchange, lambda _, *unchanged: unchanged
             )
-            going = state["alive"] != 0
+            alive, there = state["alive"] != 0, stream.more(s)
+            going = alive & (there | (buffer[0] < _BEHIND))
             if check:
-                going |= bound <= last[0]
-            return s, dr.select(stream.more(s) & going, U(1), 0), keys, names, last, failed, state
+                going |= there & (_word(lib, bound, U(0)) <= last)
+            return s, dr.select(going, U(1), 0), buffer, last, failed, state
 
         go = dr.select(stream.more(start) & (state["alive"] != 0), U(1), 0)
-        loop = (start, go, keys, names, [F(EMPTY), U(0)], U(0), state)
-        _, _, keys, names, _, failed, state = dr.while_loop(loop, lambda s, go, *_: go != 0, body)
+        loop = (start, go, [word(EMPTY)] * size, word(EMPTY), U(0), state)
+        *_, failed, state = dr.while_loop(loop, lambda s, go, *_: go != 0, body)
         self.failed = failed != 0
-        return [self._drain(kernel, keys, names, state)]
-
-    def _drain(self, kernel: Kernel, keys: list[Float], names: list[list[UInt32]], state: dict) -> dict:
-        """Composite what is left in the buffer."""
-        lib = self.lib
-
-        def body(j: UInt32, keys: list[Float], names: list[list[UInt32]], state: dict) -> tuple:
-            (state,) = kernel.shade(
-                names[0][0], self.rays, [state], [[keys[0], *names[0]]], (keys[0] != EMPTY) & (keys[0] < _LAST)
-            )
-            keys = [*keys[1:], lib.Float(_LAST)]
-            names = [*names[1:], [lib.UInt32(0) for _ in names[0]]]
-            return j + 1, keys, names, state
-
-        def cond(j: UInt32, keys: list[Float], names: list[list[UInt32]], state: dict) -> Mask:
-            return (j < BUFFER) & (state["alive"] != 0)
-
-        return dr.while_loop((lib.UInt32(0), keys, names, state), cond, body)[3]
+        return [state]
 
 
-def _less(key_a: Float, index_a: UInt32, key_b: Float, index_b: UInt32) -> Mask:
-    """(key, index) order."""
-    return (key_a < key_b) | ((key_a == key_b) & (index_a < index_b))
+def together(done: Iterable[tuple[Part, list[dict]]]) -> list[Family]:
+    """Each part side by side with those that walk rays of it again."""
+    groups: dict[Part, Family] = {}
+    for part, finals in done:
+        groups.setdefault(part.base or part, []).append((part, finals))
+    return list(groups.values())
 
 
-def _push(
-    key: Float, name: list[UInt32], keys: list[Float], names: list[list[UInt32]]
-) -> tuple[tuple[Float, list[UInt32]], list[Float], list[list[UInt32]]]:
-    """Insert into a buffer that ascends by (key, Gaussian) and take its smallest out; pushing EMPTY changes nothing.
+Family = list[tuple[Part, list[dict]]]
+"""Parts with the final states of their rays: one, and those that walk some of its rays again."""
 
-    A name begins with the Gaussian.
+
+def _word(lib: Lib, key: Float, name: UInt32) -> Float:
+    """A hit in one Float64 that orders like (key, name): positive floats order like their bits, and these are those of
+    the key before those of the name. Processors exchange floats faster than integers.
     """
-    keys, names = list(keys), list(names)
-    swap = _less(keys[0], names[0][0], key, name[0])
-    out = dr.select(swap, keys[0], key), _either(swap, names[0], name)
-    key, name = dr.select(swap, key, keys[0]), _either(swap, name, names[0])
-    for j in range(1, len(keys)):
-        swap = _less(keys[j], names[j][0], key, name[0])
-        keys[j - 1], names[j - 1] = dr.select(swap, keys[j], key), _either(swap, names[j], name)
-        key, name = dr.select(swap, key, keys[j]), _either(swap, name, names[j])
-    keys[-1], names[-1] = key, name
-    return out, keys, names
+    # Where the float32 is not normal the float64 would not be, and might become 0.
+    key = dr.select(key >= 0, dr.maximum(key, _LEAST), EMPTY)
+    bits = lib.UInt64(dr.reinterpret_array(lib.UInt32, key)) << 32
+    return dr.reinterpret_array(lib.Float64, bits | lib.UInt64(name))
 
 
-def _either(first: Mask, a: list[UInt32], b: list[UInt32]) -> list[UInt32]:
-    return [dr.select(first, x, y) for x, y in zip(a, b, strict=True)]
+def _push(hit: Float, buffer: list[Float]) -> tuple[Float, list[Float]]:
+    """Insert into an ascending buffer and take its smallest out; pushing EMPTY changes nothing."""
+    shifted = []
+    for old in buffer:
+        first = hit < old
+        shifted.append(dr.select(first, hit, old))
+        hit = dr.select(first, old, hit)
+    return shifted[0], [*shifted[1:], hit]

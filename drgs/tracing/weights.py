@@ -35,7 +35,6 @@ PIXELS = 64  # of a tile
 MATRIX = 128 << 20
 """Bytes of the weights that are held at once; more where the list of a single tile has more."""
 _WORK = 4 << 20  # bytes of the features of the entries that one product takes
-_UNSPLIT = 512  # entries (measured with MKL: 512 are summed by one thread of 16, 813 are not)
 _SLACK = 8  # tiles of one product: the most entries may be more than the fewest by 1/8, or by as many entries
 
 
@@ -59,8 +58,6 @@ class _Group:
         """(rows, Gaussians) of as many entries at a time as there is room for."""
         tiles, entries = self.rows.shape
         step = max(1, _WORK // (4 * width * tiles))
-        if tiles == 1:  # a longer sum of one product is split between threads, and rounds by their number
-            step = min(step, _UNSPLIT)
         for k in range(0, entries, step):
             yield self.rows[:, k : k + step].reshape(-1), self.index[:, k : k + step].reshape(-1)
 
@@ -71,16 +68,15 @@ class Weights:
     Args:
         index: (entries,) int32, Gaussians of the tiles' lists, one list behind the other.
         lengths: (T,) int64 of the lists.
-        first: Place of the first entry in the lists of the whole view.
         pixels: (T, 64) int64: row-major pixel, -1 outside of the image.
     Attributes:
         kept: A buffer that the adjoint may use again, or None.
     """
 
-    def __init__(self, lib: Lib, index: torch.Tensor, lengths: torch.Tensor, first: int, pixels: torch.Tensor) -> None:
+    def __init__(self, lib: Lib, index: torch.Tensor, lengths: torch.Tensor, pixels: torch.Tensor) -> None:
         self.lib, self.lengths, self.pixels, self.inside = lib, lengths, pixels.clamp_min(0), pixels >= 0
         self.index = torch.cat([index, index.new_zeros(1)])  # of the row that is 0, too
-        self.rows, self.first = len(index), dr.opaque(lib.UInt32, first)
+        self.rows = len(index)
         self.kept: Float | None = None
         self._groups: list[_Group] | None = None
         self._width = 0
@@ -182,8 +178,13 @@ class Weights:
             count = max(min(similar, _WORK // (4 * width * max(most, PIXELS))), 1)  # rows of features, or of pixels
             own, j = tiles[k : k + count], torch.arange(most, device=tiles.device)
             at = torch.where(j < counts[k : k + count, None], starts[own, None] + j, -1)  # -1: the row that is 0
-            rows = touched[at]
             inside = self.inside[own].view(-1)
+            if count == 1:
+                # A single product is split between threads, and rounds by their number; one of two is not. The other
+                # one is of nothing.
+                own, at = own.expand(2), torch.cat([at, torch.full_like(at, -1)])
+                inside = torch.cat([inside, torch.zeros_like(inside)])
+            rows = touched[at]
             index = self.index[rows].long()  # what int32 would take to add is twice the time
             self._groups.append(_Group(rows, index, self.pixels[own].view(-1), inside))
             k += count
@@ -205,7 +206,7 @@ def emit_weights(part: Part, buffer: Float | None, visibility: Float | None = No
 
     def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
         if buffer is not None:
-            dr.scatter(buffer, w, part.held(k, place), ok)
+            dr.scatter(buffer, w, part.slot(k, place), ok)
         if visibility is not None:
             dr.scatter_add(visibility, w, index, ok)
 

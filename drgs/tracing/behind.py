@@ -1,0 +1,158 @@
+"""What a walk in exact order knows about each hit, written down, for derivatives in the order of the list.
+
+Rays sort their hits each on their own, so that the lanes of a packet are at different Gaussians: each loads a record of
+its own, and adds to gradients of its own, atomically. But all that a derivative needs of the order are a few numbers a
+hit, the transmittance T in front of it and what lies behind it. One walk in exact order fills a table of these, for
+every entry of a tile's list and every pixel of the tile; the derivative then walks along the list, where a packet meets
+one Gaussian at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Protocol
+
+import drjit as dr
+
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Channels, HitModel, Ray
+    from drgs.tracing.walk import Family, Part
+
+__all__ = ["Replayed", "Table", "by_lists", "passed"]
+
+
+class Replayed(Protocol):
+    """A derivative that depends on the order by what lies in front of a hit and behind it.
+
+    Attributes:
+        m, channels: Of the primal pass.
+        finals: Per shared ray, its final state.
+    """
+
+    m: HitModel
+    channels: Channels
+    finals: list[dict]
+
+    def rest(self, k: int) -> list[Float]:
+        """Float64 sums along shared ray k, of which each hit takes its part."""
+
+    def terms(self, k: int, values: list[Float], depth: Float, place: list, ok: Mask) -> list[Float]:
+        """Of each sum, what a hit's weight is multiplied by; values: its channels."""
+
+
+class Table:
+    """T in front of every entry in every pixel, and what lies behind it per unit of transmittance; T = 0: no hit.
+
+    Args:
+        part: Rays in the order of the lists of tiles, by which it is read.
+        count: Of the numbers that say what lies behind.
+    """
+
+    def __init__(self, lib: Lib, part: Part, count: int) -> None:
+        assert part.slots is not None  # of a part along the lists of tiles
+        self.lib, self.part = lib, part
+        self.count = 1 << count.bit_length()  # numbers of a slot: so many are written at once
+        self.numbers, self.array = 1 + count, dr.zeros(lib.Float, self.count * part.slots.size)
+
+    def front(self, k: int, place: list, active: Mask) -> Float:
+        """T at a place of shared ray k, 0 where there is no hit."""
+        return dr.gather(self.lib.Float, self.array, self.count * self.part.slot(k, place), active)
+
+    def read(self, k: int, place: list, a: Float, active: Mask) -> tuple[Float, Float, list[Float], Mask]:
+        """Of a hit of opacity `a` on shared ray k: T, its weight, what lies behind it, and whether it is one."""
+        slot = self.part.slot(k, place)
+        T, *behind = dr.gather(self.lib.ArrayXf, self.array, slot, active, shape=(self.count, dr.width(slot)))
+        return T, T * a, behind[: self.numbers - 1], T > 0
+
+    def if_any_hit(
+        self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask, take: Callable
+    ) -> list[dict]:
+        """As `derivatives.if_any_hit`, without looking at the Gaussian."""
+        hits = self.lib.Bool(False)
+        for k, (st, place) in enumerate(zip(states, places, strict=True)):
+            hits |= self.front(k, place, active & (st["alive"] != 0)) > 0
+        return dr.if_stmt(
+            (states, index, rays, places, active),
+            hits,
+            lambda states, index, rays, places, active: take(index, rays, states, places, active),
+            lambda states, *_: states,
+        )
+
+
+def by_lists(
+    lib: Lib, family: Family, count: int | None, kernel: Callable[[Part, list[dict]], Replayed]
+) -> Iterator[tuple[Part, list[dict], Table | None]]:
+    """What a derivative walks of a part and of what of it is walked again: rays with their final states; in place of
+    all that are sorted one by one along the lists of tiles, the order of these lists, with a table.
+
+    Args:
+        group: Of `walk.together`.
+        count: Of the numbers that say what lies behind a hit; None: no table, all rays as they are.
+        kernel: Part, final states -> what says how these numbers are summed up.
+    """
+    table = None
+    for part, finals in family:
+        if count is None or not part.ordered or part.slots is None:
+            yield part, finals, None
+            continue
+        table = table or Table(lib, (part.base or part).in_lists(), count)
+        dr.eval(part.run(Behind(kernel(part, finals), part, table)), table.array)
+    if table is not None:
+        yield table.part, [], table
+
+
+class Behind:
+    """Replay of a primal pass in exact order that fills a table.
+
+    Args:
+        kernel: Takes the derivative afterwards; says what is summed up along a ray.
+        part: Whose rays they are, in the table's tiles.
+    """
+
+    def __init__(self, kernel: Replayed, part: Part, table: Table) -> None:
+        self.kernel, self.part, self.table, self.m = kernel, part, table, kernel.m
+
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
+        """State of a ray: what is left of each sum behind the last hit."""
+        alive = alive & (self.kernel.finals[k]["place"] != nowhere)
+        return {
+            "T": self.m.lib.Float(1),
+            "rest": self.kernel.rest(k),
+            "alive": dr.select(alive, self.m.lib.UInt32(1), 0),
+        }
+
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
+        """One hit."""
+        kernel, table = self.kernel, self.table
+        (ray,), (st,), (place,) = rays, states, places
+        going = active & (st["alive"] != 0)
+        loaded: Any = kernel.channels.load(self.m.lib, index, ray, going)
+        a, depth, ok = self.m.hit(loaded["record"], ray, going)
+        terms = kernel.terms(0, kernel.channels.values(self.m, loaded, ray), depth, place, ok)
+        T, _, behind, new = passed(kernel.finals[0], st, a, terms, place, ok)
+        numbers = [T, *behind, *[self.m.lib.Float(0)] * (table.count - table.numbers)]
+        dr.scatter(table.array, self.m.lib.ArrayXf(numbers), self.part.slot(0, place), ok)
+        return [new]
+
+
+def passed(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok: Mask) -> tuple:
+    """A hit of opacity `a` replayed: T in front of it, its weight, what lies behind it and the new state of the ray.
+
+    Args:
+        final: State of the ray after the primal pass.
+        st: State with `T`, `alive` and `rest`, a Float64 for each term.
+        terms: Of each sum along the ray, what the hit's weight is multiplied by.
+    """
+    T, left, new, wide = st["T"], 1 - a, dict(st), dr.float64_array_t(a)
+    w = dr.select(ok, T * a, 0)
+    rest = [r - wide(w) * wide(term) for r, term in zip(st["rest"], terms, strict=True)]
+    # Behind an a that rounds to 1 nothing was composited: there is no rest to share out.
+    share = dr.select(left > 0, dr.rcp(dr.select(left > 0, left, 1)), 0)
+    behind = [type(a)(r) * share for r in rest]
+    new["T"] = dr.select(ok, T * left, T)
+    new["rest"] = [dr.select(ok, x, y) for x, y in zip(rest, st["rest"], strict=True)]
+    # The last composited hit ends the ray, whatever rule ended the primal pass.
+    new["alive"] = dr.select(ok & (place[0] == final["place"]), 0, st["alive"])
+    return T, w, behind, new
