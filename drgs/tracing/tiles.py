@@ -224,7 +224,7 @@ def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, 
         )
     pairs = int(total64)
     what = f"{pairs} entries of tile lists ({count} Gaussians, {width}x{height} pixels)"
-    each = memory.PAIR + memory.BLOCKS * exact
+    each = memory.PAIR + memory.ORDERED * exact
     memory.require("render", each * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
     start, end = dr.zeros(lib.UInt32, columns * rows), dr.zeros(lib.UInt32, columns * rows)
     none, ends = dr.zeros(lib.UInt32, 1), dr.zeros(lib.UInt32, 4 * columns * rows)
@@ -296,18 +296,19 @@ def _blocks(
     depth = dr.clip(dr.reinterpret_array(lib.UInt32, tiles.depth(dx, dy)), near, far)
     rank = lib.UInt32(lib.Float(depth - near) * (float((1 << bits) - 1) / dr.maximum(lib.Float(far - near), 1)))
     key = ((4 * own + corner) << bits) | dr.minimum(rank, (1 << bits) - 1)
-    kept = dr.compress(tiles.may_hit(dx, dy))
+    kept = dr.compress(dr.full(lib.Bool, True, dr.width(lane)) & tiles.may_hit(dx, dy))
+    start, end = (dr.zeros(lib.UInt32, 4 * lists.columns * lists.rows) for _ in range(2))
+    if dr.width(kept) == 0:
+        return BlockLists(dr.zeros(lib.UInt32, 1), dr.zeros(lib.UInt32, 1), start, end, dr.zeros(lib.Float, 1))
     key, place = dr.gather(lib.UInt32, key, kept), kept // 4
     dr.eval(key, place)
     order = dr.argsort(key)
     place, block = dr.gather(lib.UInt32, place, order), dr.gather(lib.UInt32, key, order) >> bits
     index = dr.gather(lib.UInt32, lists.index, place)
-    start, end = (dr.zeros(lib.UInt32, 4 * lists.columns * lists.rows) for _ in range(2))
     ahead = dr.gather(lib.Float, lower, index)
     dr.eval(place, block, index, ahead)
-    if dr.width(place):
-        _ranges(lib, block, start, end)
-        ahead = _suffix_minimum(lib, ahead, start, end)
+    _ranges(lib, block, start, end)
+    ahead = _suffix_minimum(lib, ahead, start, end)
     return BlockLists(index, place, start, end, ahead)
 
 
