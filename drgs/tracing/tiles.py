@@ -29,7 +29,7 @@ __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 
 TILE = 8
 TABLES = 128 << 20
-"""Bytes of the tables that a derivative in exact order fills at once; more where the list of a single tile has more."""
+"""Bytes of a table that the adjoint fills in exact order (information: twice that); a single tile's may have more."""
 _BLOCK = 4  # pixels of a block's edge: four blocks are a tile
 _FAR = 3.0e38
 _NOWHERE = 2**64 - 1
