@@ -88,7 +88,7 @@ def by_lists(
     all that are sorted one by one along the lists of tiles, the order of these lists, with a table.
 
     Args:
-        group: Of `walk.together`.
+        family: Of `walk.together`.
         count: Of the numbers that say what lies behind a hit; None: no table, all rays as they are.
         kernel: Part, final states -> what says how these numbers are summed up.
     """
@@ -109,6 +109,7 @@ class Behind:
     Args:
         kernel: Takes the derivative afterwards; says what is summed up along a ray.
         part: Whose rays they are, in the table's tiles.
+        table: That is filled.
     """
 
     def __init__(self, kernel: Replayed, part: Part, table: Table) -> None:

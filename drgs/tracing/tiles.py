@@ -327,6 +327,7 @@ class _Tiles:
 
     Args:
         loaded: The first entries of each lane's record.
+        size: Pixels of a tile's edge, or of a block's.
     """
 
     def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], size: int = TILE) -> None:
@@ -340,10 +341,9 @@ class _Tiles:
 
     def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
         """Of tile (x, y), from the anchor."""
-        r = self.r
-        return (self.lib.Float(x) + 0.5) * self.size - r[layout.AX], (self.lib.Float(y) + 0.5) * self.size - r[
-            layout.AY
-        ]
+        at = (self.lib.Float(v) + 0.5 for v in (x, y))
+        dx, dy = (v * self.size - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
+        return dx, dy
 
     def depth(self, dx: Float, dy: Float) -> Float:
         """t* there, at least 0: orders the list, decides nothing."""
