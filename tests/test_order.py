@@ -1,4 +1,4 @@
-"""Exact order on tiles: what its three passes, its tables and its words must not change."""
+"""Exact order: what its passes, rows, tables and words must not change."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 from scenes_random import Oracle, camera, compare, gaussians, relative
-from test_tiles import _scene
 
 from drgs import fisher, reference, runtime
 from drgs.integrator import render
 from drgs.settings import RenderSettings
-from drgs.tracing import tiles, walk
-from drgs.tracing.tiles import TILE
+from drgs.tracing import rows, tiles, walk, words
+from drgs.tracing.bridge import to_drjit
+from drgs.tracing.call import Call
 
 EXACT = RenderSettings.preset("exact")
+RAYS = EXACT.replace(traversal="bvh")
 
 
 def shallow(monkeypatch):
@@ -33,7 +34,7 @@ def test_rays_walked_three_times(rng, monkeypatch, response, width):
     shallow(monkeypatch)
     lists, kinds = walk.Part._listed, []
     monkeypatch.setattr(walk.Part, "_listed", lambda part, count: kinds.append(count) or lists(part, count))
-    settings = EXACT.replace(response=response, background=(0.2, 0.5, 0.9))
+    settings = RAYS.replace(response=response, background=(0.2, 0.5, 0.9))
     cam, g = camera(rng, (19, 13)), gaussians(rng, 30, 4, width, scale=0.3, opacity=3.0)
     errors = compare(g, cam, settings, Oracle(g, cam, settings, rng))
     assert errors.finite
@@ -46,7 +47,7 @@ def test_rays_walked_three_times(rng, monkeypatch, response, width):
 @pytest.mark.parametrize("direction", ["gaussian", "ray"])
 def test_information_of_rays_walked_three_times(rng, monkeypatch, direction):
     """Diagonal, blocks and variance map against the oracle's dense Jacobian."""
-    settings = EXACT.replace(background=(0.2, 0.5, 0.9), sh_direction=direction)
+    settings = RAYS.replace(background=(0.2, 0.5, 0.9), sh_direction=direction)
     g, cam, out = dense.scene(rng, settings, n=14)
     J = dense.jacobian(g, out)
     truth, rows = dense.squares(J), dense.stacked(J)
@@ -62,10 +63,10 @@ def test_information_of_rays_walked_three_times(rng, monkeypatch, direction):
 
 @pytest.mark.parametrize("width", [0, 3])
 def test_tables_of_few_tiles(rng, monkeypatch, width):
-    """Derivatives whose tables are filled for a few tiles at a time are the same."""
+    """Derivatives whose tables are filled for a few tiles at a time are the same, whatever orders are held."""
     cam, g = camera(rng, (37, 29)), gaussians(rng, 40, 4, width, scale=0.2)
     v = torch.tensor(rng.normal(size=(29, 37, 3)))
-    found, parts = [], []
+    found, parts, room = [], [], tiles._HELD
     bands = tiles.TileTraversal._bands
 
     def noted(view, *args):
@@ -74,51 +75,107 @@ def test_tables_of_few_tiles(rng, monkeypatch, width):
         return iter(made)
 
     monkeypatch.setattr(tiles.TileTraversal, "_bands", noted)
-    for size in (tiles.TABLES, 60 << 10):
+    for size, held in ((tiles.TABLES, room), (60 << 10, room), (60 << 10, 0), (60 << 10, 9000)):
         monkeypatch.setattr(tiles, "TABLES", size)
+        monkeypatch.setattr(tiles, "_HELD", held)
         leaves = {name: x.clone().requires_grad_() for name, x in g.detach().parameters().items()}
         out = render(g.detach().replace(**leaves), cam, EXACT)
         ((out.rgb * v).sum() + (out.features.sum() if width else 0)).backward()
         found.append({name: x.grad for name, x in leaves.items()} | fisher.diagonal(g.detach(), cam, EXACT))
     assert parts[0][0] == 1
     assert parts[-1][0] > 2
-    for name, x in found[0].items():
-        assert relative(found[1][name].double(), x.double()) < 1e-5, name
+    for other in found[1:]:
+        assert all(relative(other[name].double(), x.double()) < 1e-5 for name, x in found[0].items())
 
 
-def test_words(rng):
+def test_words_of_hits(rng):
     """A hit's word orders like its key, then like its name, at any key that a hit can have."""
     lib = runtime.dr_types()
     keys = np.concatenate([[0.0, 1e-45, 1e-39, 1.3e-38, 1e-30, 1.0, np.nextafter(np.float32(1), np.float32(2)), 3e38]])
     keys = np.concatenate([keys, rng.lognormal(0, 20, 200)]).astype(np.float32)
     names = np.array([0, 1, 5, 2**31, 2**32 - 1], dtype=np.uint32)
     key, name = (x.ravel() for x in np.meshgrid(keys, names, indexing="ij"))
-    word = walk._word(lib, lib.Float(key), lib.UInt32(name))
+    word = words.word_of(lib, lib.Float(key), lib.UInt32(name))
     normal = np.maximum(key, np.float32(1.2e-38))  # below, keys are all one
     assert (np.argsort(word.numpy(), kind="stable") == np.lexsort((name, normal))).all()
-    assert (word.numpy() > walk.EMPTY).all()
-    assert (word.numpy() < walk._BEHIND).all()
-    assert dr.all(walk._word(lib, lib.Float(walk.EMPTY), lib.UInt32(0)) < 0)
+    assert (word.numpy() > words.EMPTY).all()
+    assert (word.numpy() < words.BEYOND).all()
+    assert (words.name_of(lib, word).numpy() == name).all()
+    assert dr.all(words.word_of(lib, lib.Float(words.EMPTY), lib.UInt32(0)) < 0)
 
 
-def test_blocks_list_every_hit(rng):
-    """What the oracle finds at a pixel is in the list of its block, which orders by t* in its middle."""
-    cam, g = camera(rng, (37, 21)), gaussians(rng, 25, 1, anisotropy=1.2).detach()
-    _, lists = _scene(g, cam, EXACT)
-    index, place, start, end = (getattr(lists.blocks, name).numpy() for name in ("index", "place", "start", "end"))
-    assert (lists.index.numpy()[place] == index).all()
-    for tile in range(lists.columns * lists.rows):
-        own = lists.index.numpy()[lists.start.numpy()[tile] : lists.end.numpy()[tile]]
-        assert (np.diff(own) > 0).all()  # in the order of indices: names of hits with the same key
-        at = np.concatenate([place[start[4 * tile + k] : end[4 * tile + k]] for k in range(4)])
-        assert ((at >= lists.start.numpy()[tile]) & (at < lists.end.numpy()[tile])).all()
-    assert len(index) < 4 * lists.pairs  # not every block of a tile
-    extent = (2 * torch.log((g.opacities.double() * 25 / 1e-5).clamp(min=1))).sqrt()
+@pytest.mark.parametrize("held", [0, 1 << 20])
+def test_rows_have_every_hit_in_order(rng, monkeypatch, held):
+    """What the oracle finds at a pixel, one Gaussian at a time, is in its row, once, by (t*, index)."""
+    monkeypatch.setattr(tiles, "_HELD", held)
+    cam, g, lib = camera(rng, (21, 13)), gaussians(rng, 25, 1, anisotropy=1.2).detach(), runtime.dr_types()
+    for x in g.parameters().values():
+        x[20:23] = x[20].clone()  # what has the same key goes by the index
+    settings = EXACT.replace(extent=3.5)
+    call = Call(g, cam, settings, frozenset())
+    compositor, arguments = call.prepare({name: to_drjit(lib, x) for name, x in call.inputs.items()})
+    compositor.forward(*arguments, keep=True)
+    (part,) = compositor.parts
+    stream = part.stream.opened()
+    assert (part.stream.held is stream) == bool(held)
+    hits, start, end = (x.numpy() for x in (stream.hits, stream.start, stream.end))
+    entries = hits if held else words.name_of(lib, stream.hits).numpy()
+    listed, found = compositor.traversal.lists.index.numpy(), {}
+    for pixel, a, b in zip(part.flat[0].numpy(), start, end, strict=True):
+        if a < b:
+            found[int(pixel)] = listed[entries[a:b]].tolist()
+    true: dict = {}
     for i in range(len(g)):
-        one = reference.render(g.take([i]), cam, EXACT.replace(extent=max(float(extent[i]), 1e-3)))
-        for y, x in ((one.count > 0) & (one.alpha > 1e-12)).nonzero().tolist():
-            tile, inner = (y // TILE) * lists.columns + x // TILE, y % TILE // 4 * 2 + x % TILE // 4
-            assert i in index[start[4 * tile + inner] : end[4 * tile + inner]]
+        one = reference.render(g.take([i]), cam, settings)
+        for y, x in (one.count > 0).nonzero().tolist():
+            true.setdefault(y * cam.width + x, []).append((one.depth[y, x].item(), i))
+    assert {pixel: sorted(row) for pixel, row in found.items()} == {p: sorted(i for _, i in r) for p, r in true.items()}
+    depths = {pixel: {i: depth for depth, i in row} for pixel, row in true.items()}
+    for pixel, row in found.items():
+        along = [depths[pixel][i] for i in row]
+        assert all(b - a > -1e-5 * b for a, b in zip(along, along[1:], strict=False))
+        together = [i for i in row if 20 <= i < 23]
+        assert together == sorted(together)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_both_ways_to_sort_rows(rng, monkeypatch, threads):
+    """By tile, as processors do it, and all at once, as CUDA does."""
+    monkeypatch.setattr(rows, "_TILES", 2)
+    lengths = torch.tensor([3, 0, 7, 1, 0, 12])
+    counts = torch.stack([torch.from_numpy(rng.integers(0, n + 1, 64)) for n in lengths.tolist()])
+    flat, expected = [], []
+    for n, own in zip(lengths.tolist(), counts.tolist(), strict=True):
+        for count in own:
+            row = rng.lognormal(0, 9, count)
+            flat += [*row, *[words.BEYOND] * (n - count)]
+            expected += [*sorted(row), *[words.BEYOND] * (n - count)]
+    flat.append(words.BEYOND)  # buffers have one tile's slots more than they need
+    one, other = (torch.tensor(flat, dtype=torch.float64) for _ in range(2))
+    rows._sort_by_tile(one, lengths, counts, threads)
+    rows._sort_at_once(other, lengths)
+    assert one[:-1].tolist() == expected
+    assert other[:-1].tolist() == expected
+
+
+def test_tails_left_out_of_tiles(rng, monkeypatch):
+    """Where a tile lists few of N, tails are left out; derivatives of what is left agree with the oracle."""
+    cam, g = camera(rng, (40, 32)), gaussians(rng, 3000, 1, 3, scale=0.01, opacity=1.0).detach()
+    v = torch.tensor(rng.normal(size=(32, 40, 3)))
+    leaves = {name: x.clone().requires_grad_() for name, x in g.parameters().items()}
+    short, whole = render(g.replace(**leaves), cam, EXACT, outputs=()), render(g, cam, EXACT)
+    assert short.certificate["pairs"] < whole.certificate["pairs"]  # a depth and a count are of every hit
+    oracle = reference.render(g.replace(**leaves), cam, EXACT)
+    for name in ("rgb", "alpha", "features"):
+        assert float((getattr(short, name) - getattr(oracle, name)).abs().max()) < 5e-6 + 1e-6, name
+    loss = lambda out: (out.rgb * v).sum() + (out.features * v).sum()  # noqa: E731
+    found, true = (torch.autograd.grad(loss(out), leaves.values()) for out in (short, oracle))
+    for name, x, y in zip(leaves, found, true, strict=True):
+        assert relative(x.double(), y.double()) < 1e-4, name
+    diagonal = fisher.diagonal(g, cam, EXACT)
+    monkeypatch.setattr(tiles, "_TAILS", 1e-30)
+    for name, x in fisher.diagonal(g, cam, EXACT).items():
+        assert relative(diagonal[name].double(), x.double()) < 1e-5, name
 
 
 def test_many_rays_in_lists_of_their_own(rng, monkeypatch):
@@ -126,5 +183,6 @@ def test_many_rays_in_lists_of_their_own(rng, monkeypatch):
     monkeypatch.setattr(walk, "BUFFER", 2)
     monkeypatch.setattr(walk, "_WORD", 32 - 28)  # bits: 16 lanes of 1 Gaussian
     cam, g = camera(rng, (19, 13)), gaussians(rng, 6, 1, scale=0.4).detach()
-    out = render(g, cam, EXACT)
-    assert relative(out.rgb.double(), reference.render(g, cam, EXACT).rgb) < 1e-5
+    out = render(g, cam, RAYS)
+    assert out.certificate["redone"] > 4
+    assert relative(out.rgb.double(), reference.render(g, cam, RAYS).rgb) < 1e-5

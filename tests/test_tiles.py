@@ -96,28 +96,6 @@ def test_order(rng):
         assert entries == sorted(entries, key=lambda i: (key[i], i))
 
 
-def test_nothing_ahead_of_the_bound(rng):
-    """`ray` order: no hit of an entry or a later one is nearer than the entry's bound."""
-    cam = camera(rng, (24, 16))
-    g = around_camera(gaussians(rng, 30, 1, scale=0.3), cam).detach()
-    settings = RenderSettings(order="ray", extent=3.0)
-    _, lists = _scene(g, cam, settings)
-    ahead, start, end, index = (getattr(lists.blocks, name).numpy() for name in ("ahead", "start", "end", "index"))
-    nearest = {}
-    for i in range(len(g)):
-        one = reference.render(g.take([i]), cam, settings)
-        for y, x in (one.count > 0).nonzero().tolist():
-            nearest[i, x, y] = float(one.depth[y, x])
-    columns = -(-24 // TILE)
-    for block in range(len(start)):
-        tile, entries = block // 4, index[start[block] : end[block]].tolist()
-        x0, y0 = (tile % columns) * TILE + block % 2 * 4, (tile // columns) * TILE + block % 4 // 2 * 4
-        pixels = [(x, y) for x in range(x0, x0 + 4) for y in range(y0, y0 + 4)]
-        for k in range(len(entries)):
-            later = [nearest.get((i, x, y), math.inf) for i in entries[k:] for x, y in pixels]
-            assert ahead[start[block] + k] <= min(later) * (1 + 1e-6)
-
-
 def test_nothing_listed(rng):
     """All Gaussians behind the camera or off the screen: empty lists, a black image."""
     cam, g = camera(rng, (9, 7)), gaussians(rng, 12, 1)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["ORDERED", "PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "require"]
+__all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "require"]
 
 # Measured: what a frame of 1024^2 to 4096^2 pixels adds to the resident set of a fresh process (LLVM, one thread; rgb,
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
@@ -23,8 +23,6 @@ TANGENT = 70
 """Bytes a pixel that each column of forward mode adds (measured with six: 73)."""
 PAIR = 24
 """Bytes an entry of the tile lists takes while they are made: keys, their sorted copy, and the sort's own."""
-ORDERED = 32
-"""Bytes more in exact order: a key for each of the four blocks of its tile."""
 _MEMINFO, _GROUP_OF, _GROUPS = Path("/proc/meminfo"), Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 _OTHER = 256 << 20  # kernels, tensors of the Gaussians and whatever else a command holds
 _SMALL = 256 << 20  # of what needs less, nobody asks: looking costs more than it is worth

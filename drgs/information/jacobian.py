@@ -147,7 +147,7 @@ class Rows:
                 terms = self.terms(k, color, depth, place, ok)
                 T, w, behind, new = passed(self.finals[k], st, a, terms, place, ok)
             else:
-                T, w, behind, ok = self.table.read(k, place, a, active & (st["alive"] != 0))
+                T, w, behind, ok = self.table.read(place, a)
                 new = dict(st)
             slopes = g = turned = None
             if extra:

@@ -17,7 +17,6 @@ from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.pose import quaternion_product
 from drgs.tracing.protocols import Float
-from drgs.tracing.walk import together
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -177,11 +176,10 @@ class Replay:
                 assert features is not None  # only the first slice may be none at all
                 channels, done = compositor.again(to_drjit(self.lib, features.reshape(-1)).array, count)
             numbers = channels.outputs if self.extras is not None else 0
-            kernel = functools.partial(self._rows, channels)
+            kernel, tabled = functools.partial(self._rows, channels), None if numbers > _TABLED else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
-            for group in together(done):
-                for part, finals, table in by_lists(self.lib, group, None if numbers > _TABLED else numbers, kernel):
-                    yield Walk(number == 0, own, channels, part, finals, table)
+            for at in done:
+                yield Walk(number == 0, own, channels, *by_lists(self.lib, *at, tabled, kernel))
 
     def _rows(
         self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
@@ -202,8 +200,7 @@ class Replay:
         """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks."""
         total = torch.zeros(self.count, width, dtype=torch.float64)
         for walk in self._walks(weights):
-            # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
-            sink = sink_of(walk, dr.ReduceMode.Direct if walk.part.ordered else dr.ReduceMode.Local)
+            sink = sink_of(walk, walk.part.reduction)
             dr.eval(self._replay(walk, sink), sink.buffer)
             found = _torch(sink.buffer).reshape(self.count, -1)
             total[:, : found.shape[1]] += found

@@ -9,7 +9,7 @@ one Gaussian at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
@@ -18,7 +18,7 @@ from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 
 if TYPE_CHECKING:
     from drgs.tracing.kernels import Channels, HitModel, Ray
-    from drgs.tracing.walk import Family, Part
+    from drgs.tracing.walk import Part
 
 __all__ = ["Replayed", "Table", "by_lists", "passed"]
 
@@ -56,14 +56,16 @@ class Table:
         self.count = 1 << count.bit_length()  # numbers of a slot: so many are written at once
         self.numbers, self.array = 1 + count, dr.zeros(lib.Float, self.count * part.slots.size)
 
-    def front(self, k: int, place: list, active: Mask) -> Float:
-        """T at a place of shared ray k, 0 where there is no hit."""
-        return dr.gather(self.lib.Float, self.array, self.count * self.part.slot(k, place), active)
-
-    def read(self, k: int, place: list, a: Float, active: Mask) -> tuple[Float, Float, list[Float], Mask]:
-        """Of a hit of opacity `a` on shared ray k: T, its weight, what lies behind it, and whether it is one."""
+    def load(self, k: int, place: list, active: Mask) -> list[Float]:
+        """T at a place of shared ray k, 0 where there is no hit, and what lies behind it."""
         slot = self.part.slot(k, place)
-        T, *behind = dr.gather(self.lib.ArrayXf, self.array, slot, active, shape=(self.count, dr.width(slot)))
+        return list(dr.gather(self.lib.ArrayXf, self.array, slot, active, shape=(self.count, dr.width(slot))))
+
+    def read(self, place: list, a: Float) -> tuple[Float, Float, list[Float], Mask]:
+        """Of a hit of opacity `a` whose place begins with what was loaded: T, its weight, what lies behind it, and
+        whether it is one.
+        """
+        T, *behind = place[0]
         return T, T * a, behind[: self.numbers - 1], T > 0
 
     def if_any_hit(
@@ -71,8 +73,12 @@ class Table:
     ) -> list[dict]:
         """As `derivatives.if_any_hit`, without looking at the Gaussian."""
         hits = self.lib.Bool(False)
+        loaded = []
         for k, (st, place) in enumerate(zip(states, places, strict=True)):
-            hits |= self.front(k, place, active & (st["alive"] != 0)) > 0
+            numbers = self.load(k, place, active & (st["alive"] != 0))
+            hits |= numbers[0] > 0
+            loaded.append([numbers, *place])
+        places = loaded
         return dr.if_stmt(
             (states, index, rays, places, active),
             hits,
@@ -82,25 +88,20 @@ class Table:
 
 
 def by_lists(
-    lib: Lib, family: Family, count: int | None, kernel: Callable[[Part, list[dict]], Replayed]
-) -> Iterator[tuple[Part, list[dict], Table | None]]:
-    """What a derivative walks of a part and of what of it is walked again: rays with their final states; in place of
-    all that are sorted one by one along the lists of tiles, the order of these lists, with a table.
+    lib: Lib, part: Part, finals: list[dict], count: int | None, kernel: Callable[[Part, list[dict]], Replayed]
+) -> tuple[Part, list[dict], Table | None]:
+    """What a derivative walks of a part: its rays with their final states; in place of rays along rows of their own
+    hits the same ones along the lists of tiles, with a table.
 
     Args:
-        family: Of `walk.together`.
         count: Of the numbers that say what lies behind a hit; None: no table, all rays as they are.
         kernel: Part, final states -> what says how these numbers are summed up.
     """
-    table = None
-    for part, finals in family:
-        if count is None or not part.ordered or part.slots is None:
-            yield part, finals, None
-            continue
-        table = table or Table(lib, (part.base or part).in_lists(), count)
-        dr.eval(part.run(Behind(kernel(part, finals), part, table)), table.array)
-    if table is not None:
-        yield table.part, [], table
+    if count is None or part.in_lists is None:
+        return part, finals, None
+    table = Table(lib, part.in_lists(), count)
+    dr.eval(part.run(Behind(kernel(part, finals), part, table)), table.array)
+    return table.part, [], table
 
 
 class Behind:

@@ -33,7 +33,8 @@ from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.projection import Projected
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.tiles import depth_order
-from drgs.tracing.walk import EMPTY, Part
+from drgs.tracing.walk import Part
+from drgs.tracing.words import EMPTY
 
 __all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 
@@ -58,7 +59,7 @@ class BvhTraversal:
         self.lib, self.settings, self.projected, self.rays = lib, settings, projected, rays
         self.certificate: dict = {}
 
-    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int) -> None:
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
         """Build the proxies, and find the order of the rays."""
         self.model, self.records, self.carried, self.basis = model, records, carried, basis
         lib, s = self.lib, self.settings
@@ -268,6 +269,10 @@ class _ProxyStream:
             size = dr.maximum(dr.maximum(abs(self.o[0]), abs(self.o[1])), abs(self.o[2]))
             self.step = _STEP * dr.maximum(size, proxies.scale)
 
+    def opened(self) -> _ProxyStream:
+        """Itself."""
+        return self
+
     def begin(self) -> tuple:
         """(candidates so far, parameter, step, primitive, next member, end of members, something left)."""
         lib, p = self.lib, self.proxies
@@ -293,28 +298,16 @@ class _ProxyStream:
         """Whether the ray goes on."""
         return s[6] != 0
 
-    def place(self, s: tuple) -> UInt32:
-        """The number of candidates before."""
-        return s[0]
-
-    def name(self, s: tuple, candidate: UInt32) -> UInt32:
-        """The Gaussian itself."""
-        return candidate
-
-    def named(self, name: UInt32, active: Mask) -> UInt32:
-        """Likewise."""
-        return name
-
     def of(self, lanes: UInt32) -> _ProxyStream:
         """The same for some of the rays."""
         carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]
         return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.bounded)
 
-    def next(self, s: tuple, active: Mask) -> tuple[UInt32, Mask, Float, tuple]:
+    def next(self, s: tuple, active: Mask) -> tuple[UInt32, Mask, list, Float, tuple]:
         """One member of the current primitive, or the next primitive (whose members follow)."""
         lib, p, mi = self.lib, self.proxies, self.mi
         if p is None:
-            return lib.UInt32(0), lib.Bool(False), lib.Float(EMPTY), s
+            return lib.UInt32(0), lib.Bool(False), [s[0]], lib.Float(EMPTY), s
         count, at, step, last, member, end, some = s
         inside = member < end
         trace = active & ~inside & (some != 0)
@@ -346,7 +339,7 @@ class _ProxyStream:
             # Listed ones come first, whatever their keys. The factor is the rounding of entries.
             bound = dr.select(last == 0xFFFFFFFF, EMPTY, dr.maximum(self.start + entry, 0) * (1 - 1e-4))
         member = dr.select(valid, member + 1, member)
-        return index, valid, bound, (count + 1, at, step, last, member, end, some)
+        return index, valid, [count], bound, (count + 1, at, step, last, member, end, some)
 
 
 def _coherent(lib: Lib, rays: list[Float]) -> UInt32:

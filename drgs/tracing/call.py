@@ -193,7 +193,9 @@ class Call:
             K, size = self.camera.K, (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
             projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, coefficients)
-            traversal = TileTraversal(lib, s, projected, pinhole, *size)
+            # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
+            trimmed = not self.want & {"depth", "count"}
+            traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed)
         basis, carried = self._carried(p, along_ray, traversal.world)
         compositor = Compositor(lib, s, traversal, self.want, self.width, basis, self.couple)
         sh = lib.Float(p["sh"]) if along_ray else None

@@ -19,7 +19,7 @@ from drgs.tracing.derivatives import Adjoint, Tangent
 from drgs.tracing.kernels import Channels, HitModel, Primal
 from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
-from drgs.tracing.walk import Family, Part, together
+from drgs.tracing.walk import Part
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, emit_weights, in_rows, without_graph
 
 __all__ = ["CHUNK", "Compositor"]
@@ -96,7 +96,7 @@ class Compositor:
         if features is not None:
             self.buffers["features"] = features
         dr.eval(self.buffers, carried)
-        view.start(self.model, self.buffers["record"], carried, self.basis)
+        view.start(self.model, self.buffers["record"], carried, self.basis, keep)
         self.certificate.update(view.certificate)
         self.passes = [self._channels(0, self.beside, color=True)]
         chunks = range(self.beside, self.width, CHUNK)
@@ -194,10 +194,8 @@ class Compositor:
         part.inside = [part.inside[0] & ~failed]
         dr.eval(part.inside)
         self.certificate["rays"] = self.rays
-        if part.base is None:  # those walked a third time are among them
+        if part.first:  # those walked a third time are among them
             self.certificate["redone"] = self.certificate.get("redone", 0) + dr.width(again)
-        if part.weights is not None and dr.width(again):
-            part.weights.skip(dr.gather(self.lib.UInt32, part.flat[0], again))
         return part.again(again)
 
     @property
@@ -235,9 +233,9 @@ class Compositor:
         dr.eval(g)
         slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
-            for group in together(done):
+            for part, finals in done:
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
-                    self._adjoint(g, channels, group, grads, carried, slopes)
+                    self._adjoint(g, channels, part, finals, grads, carried, slopes)
         if slopes is not None:
             grads["features"] += lib.Float(slopes.view(-1))
         i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
@@ -250,36 +248,36 @@ class Compositor:
         return grads | ({"carried": carried} if carried else {})
 
     def _adjoint(
-        self, g: dict, channels: Channels, group: Family, grads: dict, carried: list[Float], slopes: torch.Tensor | None
+        self,
+        g: dict,
+        channels: Channels,
+        part: Part,
+        finals: list[dict],
+        grads: dict,
+        carried: list[Float],
+        slopes: torch.Tensor | None,
     ) -> None:
-        """Of a part and of what of it is walked again: add to `grads`, `carried` and the `slopes` of features."""
-        depth, shared, of = "depth" in self.want and channels.color, None, {}
-        for part, _ in group:
-            of[part] = [self._cotangent(g, channels, *at) for at in zip(part.flat, part.inside, strict=True)]
-            if part.weights is not None and slopes is not None:  # the first part only
-                shared = self._products(part, part.weights, in_rows(g["features"], self.width), slopes, of[part])
+        """Of a part: add to `grads`, `carried` and the `slopes` of features."""
+        depth, shared = "depth" in self.want and channels.color, None
+        cotangents = self._cotangents(g, channels, part)
+        if part.weights is not None and slopes is not None:
+            shared = self._products(part, part.weights, in_rows(g["features"], self.width), slopes, cotangents)
+        if channels.channels and not self.couple:
+            self._feature_gradient(grads["features"], channels, part, cotangents)
+            return
 
         def kernel(part: Part, finals: list[dict], table: Table | None = None) -> Adjoint:
-            # In order, a packet of lanes meets the same Gaussian: reduce it first. Sorted lanes do not.
-            mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
-            if table is not None:
-                of[part] = [self._cotangent(g, channels, *at) for at in zip(part.flat, part.inside, strict=True)]
-            scalar = None
-            if shared is not None and (table is not None or part.weights is not None):
+            own, scalar = cotangents if table is None else self._cotangents(g, channels, part), None
+            if shared is not None:
                 scalar = lambda k, place, ok: dr.gather(self.lib.Float, shared, part.slot(k, place), ok)  # noqa: E731
-            return Adjoint(self.model, channels, grads, finals, of[part], depth, mode, scalar, table)
+            return Adjoint(self.model, channels, grads, finals, own, depth, part.reduction, scalar, table)
 
-        if channels.channels and not self.couple:
-            for part, _ in group:
-                mode = dr.ReduceMode.Direct if part.ordered else dr.ReduceMode.Local
-                self._feature_gradient(grads["features"], channels, part, of[part], mode)
-            return
-        for part, finals, table in by_lists(self.lib, group, 1, kernel):
-            states = part.run(kernel(part, finals, table))
-            for st, at, inside in zip(states, part.flat, part.inside, strict=True):
-                for total, x in zip(carried, st["carried"], strict=True):
-                    dr.scatter_add(total, x, at, inside)
-            dr.eval(grads, carried)
+        part, finals, table = by_lists(self.lib, part, finals, 1, kernel)
+        states = part.run(kernel(part, finals, table))
+        for st, at, inside in zip(states, part.flat, part.inside, strict=True):
+            for total, x in zip(carried, st["carried"], strict=True):
+                dr.scatter_add(total, x, at, inside)
+        dr.eval(grads, carried)
 
     def _products(
         self, part: Part, weights: Weights, g: torch.Tensor, slopes: torch.Tensor, cotangents: list[dict]
@@ -301,20 +299,22 @@ class Compositor:
             cotangent["rest"] = dr.gather(lib.Float64, totals, tile * PIXELS + column)
         return scalars
 
-    def _feature_gradient(
-        self, grad: Float, channels: Channels, part: Part, cotangents: list[dict], mode: dr.ReduceMode
-    ) -> None:
+    def _feature_gradient(self, grad: Float, channels: Channels, part: Part, cotangents: list[dict]) -> None:
         """Add w times the cotangents of a feature pass to the gradient of its features: dL/df_i = sum w_i dL/dF."""
 
         def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
             base = index * self.width + channels.first
             for c, cotangent in enumerate(cotangents[k]["sum"]):
-                dr.scatter_add(grad, w * cotangent, base + c, ok, mode=mode)
+                dr.scatter_add(grad, w * cotangent, base + c, ok, mode=part.reduction)
 
         dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), emit)), grad)
 
+    def _cotangents(self, g: dict, channels: Channels, part: Part) -> list[dict]:
+        """What `Adjoint` needs of the images' cotangents at the pixels of rays."""
+        return [self._cotangent(g, channels, *at) for at in zip(part.flat, part.inside, strict=True)]
+
     def _cotangent(self, g: dict, channels: Channels, at: UInt32, inside: Mask) -> dict:
-        """What `Adjoint` needs of the images' cotangents at a ray's pixel."""
+        """At one."""
         lib = self.lib
         gathered = lambda name, i: dr.gather(lib.Float, g[name], i, inside)  # noqa: E731
         sums = [gathered("rgb", 3 * at + c) for c in range(3)] if channels.color else []

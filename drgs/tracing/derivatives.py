@@ -149,7 +149,7 @@ class Adjoint:
                 if self.table is None:
                     T, w, (behind,), new = passed(self.finals[number], st, a0, [s], place, ok)
                 else:
-                    T, w, (behind,), ok = self.table.read(number, place, a0, active & (st["alive"] != 0))
+                    T, w, (behind,), ok = self.table.read(place, a0)
                     new = dict(st)
                 local = dr.fma(dr.fma(T, lib.Float(s), -behind), a, w * g["depth"] * depth)
                 for v, c in zip(values, g["sum"], strict=True):

@@ -20,7 +20,7 @@ from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
 from drgs.tracing.harmonics import sh_color
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
-from drgs.tracing.records import RECORD
+from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.responses import RESPONSES
 
 __all__ = ["Channels", "Emit", "HitModel", "Primal", "Ray"]
@@ -126,8 +126,7 @@ class Channels:
             if name not in buffers or (only and name != only):
                 continue
             if name == "record":
-                packet = dr.gather(lib.ArrayXf, buffers[name], index, active, shape=(RECORD, dr.width(index)))
-                loaded[name] = list(packet)
+                loaded[name] = load_record(lib, buffers[name], index, active)
             else:
                 base = index * stride + offset
                 loaded[name] = [dr.gather(lib.Float, buffers[name], base + k, active) for k in range(count)]

@@ -29,7 +29,6 @@ class Projected:
             parameters.
         key: (N,) float, the depth key of `order="center"`; detached.
         bounds: Four (N,) floats x0, y0, x1, y1, in pixels, outside of which the Gaussian has no hit; detached.
-        lower: (N,) float, no hit has an order key below it; detached.
         alive: (N,) mask of Gaussians that can have a hit.
         ellipsoids: World records only: mean (3), quaternion wxyz (4) and half axes of the extent (3); detached.
         frame: Not of `ewa`: rotation (3, 3) to world axes, scales (3), and of the local frame, on the screen only, the
@@ -41,7 +40,6 @@ class Projected:
         record: list[Float],
         key: Float,
         bounds: list[Float] | None,
-        lower: Float,
         alive: Mask,
         ellipsoids: list[Float] | None = None,
         frame: tuple | None = None,
@@ -49,7 +47,6 @@ class Projected:
         self.record, self.key, self.alive = record, key, alive
         # Any: None where a view has no such thing, and then nobody reads it.
         self.bounds: list[Float] | Any = bounds
-        self.lower: Float = lower
         self.ellipsoids: list[Float] | Any = ellipsoids
         self.frame: tuple | Any = frame
 
@@ -197,10 +194,7 @@ def project_screen(
         alive &= zd > settings.near
     # Keys order hits, and an order has no derivative.
     key = dr.detach(g.center[2] if settings.depth_key == "z" else distance)
-    # Peaks lie inside the extent ellipsoid, so no t* is nearer than its nearest point; 1e-6 for rounding to float32.
-    reach = g.extent * dr.maximum(dr.maximum(g.scale[0], g.scale[1]), g.scale[2])
-    lower = dr.maximum(dr.detach(distance - reach), 0) * (1 - 1e-6)
-    return Projected(record, Float(key), [Float(b) for b in bounds], Float(lower), alive, frame=frame)
+    return Projected(record, Float(key), [Float(b) for b in bounds], alive, frame=frame)
 
 
 def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coefficients: int) -> Projected:
@@ -225,4 +219,4 @@ def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coeff
     extent = dr.detach(g.extent) if settings.order == "entry" else g.listed_extent()
     ellipsoids = [dr.detach(x) for x in [*g.mean, *g.quat, *[dr.detach(s) * extent for s in g.scale]]]
     frame = g.rotation, g.scale, None, None
-    return Projected(record, Float(key), None, None, alive & (extent > 0), ellipsoids, frame)
+    return Projected(record, Float(key), None, alive & (extent > 0), ellipsoids, frame)

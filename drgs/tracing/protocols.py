@@ -17,7 +17,19 @@ if TYPE_CHECKING:
     from drgs.tracing.projection import Projected
     from drgs.tracing.walk import Part
 
-__all__ = ["Float", "Int32", "Kernel", "Lib", "Mask", "Sink", "Stream", "Traversal", "UInt32", "UInt64"]
+__all__ = [
+    "DividedStream",
+    "Float",
+    "Int32",
+    "Kernel",
+    "Lib",
+    "Mask",
+    "Sink",
+    "Stream",
+    "Traversal",
+    "UInt32",
+    "UInt64",
+]
 
 Lib = ModuleType  # the module of Dr.Jit's array types of the backend (runtime.dr_types)
 
@@ -44,8 +56,10 @@ class Traversal(Protocol):
     rays: int
     certificate: dict
 
-    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int) -> None:
-        """Build lists or proxies from the record buffer; `carried`: per-ray floats, `basis` of them an SH basis."""
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
+        """Build lists or proxies from the record buffer; `carried`: per-ray floats, `basis` of them an SH basis;
+        `replayed`: derivatives follow, what they need again may be held.
+        """
 
     def parts(self, share: int) -> list[Part]:
         """All rays, `share` (1 or 4) a lane."""
@@ -57,26 +71,28 @@ class Traversal(Protocol):
 class Stream(Protocol):
     """Candidate Gaussians of every lane, one after the other; its state is part of that of Dr.Jit's loop."""
 
+    def opened(self) -> Stream:
+        """What is walked along: itself, or what is made now."""
+
     def begin(self) -> Any:
         """State before the first candidate."""
 
     def more(self, state: Any) -> Mask:
         """Mask of lanes that have a candidate left."""
 
-    def place(self, state: Any) -> UInt32:
-        """UInt32, different for each candidate of a lane: where it stands in the stream."""
+    def next(self, state: Any, active: Mask) -> tuple[UInt32, Mask, list, Float, Any]:
+        """(Gaussian, whether there is one, its place, lower bound of its and all later order keys, new state).
 
-    def next(self, state: Any, active: Mask) -> tuple[UInt32, Mask, Float, Any]:
-        """(Gaussian, whether there is one, lower bound of its and all later order keys, new state)."""
+        A place is a list: a number that no other candidate of the lane has and, of a ray through a tile, where it
+        stands in the tile's list, which may be the same.
+        """
 
-    def name(self, state: Any, candidate: UInt32) -> UInt32:
-        """Of the candidate that a state comes to: what orders hits with the same key, as Gaussians' indices do."""
 
-    def named(self, name: UInt32, active: Mask) -> UInt32:
-        """The Gaussian of a name."""
+class DividedStream(Stream, Protocol):
+    """One of which some lanes can be taken."""
 
-    def of(self, lanes: UInt32) -> Stream:
-        """The same for some of the lanes."""
+    def of(self, lanes: UInt32) -> DividedStream:
+        """The same for these lanes."""
 
 
 class Kernel(Protocol):

@@ -12,7 +12,7 @@ import drjit as dr
 
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 
-__all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "pack", "pack_records", "packed_size"]
+__all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "load_record", "pack", "pack_records", "packed_size"]
 
 # Layout of a screen record (floats). ALPHA holds the opacity, or what stands for it in the response (its `strength`).
 RECORD = 24
@@ -45,6 +45,11 @@ def pack_records(lib: Lib, record: list[Float]) -> Float:
     buffer = dr.zeros(lib.Float, count * RECORD)
     dr.scatter(buffer, lib.ArrayXf(spread), i)
     return buffer
+
+
+def load_record(lib: Lib, buffer: Float, index: UInt32, active: Mask) -> list[Float]:
+    """The record of a Gaussian."""
+    return list(dr.gather(lib.ArrayXf, buffer, index, active, shape=(RECORD, dr.width(index))))
 
 
 def packed_size(count: int) -> int:

@@ -2,7 +2,8 @@
 
 A frame is cut into 8x8-pixel tiles. Every Gaussian is listed in each tile of its screen bounds, where these are large
 only in those in which a pixel may be hit; tiles are grouped and ordered by one sort of packed 64-bit keys. `center`
-order sorts by (depth of the mean, index); `ray` order by t* at the tile's center, which walk.py makes exact.
+order sorts by (depth of the mean, index); in `ray` order lists stay in that of the indices, and the hits of each pixel
+are sorted (rows.py).
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from drgs.tracing import records as layout
 from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.projection import Projected
 from drgs.tracing.protocols import Float, Int32, Lib, Mask, UInt32, UInt64
+from drgs.tracing.records import load_record
 from drgs.tracing.responses import RESPONSES
+from drgs.tracing.rows import Room, SortedHits
 from drgs.tracing.walk import ListStream, Part, Slots
 from drgs.tracing.weights import PIXELS, Weights, signed
 
@@ -29,10 +32,12 @@ __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 
 TILE = 8
 TABLES = 128 << 20
-"""Bytes of a table that the adjoint fills in exact order (information: twice that); a single tile's may have more."""
-_BLOCK = 4  # pixels of a block's edge: four blocks are a tile
-_FAR = 3.0e38
+"""Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
+(information: twice that); a single tile's may have more.
+"""
 _NOWHERE = 2**64 - 1
+_HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
+_TAILS = 5e-6  # what the tails left out of a pixel may add up to
 _LARGE = 8  # tiles of a box, on average
 
 
@@ -41,31 +46,44 @@ class TileTraversal:
 
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
+        trimmed: In `ray` order, leave tails out that together change no color, alpha or feature by more than `_TAILS`.
     """
 
     world = False
 
     def __init__(
-        self, lib: Lib, settings: RenderSettings, projected: Projected, pinhole: list[Float], width: int, height: int
+        self,
+        lib: Lib,
+        settings: RenderSettings,
+        projected: Projected,
+        pinhole: list[Float],
+        width: int,
+        height: int,
+        trimmed: bool,
     ) -> None:
         self.lib, self.settings, self.projected = lib, settings, projected
+        self.trimmed = trimmed and settings.order == "ray" and settings.extent is None
         self.width, self.height, self.rays = width, height, width * height
         self.certificate: dict = {}
         self.pinhole = [lib.Float(v) for v in pinhole]
         dr.make_opaque(*self.pinhole)
 
-    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int) -> None:
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
         """Build the lists."""
         self.model, self.records, self.carried, self.basis = model, records, carried, basis
-        self.lists = build(self.lib, self.projected, self.settings, self.width, self.height, records)
+        size = self.width, self.height
+        self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed)
         self.certificate["pairs"] = self.lists.pairs
+        self.room = Room(_HELD if replayed else 0)
+        if self.settings.order == "ray":
+            self.certificate |= {"rays": self.rays, "redone": 0}  # rows hold every hit
 
     def parts(self, share: int) -> list[Part]:
         """All pixels as one part; in `ray` order as `weighed`, for tables of two numbers."""
         if self.settings.order == "ray":
             return [part for part, _ in self._bands(share, TABLES // 2)]
         count, per_tile = self.lists.columns * self.lists.rows, TILE * TILE // share
-        return [self._part(share, dr.arange(self.lib.UInt32, count * per_tile) // per_tile, False)]
+        return [self._part(share, dr.arange(self.lib.UInt32, count * per_tile) // per_tile)]
 
     def weighed(self, share: int, size: int) -> list[Part]:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
@@ -89,19 +107,27 @@ class TileTraversal:
             end = min(max(end, begin + 1), len(lengths))
             last = int(ends[end - 1])
             lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
-            part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin), self.settings.order == "ray")
-            part.slots = Slots(dr.opaque(lib.UInt32, first), (last - first + 1) * PIXELS)
+            tile = lane // per_tile + dr.opaque(lib.UInt32, begin)
+            part = self._part(share, tile)
+            part.slots = Slots(dr.opaque(lib.UInt32, first), (last - first + 1) * pixels)
             part.columns = [lane % per_tile + 16 * k for k in range(share)]
-            part.in_lists = functools.partial(self._in_lists, begin, end, part.slots)
+            if self.settings.order == "ray":
+                what = f"rows of the hits in {end - begin} tiles of {last - first} entries"
+                memory.require("render", 8 * part.slots.size, what, "lower extent", runtime.backend().name == "cuda")
+                own = lengths[begin:end]
+                in_lists = functools.partial(self._in_lists, begin, end, part.slots)
+                part.in_lists = functools.partial(in_lists, 1 if self.basis else 4)
+                tiles = dr.arange(lib.UInt32, end - begin) + dr.opaque(lib.UInt32, begin)
+                cut = None if self.lists.cut is None else dr.gather(lib.Float, self.lists.cut, tiles)
+                part.stream = SortedHits(lib, functools.partial(in_lists, 4), self.lists.index, own, cut, self.room)
             yield part, (begin, end, first, lengths[begin:end])
             begin, first = end, last
 
-    def _in_lists(self, begin: int, end: int, slots: Slots) -> Part:
-        """The pixels of tiles in the order of the tiles' lists, as many a lane as there is room for."""
-        lib, share = self.lib, 1 if self.basis else 4
-        per_tile = TILE * TILE // share
+    def _in_lists(self, begin: int, end: int, slots: Slots, share: int) -> Part:
+        """The pixels of tiles in the order of the tiles' lists."""
+        lib, per_tile = self.lib, PIXELS // share
         lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
-        part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin), False)
+        part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin))
         part.slots, part.columns = slots, [lane % per_tile + 16 * k for k in range(share)]
         return part
 
@@ -112,8 +138,8 @@ class TileTraversal:
         y = (tiles // self.lists.columns)[:, None] * TILE + k // 32 * 4 + k % 16 // 4
         return torch.where((x < self.width) & (y < self.height), y * self.width + x, -1)
 
-    def _part(self, share: int, tile: UInt32, ordered: bool) -> Part:
-        """The pixels of tiles, one a lane, `share` a lane."""
+    def _part(self, share: int, tile: UInt32) -> Part:
+        """The pixels of tiles, one a lane, `share` a lane, along the tiles' lists."""
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
         inner = dr.arange(lib.UInt32, dr.width(tile)) % per_tile
@@ -132,13 +158,10 @@ class TileTraversal:
         some = inside[0]
         for other in inside[1:]:
             some = some | other
-        blocks = lists.blocks if ordered else None
-        of, group = (lists, tile) if blocks is None else (blocks, 4 * tile + block)
-        start = dr.gather(lib.UInt32, of.start, group)
-        end = dr.select(some, dr.gather(lib.UInt32, of.end, group), start)
-        names = () if blocks is None else (blocks.ahead, blocks.place, lists.index)
-        stream = ListStream(lib, of.index, start, end, *names)
-        return Part(lib, self.model, self.records, rays, flat, inside, stream, ordered)
+        start = dr.gather(lib.UInt32, lists.start, tile)
+        end = dr.select(some, dr.gather(lib.UInt32, lists.end, tile), start)
+        stream = ListStream(lib, lists.index, start, end)
+        return Part(lib, self.model, self.records, rays, flat, inside, stream, False)
 
     def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
@@ -159,7 +182,7 @@ class Lists:
         start, end: (tiles,) range of each tile.
         columns, rows: Tiles in x and y.
         pairs: Number of entries.
-        blocks: `ray` order only: the same entries, block by block.
+        cut: (tiles,) what is taken off the squared extent of each entry; None: nothing.
     """
 
     index: UInt32
@@ -168,34 +191,25 @@ class Lists:
     columns: int
     rows: int
     pairs: int
-    blocks: BlockLists | None = None
+    cut: Float | None = None
 
 
-@dataclasses.dataclass
-class BlockLists:
-    """The entries of tiles' lists again, in the order of t* in the middle of each 4x4 block of a tile, four a tile.
-
-    Attributes:
-        index: (entries,) Gaussian of each.
-        place: (entries,) where it stands in the tiles' lists, which have Gaussians in the order of their indices.
-        start, end: (4 tiles,) range of each block.
-        ahead: (entries,) no hit of this entry or a later one of its block has a smaller key.
-    """
-
-    index: UInt32
-    place: UInt32
-    start: UInt32
-    end: UInt32
-    ahead: Float
-
-
-def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, height: int, record: Float) -> Lists:
+def build(
+    lib: Lib,
+    projected: Projected,
+    settings: RenderSettings,
+    width: int,
+    height: int,
+    record: Float,
+    trimmed: bool = False,
+) -> Lists:
     """List the Gaussians of each tile.
 
     Args:
         lib: Dr.Jit types.
         projected: `Projected` of the view.
         record: Flat record buffer.
+        trimmed: Leave tails out.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     x0, y0, x1, y1 = projected.bounds
@@ -218,18 +232,15 @@ def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, 
         order = depth_order(lib, projected.key, gaussian)
         amount = dr.gather(lib.UInt32, amount, order)
     total64 = dr.sum(lib.UInt64(amount))[0]
-    if total64 >= 2 ** (most := 30 if exact else 32):  # in exact order there are up to four lanes an entry
+    if total64 >= 2**32:
         raise ValueError(
-            f"render: the tile lists must have fewer than 2^{most} entries, got {total64}; lower extent or image size"
+            f"render: the tile lists must have fewer than 2^32 entries, got {total64}; lower extent or image size"
         )
     pairs = int(total64)
     what = f"{pairs} entries of tile lists ({count} Gaussians, {width}x{height} pixels)"
-    each = memory.PAIR + memory.ORDERED * exact
-    memory.require("render", each * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
+    memory.require("render", memory.PAIR * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
     start, end = dr.zeros(lib.UInt32, columns * rows), dr.zeros(lib.UInt32, columns * rows)
-    none, ends = dr.zeros(lib.UInt32, 1), dr.zeros(lib.UInt32, 4 * columns * rows)
-    blocks = BlockLists(none, none, ends, ends, dr.zeros(lib.Float, 1)) if exact else None
-    nothing = Lists(none, start, end, columns, rows, 0, blocks)
+    nothing = Lists(dr.zeros(lib.UInt32, 1), start, end, columns, rows, 0)
     if pairs == 0:
         return nothing
     offset = dr.cumsum(amount) - amount
@@ -252,9 +263,33 @@ def build(lib: Lib, projected: Projected, settings: RenderSettings, width: int, 
     dr.eval(tile, index)
     _ranges(lib, tile, start, end)
     lists = Lists(index, start, end, columns, rows, pairs)
-    if exact:
-        lists.blocks = _blocks(lib, lists, settings, record, projected, tile)
-    return lists
+    return _shorter(lib, lists, tile, settings, record, count) if trimmed else lists
+
+
+def _shorter(lib: Lib, lists: Lists, tile: UInt32, settings: RenderSettings, record: Float, count: int) -> Lists:
+    """Shorter lists: an extent that bounds the sum of the tails of all Gaussians is longer than a tile needs, which
+    lists few of them. Beyond the extent a Gaussian has at most the opacity 1e-5 / N (projection.py); beyond a squared
+    one that is less by c, exp(c / 2) times as much, so that n tails add up to _TAILS where c = 2 ln(_TAILS N / 1e-5 n).
+
+    Args:
+        tile: (pairs,) of each entry.
+        record: Flat record buffer.
+        count: N.
+    """
+    listed = lib.Float(lists.end - lists.start)
+    cut = dr.maximum(2 * dr.log(_TAILS / 1e-5 * count / dr.maximum(listed, 1)), 0)
+    loaded = load_record(lib, record, lists.index, lib.Bool(True))
+    tiles = _Tiles(lib, settings, loaded)
+    tiles.limit = tiles.limit - dr.gather(lib.Float, cut, tile)
+    dx, dy = tiles.center(lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns))
+    kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & tiles.may_hit(dx, dy))
+    start, end = dr.zeros(lib.UInt32, dr.width(listed)), dr.zeros(lib.UInt32, dr.width(listed))
+    if dr.width(kept) == 0:
+        return Lists(lists.index, start, end, lists.columns, lists.rows, 0, cut)
+    index, tile = dr.gather(lib.UInt32, lists.index, kept), dr.gather(lib.UInt32, tile, kept)
+    dr.eval(index, tile, cut)
+    _ranges(lib, tile, start, end)
+    return Lists(index, start, end, lists.columns, lists.rows, dr.width(kept), cut)
 
 
 def _ranges(lib: Lib, group: UInt32, start: UInt32, end: UInt32) -> None:
@@ -268,50 +303,6 @@ def _ranges(lib: Lib, group: UInt32, start: UInt32, end: UInt32) -> None:
     dr.eval(start, end)
 
 
-def _blocks(
-    lib: Lib, lists: Lists, settings: RenderSettings, record: Float, projected: Projected, tile: UInt32
-) -> BlockLists:
-    """The entries of each block of a tile, by t* at the block's center.
-
-    Args:
-        lists: Of the tiles.
-        record: Flat record buffer.
-        projected: `Projected` of the view.
-        tile: (pairs,) of each entry.
-    """
-    lower = projected.lower
-    upper = 2 * projected.key - lower  # the mean's distance and the reach
-    lane = dr.arange(lib.UInt32, 4 * lists.pairs)
-    entry, corner = lane // 4, lane % 4
-    own = dr.gather(lib.UInt32, tile, entry)
-    x = (own % lists.columns) * 2 + corner % 2
-    y = (own // lists.columns) * 2 + corner // 2
-    index = dr.gather(lib.UInt32, lists.index, entry)
-    loaded = list(dr.gather(lib.ArrayXf, record, index, shape=(layout.RECORD, dr.width(index))))
-    tiles = _Tiles(lib, settings, loaded, _BLOCK)
-    dx, dy = tiles.center(lib.Int32(x), lib.Int32(y))
-    # What is sorted has 32 bits: a block, then the depth among all that there are, as far as there is room.
-    bits = 32 - max(1, (4 * lists.columns * lists.rows - 1).bit_length())
-    near, far = (dr.reinterpret_array(lib.UInt32, f(x)) for f, x in ((dr.min, lower), (dr.max, upper)))
-    depth = dr.clip(dr.reinterpret_array(lib.UInt32, tiles.depth(dx, dy)), near, far)
-    rank = lib.UInt32(lib.Float(depth - near) * (float((1 << bits) - 1) / dr.maximum(lib.Float(far - near), 1)))
-    key = ((4 * own + corner) << bits) | dr.minimum(rank, (1 << bits) - 1)
-    kept = dr.compress(dr.full(lib.Bool, True, dr.width(lane)) & tiles.may_hit(dx, dy))
-    start, end = (dr.zeros(lib.UInt32, 4 * lists.columns * lists.rows) for _ in range(2))
-    if dr.width(kept) == 0:
-        return BlockLists(dr.zeros(lib.UInt32, 1), dr.zeros(lib.UInt32, 1), start, end, dr.zeros(lib.Float, 1))
-    key, place = dr.gather(lib.UInt32, key, kept), kept // 4
-    dr.eval(key, place)
-    order = dr.argsort(key)
-    place, block = dr.gather(lib.UInt32, place, order), dr.gather(lib.UInt32, key, order) >> bits
-    index = dr.gather(lib.UInt32, lists.index, place)
-    ahead = dr.gather(lib.Float, lower, index)
-    dr.eval(place, block, index, ahead)
-    _ranges(lib, block, start, end)
-    ahead = _suffix_minimum(lib, ahead, start, end)
-    return BlockLists(index, place, start, end, ahead)
-
-
 def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
     """Gaussians by (key, index)."""
     # IEEE bits order like unsigned integers once negative floats are flipped.
@@ -323,15 +314,14 @@ def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
 
 
 class _Tiles:
-    """Of pairs of a Gaussian and a tile: whether there is a pixel center that may be hit, and how far away.
+    """Of pairs of a Gaussian and a tile: whether there is a pixel center that may be hit.
 
     Args:
         loaded: The first entries of each lane's record.
-        size: Pixels of a tile's edge, or of a block's.
     """
 
-    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], size: int = TILE) -> None:
-        self.size, self.lib, self.r, self.response = size, lib, loaded, RESPONSES[settings.response]
+    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float]) -> None:
+        self.lib, self.r, self.response = lib, loaded, RESPONSES[settings.response]
         self.limit = loaded[layout.EXT2]
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
@@ -342,16 +332,12 @@ class _Tiles:
     def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
         """Of tile (x, y), from the anchor."""
         at = (self.lib.Float(v) + 0.5 for v in (x, y))
-        dx, dy = (v * self.size - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
+        dx, dy = (v * TILE - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
         return dx, dy
-
-    def depth(self, dx: Float, dy: Float) -> Float:
-        """t* there, at least 0: orders the list, decides nothing."""
-        return self.response.depth(self.r, dx, dy)
 
     def may_hit(self, dx: Float, dy: Float) -> Mask:
         """False only where no pixel center of the tile around there has a hit."""
-        return self.response.may_hit(self.r, dx, dy, 0.5 * (self.size - 1), self.limit)
+        return self.response.may_hit(self.r, dx, dy, 0.5 * (TILE - 1), self.limit)
 
 
 def _emit(
@@ -382,18 +368,3 @@ def _emit(
             (dr.zeros(lib.UInt32, dr.width(gaussian)), lib.Int32(x0), lib.Int32(y0)), lambda k, x, y: k < amount, body
         )
     dr.eval(keys)
-
-
-def _suffix_minimum(lib: Lib, values: Float, start: UInt32, end: UInt32) -> Float:
-    """Running minimum of each tile's range from its end; one lane a tile."""
-    out = dr.zeros(lib.Float, dr.width(values))
-
-    def body(i: UInt32, low: Float) -> tuple[UInt32, Float]:
-        low = dr.minimum(low, dr.gather(lib.Float, values, i - 1))
-        dr.scatter(out, low, i - 1)
-        return i - 1, low
-
-    with dr.suspend_grad():  # bounds have no derivative
-        dr.while_loop((lib.UInt32(end), dr.full(lib.Float, _FAR, dr.width(end))), lambda i, low: i > start, body)
-    dr.eval(out)
-    return out

@@ -1,38 +1,39 @@
 """How rays walk along their Gaussians: in the order given, or in the exact order of each ray.
 
-A `Part` is a set of lanes with one or four rays each and a stream of candidate Gaussians. In `center` order on tiles
-the stream is in order already: 16 lanes work on a tile and each carries four pixels, so that a record is loaded once
-for 64 pixels. In every other case a lane has one ray and a sorted buffer of its hits (order key and name in one word).
+A `Part` is a set of lanes with one or four rays each and a stream of candidate Gaussians. On tiles the stream is in
+order. That of the list of a tile serves all its pixels: 16 lanes carry four each, so that a record is loaded once for
+64 pixels. In exact order a lane has one pixel, and its stream are its own hits, sorted beforehand (rows.py).
 
-Exact order with a finite buffer: hits enter as they come, and the nearest leaves when a new one needs its place. A ray
-goes wrong only if a hit arrives in front of one that has left; this is checked on every hit (the certificate), and such
-rays are walked again, with a deeper buffer or along a sorted list of all their hits, so any depth is exact. A ray may
-stop at its transmittance limit only where nothing that is still to come can lie in front: streams bound the keys to
-come from below.
+Rays without lists meet their candidates in any order. A lane has one of them and a sorted buffer of its hits: they
+enter as they come, and the nearest leaves when a new one needs its place. A ray goes wrong only if a hit arrives in
+front of one that has left; this is checked on every hit (the certificate), and such rays are walked again, with a
+deeper buffer or along a sorted list of all their hits, so any depth is exact. A ray may stop at its transmittance limit
+only where nothing that is still to come can lie in front: streams bound the keys to come from below.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from drgs.tracing.kernels import HitModel, Ray
-from drgs.tracing.protocols import Float, Kernel, Lib, Mask, Stream, UInt32
-from drgs.tracing.records import RECORD
+from drgs.tracing.protocols import DividedStream, Float, Kernel, Lib, Mask, Stream, UInt32
+from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.weights import PIXELS, Weights
+from drgs.tracing.words import BEYOND, EMPTY, name_of, push, word_of
 
-__all__ = ["BUFFER", "EMPTY", "NOWHERE", "Family", "ListStream", "Part", "Slots", "together"]
+if TYPE_CHECKING:
+    from drgs.tracing.rows import SortedHits
+
+__all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots"]
 
 BUFFER = 20  # hits that a ray is sorted among
 _DEEP = 48  # of rays for which these were too few
 _MANY = 1000  # such rays, from which on a kernel of their own is worth compiling
-EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
-_LEAST = 1.2e-38  # of keys: below, float32 is not normal
-_BEHIND = 1e308  # all words of hits
 _WORD = 32  # bits of a word beside the key: the lane and the Gaussian
 _MAX_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
 
@@ -43,24 +44,14 @@ class ListStream:
     Args:
         index: (entries,) Gaussians.
         start, end: Per lane.
-        ahead: (entries,) lower bound of the order key of this entry and all later ones of its lane; None without.
-        places: (entries,) where each stands in another list, in which each lane has its Gaussians in the order of their
-            indices; None: there is none.
-        listed: Gaussians of that list.
     """
 
-    def __init__(
-        self,
-        lib: Lib,
-        index: UInt32,
-        start: UInt32,
-        end: UInt32,
-        ahead: Float | None = None,
-        places: UInt32 | None = None,
-        listed: UInt32 | None = None,
-    ) -> None:
-        self.lib, self.index, self.start, self.end, self.ahead = lib, index, start, end, ahead
-        self.places, self.listed = places, listed
+    def __init__(self, lib: Lib, index: UInt32, start: UInt32, end: UInt32) -> None:
+        self.lib, self.index, self.start, self.end = lib, index, start, end
+
+    def opened(self) -> ListStream:
+        """Itself."""
+        return self
 
     def begin(self) -> UInt32:
         """The place of the first entry."""
@@ -70,28 +61,14 @@ class ListStream:
         """Whether there is an entry left."""
         return i < self.end
 
-    def place(self, i: UInt32) -> UInt32:
-        """In the list."""
-        return i
-
-    def next(self, i: UInt32, active: Mask) -> tuple[UInt32, Mask, Float, UInt32]:
+    def next(self, i: UInt32, active: Mask) -> tuple[UInt32, Mask, list, Float, UInt32]:
         """One entry."""
-        index = dr.gather(self.lib.UInt32, self.index, i, active)
-        bound = EMPTY if self.ahead is None else dr.gather(self.lib.Float, self.ahead, i, active)
-        return index, active, bound, i + 1
-
-    def name(self, i: UInt32, candidate: UInt32) -> UInt32:
-        """The place in the other list, or the Gaussian."""
-        return candidate if self.places is None else dr.gather(self.lib.UInt32, self.places, i)
-
-    def named(self, name: UInt32, active: Mask) -> UInt32:
-        """The Gaussian of that name."""
-        return name if self.listed is None else dr.gather(self.lib.UInt32, self.listed, name, active)
+        return dr.gather(self.lib.UInt32, self.index, i, active), active, [i], EMPTY, i + 1
 
     def of(self, lanes: UInt32) -> ListStream:
         """The entries of some lanes."""
         start, end = (dr.gather(self.lib.UInt32, x, lanes) for x in (self.start, self.end))
-        return ListStream(self.lib, self.index, start, end, self.ahead, self.places, self.listed)
+        return ListStream(self.lib, self.index, start, end)
 
 
 @dataclasses.dataclass
@@ -114,13 +91,15 @@ class Part:
         rays: One or four a lane, all of which walk along the same stream.
         flat: Per shared ray, the pixel (row-major index) it belongs to.
         inside: Per shared ray, whether there is such a pixel and this part decides it.
-        failed: After a primal pass in exact order: lanes whose buffer was too short.
-        weights: Where the weights of these rays are held; None where they are not. A place in the order then ends
-            with that in the list.
+        ordered: Rays sort their candidates on the way; else these come in the order in which they are composited.
+        failed: After a primal pass of such rays: lanes whose buffer was too short.
+        first: It was not walked before, with a shorter buffer.
+        weights: Where the weights of these rays are held; None where they are not.
         columns: Per shared ray, its pixel of the tile.
-        slots: Of rays along the lists of tiles, where an entry and a pixel stand in tables; None for others.
-        in_lists: Makes a part with the rays of the tiles in the order of their lists; of rays with `slots`.
-        base: The part that these rays were in at first, where they are walked again.
+        slots: Of rays through tiles, where an entry and a pixel stand in tables; None for others. A place in the order
+            ends with that in the tile's list.
+        in_lists: Makes a part with the same rays along the lists of their tiles; of rays that walk along rows of
+            their own hits.
         buffer: Hits that its rays are sorted among.
     """
 
@@ -132,7 +111,7 @@ class Part:
         rays: list[Ray],
         flat: list[UInt32],
         inside: list[Mask],
-        stream: Stream,
+        stream: Stream | SortedHits,
         ordered: bool,
         center_key: Float | None = None,
     ) -> None:
@@ -143,9 +122,14 @@ class Part:
         self.weights: Weights | None = None
         self.columns: list[UInt32] = []
         self.slots: Slots | None = None
-        self.base: Part | None = None
+        self.first = True
         self.in_lists: Callable[[], Part] | Any = None
         self.buffer = BUFFER
+
+    @property
+    def reduction(self) -> dr.ReduceMode:
+        """How sums by Gaussian are added up: first over a packet of lanes, where all of it meets the same one."""
+        return dr.ReduceMode.Direct if self.ordered or self.in_lists is not None else dr.ReduceMode.Local
 
     def slot(self, k: int, place: list) -> UInt32:
         """Where a table has shared ray k at a place in its order, which ends with that in the list."""
@@ -161,12 +145,12 @@ class Part:
             return []
         pick = lambda x: None if x is None else dr.gather(type(x), x, lanes)  # noqa: E731
         rays = [Ray(pick(r.x), pick(r.y), pick(r.length), [pick(v) for v in r.carried], r.basis) for r in self.rays]
-        flat, stream = [pick(f) for f in self.flat], self.stream.of(lanes)
+        divided: DividedStream | Any = self.stream
+        flat, stream = [pick(f) for f in self.flat], divided.of(lanes)
         dr.eval(rays, flat)
         inside = [self.lib.Bool(True)]
         part = Part(self.lib, self.model, self.records, rays, flat, inside, stream, True, self.center_key)
-        part.slots, part.columns = self.slots, [pick(x) for x in self.columns]
-        part.base, part.buffer = self.base or self, _DEEP
+        part.first, part.buffer = False, _DEEP
         return [part] if count >= _MANY and self.buffer < _DEEP else part._listed(count)
 
     def _listed(self, count: int) -> list[Part]:
@@ -186,7 +170,7 @@ class Part:
             index = self._sorted_hits(start, total, bits)
         stream = ListStream(lib, index, start, start + hits)
         part = Part(lib, self.model, self.records, self.rays, self.flat, self.inside, stream, False)
-        part.base = self.base
+        part.first = False
         return [part]
 
     def _sorted_hits(self, start: UInt32, total: int, bits: int) -> UInt32:
@@ -207,10 +191,10 @@ class Part:
 
     def _each_hit(self, lanes: int, visit: Callable) -> UInt32:
         """Number of hits of every lane; `visit(number so far, Gaussian, key, is hit)` sees each candidate."""
-        lib, ray, stream = self.lib, self.rays[0], self.stream
+        lib, ray, stream = self.lib, self.rays[0], self.stream.opened()
 
         def body(s: Any, k: UInt32) -> tuple:
-            candidate, valid, _, s = stream.next(s, lib.Bool(True))
+            candidate, valid, _, _, s = stream.next(s, lib.Bool(True))
             key, ok = self._probe(candidate, ray, valid)
             visit(k, candidate, key, ok)
             return s, k + dr.select(ok, lib.UInt32(1), 0)
@@ -226,13 +210,13 @@ class Part:
 
     def _in_order(self, kernel: Kernel) -> list[dict]:
         """Composite the candidates as they come."""
-        lib, stream = self.lib, self.stream
+        lib, stream = self.lib, self.stream.opened()
         states = [kernel.init(k, inside, lib.UInt32(NOWHERE)) for k, inside in enumerate(self.inside)]
         start = stream.begin()
 
         def body(s: Any, go: UInt32, states: list[dict]) -> tuple:
-            index, valid, _, after = stream.next(s, lib.Bool(True))
-            states = kernel.shade(index, self.rays, states, [[stream.place(s)]] * len(self.rays), valid)
+            index, valid, place, _, after = stream.next(s, lib.Bool(True))
+            states = kernel.shade(index, self.rays, states, [place] * len(self.rays), valid)
             alive = sum((st["alive"] for st in states), lib.UInt32(0))
             return after, dr.select(stream.more(after) & (alive != 0), lib.UInt32(1), 0), states
 
@@ -242,7 +226,7 @@ class Part:
     def _probe(self, index: UInt32, ray: Ray, active: Mask) -> tuple[Float, Mask]:
         """Order key of a candidate, and whether it is a hit."""
         lib = self.lib
-        record = list(dr.gather(lib.ArrayXf, self.records, index, active, shape=(RECORD, dr.width(index))))
+        record = load_record(lib, self.records, index, active)
         _, key, ok = self.model.hit(record, ray, active)
         # `integral` has hits whose t* lies behind the origin.
         key = dr.maximum(key, 0)
@@ -252,38 +236,37 @@ class Part:
 
     def _sorted(self, kernel: Kernel, check: bool) -> list[dict]:
         """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
-        lib, stream, size = self.lib, self.stream, self.buffer
+        lib, stream, size = self.lib, self.stream.opened(), self.buffer
         U, word = lib.UInt32, lib.Float64
         state = kernel.init(0, self.inside[0], word(EMPTY))
         start = stream.begin()
 
         def exchange(enter: Float, buffer: list[Float], last: Float, state: dict) -> tuple:
             """Put a hit into the buffer and composite the one that leaves it."""
-            hit, buffer = _push(enter, buffer)
-            ok = (hit != EMPTY) & (hit < _BEHIND)
-            name = U(dr.reinterpret_array(lib.UInt64, hit) & 0xFFFFFFFF)
-            (state,) = kernel.shade(stream.named(name, ok), self.rays, [state], [[hit, name]], ok)
+            hit, buffer = push(enter, buffer)
+            ok = (hit != EMPTY) & (hit < BEYOND)
+            (state,) = kernel.shade(name_of(lib, hit), self.rays, [state], [[hit]], ok)
             return buffer, dr.select(ok, hit, last), state
 
         def body(s: Any, go: UInt32, buffer: list[Float], last: Float, failed: UInt32, state: dict) -> tuple:
             """Meet the next candidate; `last` left the buffer last, `failed` is 1 where a hit came too late."""
-            before, there = s, stream.more(s)
-            candidate, valid, bound, s = stream.next(s, there)
+            there = stream.more(s)
+            candidate, valid, _, bound, s = stream.next(s, there)
             key, ok = self._probe(candidate, self.rays[0], valid)
-            hit = _word(lib, key, stream.name(before, candidate))
+            hit = word_of(lib, key, candidate)
             if check:
                 failed = dr.select(ok & (hit < last), 1, failed)
             # When all have come, what is left in the buffer is pushed out.
             alive = state["alive"] != 0
-            enter = dr.select(alive, dr.select(there, dr.select(ok, hit, EMPTY), _BEHIND), EMPTY)
+            enter = dr.select(alive, dr.select(there, dr.select(ok, hit, EMPTY), BEYOND), EMPTY)
             # Most candidates miss most packets of lanes: the branch skips the rest for these.
             buffer, last, state = dr.if_stmt(
                 (enter, buffer, last, state), enter != EMPTY, exchange, lambda _, *unchanged: unchanged
             )
             alive, there = state["alive"] != 0, stream.more(s)
-            going = alive & (there | (buffer[0] < _BEHIND))
+            going = alive & (there | (buffer[0] < BEYOND))
             if check:
-                going |= there & (_word(lib, bound, U(0)) <= last)
+                going |= there & (word_of(lib, bound, U(0)) <= last)
             return s, dr.select(going, U(1), 0), buffer, last, failed, state
 
         go = dr.select(stream.more(start) & (state["alive"] != 0), U(1), 0)
@@ -291,35 +274,3 @@ class Part:
         *_, failed, state = dr.while_loop(loop, lambda s, go, *_: go != 0, body)
         self.failed = failed != 0
         return [state]
-
-
-def together(done: Iterable[tuple[Part, list[dict]]]) -> list[Family]:
-    """Each part side by side with those that walk rays of it again."""
-    groups: dict[Part, Family] = {}
-    for part, finals in done:
-        groups.setdefault(part.base or part, []).append((part, finals))
-    return list(groups.values())
-
-
-Family = list[tuple[Part, list[dict]]]
-"""Parts with the final states of their rays: one, and those that walk some of its rays again."""
-
-
-def _word(lib: Lib, key: Float, name: UInt32) -> Float:
-    """A hit in one Float64 that orders like (key, name): positive floats order like their bits, and these are those of
-    the key before those of the name. Processors exchange floats faster than integers.
-    """
-    # Where the float32 is not normal the float64 would not be, and might become 0.
-    key = dr.select(key >= 0, dr.maximum(key, _LEAST), EMPTY)
-    bits = lib.UInt64(dr.reinterpret_array(lib.UInt32, key)) << 32
-    return dr.reinterpret_array(lib.Float64, bits | lib.UInt64(name))
-
-
-def _push(hit: Float, buffer: list[Float]) -> tuple[Float, list[Float]]:
-    """Insert into an ascending buffer and take its smallest out; pushing EMPTY changes nothing."""
-    shifted = []
-    for old in buffer:
-        first = hit < old
-        shifted.append(dr.select(first, hit, old))
-        hit = dr.select(first, old, hit)
-    return shifted[0], [*shifted[1:], hit]

@@ -85,11 +85,6 @@ class Weights:
         """A buffer."""
         return dr.zeros(self.lib.Float, (self.rows + 1) * PIXELS)
 
-    def skip(self, pixels: UInt32) -> None:
-        """Leave out pixels of the image: what the buffer says of them is wrong."""
-        self.inside &= ~torch.isin(self.pixels, signed(pixels).long())
-        self._groups = None
-
     def image(self, buffer: Float, features: torch.Tensor, out: torch.Tensor) -> None:
         """Add W^T f to the pixels of `out` (pixels, D); `features` is (N, D)."""
         flat, width = _matrix(buffer), features.shape[1]

@@ -73,8 +73,5 @@ class Response(Protocol):
     def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where no ray within `half` pixels of (dx, dy), from the anchor, hits with rho^2 <= limit."""
 
-    def depth(self, r: list[Float], dx: Float, dy: Float) -> Float:
-        """t* at (dx, dy), at least 0, for the order of lists: it decides nothing else."""
-
 
 RESPONSES: dict[str, Response] = {response.name: response for response in (Peak(), Integral(), Ewa())}

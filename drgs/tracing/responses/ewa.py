@@ -104,10 +104,6 @@ class Ewa(AlphaStrength):
         """False only where rho^2 <= limit has no solution; 1.0001 is more than float32 rounds."""
         return ~(deviation(r, dx, dy, half) > 1.0001 * limit)
 
-    def depth(self, r: list[Float], dx: Float, dy: Float) -> Float:
-        """The Gaussian's own."""
-        return r[layout.H1]
-
 
 def _offset(r: list[Float], ray: Ray) -> tuple[Float, Float, Float, Float]:
     """The triangular factor times the pixel's offset from the projected mean; the offset from the anchor."""

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 __all__ = ["AlphaStrength", "Peak", "approach", "deviation", "times"]
 
-_FAR = 3.0e38
-
 
 class AlphaStrength:
     """What stands for alpha in the record is alpha itself, and x = strength exp(-rho^2 / 2) the opacity of a hit."""
@@ -186,13 +184,6 @@ class Peak(AlphaStrength):
             rounding = 1e-6 * sum(abs(x) for x in along)
             met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
         return met
-
-    def depth(self, r: list[Float], dx: Float, dy: Float) -> Float:
-        """t* at a point of the image, up to |d|."""
-        d = _direction(r, dx, dy)
-        along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
-        depth = along * dr.rcp(dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2])))
-        return dr.select(depth > 0, dr.minimum(depth, _FAR), 0)
 
 
 def deviation(r: list[Float], dx: Float, dy: Float, half: float) -> Float:

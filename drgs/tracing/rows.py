@@ -1,0 +1,226 @@
+"""The hits of pixels in exact order: found along the lists of tiles, and sorted in a row each.
+
+Rays through a tile meet the Gaussians of its list in orders of their own. The list is walked once, where a packet of
+rays looks at one Gaussian at a time, and every hit is written into the row of its pixel as one number, a word, that
+orders like (t*, index). Sorting short rows is what processors do fast; then each ray walks along its own row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import torch
+
+from drgs import runtime
+from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.records import load_record
+from drgs.tracing.weights import PIXELS, signed
+from drgs.tracing.words import BEYOND, EMPTY, name_of, word_of
+
+if TYPE_CHECKING:
+    from drgs.tracing.kernels import Ray
+    from drgs.tracing.walk import ListStream, Part
+
+__all__ = ["Room", "SortedHits", "SortedRows"]
+
+_TILES = 64  # that a thread sorts at a time
+
+
+class Room:
+    """Memory that orders may be held in.
+
+    Attributes:
+        left: Bytes.
+    """
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+    def take(self, size: int) -> bool:
+        """Whether there is room for so many bytes, which are taken then."""
+        fits = size <= self.left
+        self.left -= size if fits else 0
+        return fits
+
+
+class SortedHits:
+    """The hits of the pixels of some tiles, found and sorted when they are walked along (`opened`).
+
+    Args:
+        in_lists: Makes a part with these pixels, four a lane, along the lists of the tiles.
+        index: (entries,) Gaussians of all lists; of the same key the first entry is the nearer hit.
+        lengths: (tiles,) of the lists of these tiles.
+        cut: (tiles,) what is taken off the squared extents, or None.
+        room: To hold the order in once it is known.
+    """
+
+    def __init__(
+        self,
+        lib: Lib,
+        in_lists: Callable[[], Part],
+        index: UInt32,
+        lengths: torch.Tensor,
+        cut: Float | None,
+        room: Room,
+    ) -> None:
+        self.lib, self.in_lists, self.index, self.lengths, self.room = lib, in_lists, index, lengths, room
+        self.cut = cut
+        self.held: SortedRows | None = None
+
+    def opened(self) -> SortedRows:
+        """The stream to walk along."""
+        if self.held is not None:
+            return self.held
+        words, start, count = self._sorted()
+        total = int(dr.sum(self.lib.UInt64(count))[0])
+        if self.room.take(4 * total):
+            # The entries alone, one row behind the other: a fraction of what the words take.
+            first = dr.cumsum(count) - count
+            entries = self._entries(words, start, count, first, total)
+            self.held = SortedRows(self.lib, entries, first, first + count, self.index)
+            return self.held
+        return SortedRows(self.lib, words, start, start + count, self.index)
+
+    def _sorted(self) -> tuple[Float, UInt32, UInt32]:
+        """Words of the hits, and of each pixel where its row starts and how many it has."""
+        lib, part, tiles = self.lib, self.in_lists(), len(self.lengths)
+        lists: ListStream | Any = part.stream
+        assert part.slots is not None  # of a part along lists
+        share = len(part.columns)
+        first, own = lists.start - part.slots.first, lists.end - lists.start
+        starts = [first * PIXELS + column * own for column in part.columns]
+        words, lane = dr.full(lib.Float64, BEYOND, part.slots.size), dr.arange(lib.UInt32, tiles * PIXELS // share)
+        cut = lib.Float(0) if self.cut is None else dr.gather(lib.Float, self.cut, lane // (PIXELS // share))
+        dr.eval(words, starts, cut)
+        found = part.run(_Finder(part, words, starts, cut))
+        dr.eval(found, words)  # together: one kernel
+        start, count = (dr.zeros(lib.UInt32, tiles * PIXELS) for _ in range(2))
+        for column, at, state in zip(part.columns, starts, found, strict=True):
+            pixel = lane // (PIXELS // share) * PIXELS + column
+            dr.scatter(start, at, pixel)
+            dr.scatter(count, state["count"], pixel)
+        dr.eval(start, count)
+        _sort(words.torch(), self.lengths, signed(count).view(-1, PIXELS))
+        return words, start, count
+
+    def _entries(self, words: Float, start: UInt32, count: UInt32, first: UInt32, total: int) -> UInt32:
+        """(total,) what the words name, in rows without gaps."""
+        lib, entries = self.lib, dr.zeros(self.lib.UInt32, max(total, 1))
+
+        def body(i: UInt32) -> tuple[UInt32]:
+            dr.scatter(entries, name_of(lib, dr.gather(lib.Float64, words, start + i)), first + i)
+            return (i + 1,)
+
+        with dr.suspend_grad():  # an order has no derivative
+            dr.while_loop((dr.zeros(lib.UInt32, dr.width(count)),), lambda i: i < count, body)
+        dr.eval(entries, first)
+        return entries
+
+
+class SortedRows:
+    """Sorted hits, of each lane those from `start` to `end`; a `Stream`.
+
+    Args:
+        hits: Float64 words, whose names are entries of a list of Gaussians, `index`; or UInt32, the entries.
+    """
+
+    def __init__(self, lib: Lib, hits: Float | UInt32, start: UInt32, end: UInt32, index: UInt32) -> None:
+        self.lib, self.hits, self.start, self.end, self.index = lib, hits, start, end, index
+
+    def opened(self) -> SortedRows:
+        """Itself."""
+        return self
+
+    def begin(self) -> UInt32:
+        """The place of the first hit."""
+        return self.lib.UInt32(self.start)
+
+    def more(self, i: UInt32) -> Mask:
+        """Whether there is a hit left."""
+        return i < self.end
+
+    def next(self, i: UInt32, active: Mask) -> tuple[UInt32, Mask, list, Float, UInt32]:
+        """One hit."""
+        entry = dr.gather(type(self.hits), self.hits, i, active)
+        if dr.type_v(self.hits) == dr.VarType.Float64:
+            entry = name_of(self.lib, entry)
+        return dr.gather(self.lib.UInt32, self.index, entry, active), active, [i, entry], EMPTY, i + 1
+
+
+class _Finder:
+    """Writes the word of every hit into the row of its pixel; a `Kernel`.
+
+    Args:
+        part: Whose rays they are.
+        words: Of all rows.
+        starts: Per shared ray, of its row.
+        cut: What is taken off the squared extents.
+    """
+
+    def __init__(self, part: Part, words: Float, starts: list[UInt32], cut: Float) -> None:
+        self.m, self.records, self.words, self.starts, self.cut = part.model, part.records, words, starts, cut
+
+    def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
+        """State of a ray: how many hits it has."""
+        lib = self.m.lib
+        return {"count": lib.UInt32(0), "alive": dr.select(alive, lib.UInt32(1), 0)}
+
+    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
+        """Look at one Gaussian."""
+        lib, out = self.m.lib, []
+        record = load_record(lib, self.records, index, active)
+        record[self.m.extent2] -= self.cut
+        for start, ray, st, place in zip(self.starts, rays, states, places, strict=True):
+            _, key, ok = self.m.hit(record, ray, active & (st["alive"] != 0))
+            # `integral` has hits whose t* lies behind the origin.
+            word = dr.select(ok, word_of(lib, dr.maximum(key, 0), place[-1]), BEYOND)
+            # A miss is written, too, where the next hit or nothing will be: a store under a mask that follows no
+            # pattern costs several times as much.
+            dr.scatter(self.words, word, start + st["count"], active)
+            out.append({"count": st["count"] + dr.select(ok, lib.UInt32(1), 0), "alive": st["alive"]})
+        return out
+
+
+def _sort(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor) -> None:
+    """Sort rows in place.
+
+    Args:
+        words: Flat, of the tiles one behind the other: `PIXELS` rows, each as long as the tile's list.
+        lengths: (tiles,) of the lists.
+        counts: (tiles, PIXELS) hits of each row; what is behind them is `BEYOND`.
+    """
+    if words.is_cuda:
+        _sort_at_once(words, lengths)
+    else:
+        _sort_by_tile(words, lengths, counts, runtime.backend().threads)
+
+
+def _sort_at_once(words: torch.Tensor, lengths: torch.Tensor) -> None:
+    """By words, then, stably, by rows."""
+    row = torch.arange(PIXELS * len(lengths), device=words.device)
+    row = row.repeat_interleave(lengths.repeat_interleave(PIXELS))
+    used = words[: len(row)]
+    order = torch.sort(used).indices
+    used.copy_(used[order[torch.sort(row[order], stable=True).indices]])
+
+
+def _sort_by_tile(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor, threads: int) -> None:
+    """NumPy sorts short rows in vector registers."""
+    flat, most = words.numpy(), counts.amax(1).tolist()
+    ends = [0, *(PIXELS * lengths).cumsum(0).tolist()]
+
+    def sort(first: int) -> None:
+        for tile in range(first, min(first + _TILES, len(most))):
+            if most[tile] > 1:
+                flat[ends[tile] : ends[tile + 1]].reshape(PIXELS, -1)[:, : most[tile]].sort(axis=1)
+
+    lots = range(0, len(most), _TILES)
+    if min(threads, len(lots)) < 2:
+        for first in lots:
+            sort(first)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(sort, lots))

@@ -1,0 +1,38 @@
+"""A hit as one number, a word: it orders like (t*, name), and holds both."""
+
+from __future__ import annotations
+
+import drjit as dr
+
+from drgs.tracing.protocols import Float, Lib, UInt32
+
+__all__ = ["BEYOND", "EMPTY", "name_of", "push", "word_of"]
+
+EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
+BEYOND = 1e308  # all words of hits
+_LEAST = 1.2e-38  # of keys: below, float32 is not normal
+
+
+def word_of(lib: Lib, key: Float, name: UInt32) -> Float:
+    """Float64 that orders like (key, name): positive floats order like their bits, and these are those of the key
+    before those of the name. Processors exchange floats faster than integers. `EMPTY` for a key below 0.
+    """
+    # Where the float32 is not normal the float64 would not be, and might become 0.
+    key = dr.select(key >= 0, dr.maximum(key, _LEAST), EMPTY)
+    bits = lib.UInt64(dr.reinterpret_array(lib.UInt32, key)) << 32
+    return dr.reinterpret_array(lib.Float64, bits | lib.UInt64(name))
+
+
+def name_of(lib: Lib, word: Float) -> UInt32:
+    """The name in a word."""
+    return lib.UInt32(dr.reinterpret_array(lib.UInt64, word) & 0xFFFFFFFF)
+
+
+def push(word: Float, buffer: list[Float]) -> tuple[Float, list[Float]]:
+    """Insert into an ascending buffer and take its smallest out; pushing `EMPTY` changes nothing."""
+    shifted = []
+    for old in buffer:
+        first = word < old
+        shifted.append(dr.select(first, word, old))
+        word = dr.select(first, old, word)
+    return shifted[0], [*shifted[1:], word]
