@@ -27,6 +27,7 @@ from drgs.tracing.responses import RESPONSES
 from drgs.tracing.rows import Room, SortedHits
 from drgs.tracing.walk import ListStream, Part, Slots
 from drgs.tracing.weights import PIXELS, Weights, signed
+from drgs.tracing.words import ascending
 
 __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 
@@ -258,7 +259,7 @@ def build(
         if pairs == 0:
             return nothing
         keys = dr.gather(lib.UInt64, keys, kept)
-    keys = dr.sort(keys)
+    keys = ascending(lib, keys)
     tile, index = lib.UInt32(keys >> 32), dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
     dr.eval(tile, index)
     _ranges(lib, tile, start, end)
@@ -308,7 +309,7 @@ def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
     # IEEE bits order like unsigned integers once negative floats are flipped.
     bits = dr.reinterpret_array(lib.UInt32, key)
     bits = dr.select(bits >> 31 != 0, ~bits, bits | 0x80000000)
-    order = lib.UInt32(dr.sort((lib.UInt64(bits) << 32) | lib.UInt64(gaussian)) & 0xFFFFFFFF)
+    order = lib.UInt32(ascending(lib, (lib.UInt64(bits) << 32) | lib.UInt64(gaussian)) & 0xFFFFFFFF)
     dr.eval(order)
     return order
 

@@ -23,7 +23,7 @@ from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.protocols import DividedStream, Float, Kernel, Lib, Mask, Stream, UInt32
 from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.weights import PIXELS, Weights
-from drgs.tracing.words import BEYOND, EMPTY, name_of, push, word_of
+from drgs.tracing.words import BEYOND, EMPTY, ascending, name_of, push, word_of
 
 if TYPE_CHECKING:
     from drgs.tracing.rows import SortedHits
@@ -185,7 +185,7 @@ class Part:
             dr.scatter(words, word, start + k, ok)
 
         dr.eval(self._each_hit(count, write), words)
-        index = lib.UInt32(dr.sort(words) & ((1 << bits) - 1))
+        index = lib.UInt32(ascending(lib, words) & ((1 << bits) - 1))
         dr.eval(index, start)
         return index
 
