@@ -3,14 +3,13 @@
 Symbols: H Fisher information of the training views, Hc of a candidate (sums of squared derivatives of the image, unit
 noise on every channel), l the prior's precision lambda, in the inverse squared unit of its parameter. An Information is
 a dict group -> tensor with one entry a parameter, as `drgs.fisher.diagonal` returns it. docs/information.md says what
-the criteria mean, where they come from and where they differ from what others publish under the same names.
+the criteria mean, and where others publish something else under the same names.
 
 References:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771: `eig`, section 3.3.
     [2] Jiang et al., FisherRF, ECCV 2024: `eig` of a diagonal, lambda = 1e-6.
     [3] Wilson et al., POp-GS, CVPR 2025: `logdet` ("D-opt"), `trace_cov` ("T-opt"), one block a Gaussian.
-    [4] Bates & Watts, Nonlinear Regression Analysis and Its Applications, 1988: V-optimality. Ash et al., Gone Fishing
-        (BAIT), NeurIPS 2021: of a pool that is to be labelled.
+    [4] Bates & Watts, Nonlinear Regression Analysis, 1988: V-optimality. Ash et al. (BAIT), NeurIPS 2021: of a pool.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 
@@ -43,7 +43,6 @@ __all__ = [
 
 Information = Mapping[str, torch.Tensor]
 
-
 BLOCK_LAYOUT = {
     "means": slice(0, 3),
     "rotations": slice(3, 6),
@@ -53,8 +52,7 @@ BLOCK_LAYOUT = {
 }
 """Places of the groups in a block of `drgs.fisher.blocks`; of `sh` it holds the base color."""
 
-BLOCKS = "blocks"
-"""Name under which blocks (N, 13, 13) travel as an Information."""
+BLOCKS = "blocks"  # the name under which blocks (N, 13, 13) travel as an Information
 
 _ROUNDING = 1e-6  # relative to the diagonal: what float32 sums leave of an eigenvalue that is 0, on a real scene
 _CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is twice as fast
@@ -273,9 +271,9 @@ class _Diagonal:
         parts, unseen, terms_of = {}, {}, _TERMS[self.criterion]
         for name, variance in self.inverse.items():
             weight, seen_or_not, only_unseen = float(self.weights.get(name, 1.0)), 0.0, 0.0
-            chunks = (
-                x.flatten().split(_CHUNK) for x in (candidate[name], variance, self.wanted[name], self.unseen[name])
-            )
+            rows = _moved(candidate[name])
+            each = (candidate[name], variance, self.wanted[name], self.unseen[name])
+            chunks = (x[rows].flatten().split(_CHUNK) for x in each)
             for new, known, wanted, is_unseen in zip(*chunks, strict=True):
                 terms = terms_of(new.to(torch.float64, copy=True).mul_(known), wanted)
                 seen_or_not += float(terms.sum())
@@ -288,6 +286,14 @@ class _Diagonal:
                 "raise lambda or check the information for NaN"
             )
         return Gain(total, parts, dict(self.left_out), unseen)
+
+
+def _moved(candidate: torch.Tensor) -> torch.Tensor | Any:
+    """Rows of which a view says anything: others have the term 0. `...`, all, where they are most."""
+    if candidate.dim() == 0 or candidate.numel() < _CHUNK:
+        return ...
+    rows = candidate.reshape(len(candidate), -1).any(1)
+    return rows.nonzero()[:, 0] if float(rows.float().mean()) < 0.8 else ...
 
 
 def _check_alike(what: str, information: Information, train: Information) -> None:

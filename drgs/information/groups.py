@@ -93,7 +93,7 @@ GROUPS = {
     "sh": Group(
         shape=lambda g: tuple(g.sh.shape),
         entries=(GEOMETRY,),
-        collect=lambda sums, replay, weights: replay.sh_information(sums) * weights,
+        collect=lambda sums, replay, weights: replay.sh_information(sums, weights),
         spread=lambda values, replay: replay.sh_spread(values),
         input="sh",
     ),

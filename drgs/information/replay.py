@@ -265,12 +265,15 @@ class Replay:
             dr.eval(image)
         return image.torch().cpu().reshape(self.call.shape)
 
-    def sh_information(self, squares: torch.Tensor) -> torch.Tensor:
-        """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2; call after `sums`."""
+    def sh_information(self, squares: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2, times (3,) weights; call after `sums`."""
         if self.along_ray:
-            return self.light
-        basis, lit = self._squared_basis()
-        return squares[:, :, None] * basis[:, :, None] * lit[:, None, :]
+            return self.light * weights
+        seen = squares[:, 0].nonzero()[:, 0]  # a view sees few of all Gaussians
+        basis, lit = self._squared_basis(seen)
+        result = torch.zeros(self.count, basis.shape[1], 3, dtype=torch.float64)
+        result[seen] = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
+        return result
 
     @property
     def feature_scale(self) -> float:
@@ -282,12 +285,16 @@ class Replay:
         if self.along_ray:
             self.light = weights
             return torch.zeros(self.count, 3, dtype=torch.float64)
-        basis, lit = self._squared_basis()
+        basis, lit = self._squared_basis(torch.arange(self.count))
         return (basis[:, :, None] * weights).sum(1) * lit
 
-    def _squared_basis(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """(N, K) squares of the SH basis towards the Gaussians, and (N, 3) 1 where a channel is above 0, else 0."""
-        return torch.stack([_torch(x) for x in self.basis], 1).square(), torch.stack([_torch(x) for x in self.lit], 1)
+    def _squared_basis(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of some Gaussians (n, K) squares of the SH basis towards them, and (n, 3) 1 where a channel is above 0, else
+        0.
+        """
+        chosen = lambda x: x.torch().cpu()[rows]  # noqa: E731
+        basis, lit = (torch.stack([chosen(x) for x in xs], 1).double() for xs in (self.basis, self.lit))
+        return basis.square_(), lit
 
 
 def _unit(k: int) -> list[float]:
