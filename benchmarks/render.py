@@ -57,8 +57,12 @@ def backward(gaussians, camera, settings):
     return run
 
 
-def volprim(gaussians, camera, differentiate: bool):
-    """`volprim_rf_basic` as shipped, without its sRGB step (whose gradient is wrong) and with unlimited depth."""
+def volprim(gaussians, camera, differentiate: bool, **shape):
+    """`volprim_rf_basic` as shipped, without its sRGB step (whose gradient is wrong) and with unlimited depth.
+
+    Args:
+        shape: Of the shape, beside or instead of what `ellipsoids_shape` says.
+    """
     mi = runtime.mitsuba()
     import drjit as dr
 
@@ -68,7 +72,12 @@ def volprim(gaussians, camera, differentiate: bool):
     sensor["sampler"] = {"type": "independent", "sample_count": 1}
     integrator = {"type": "volprim_rf_basic", "max_depth": -1, "srgb_primitives": False}
     scene = mi.load_dict(
-        {"type": "scene", "sensor": sensor, "integrator": integrator, "gaussians": ellipsoids_shape(gaussians)}
+        {
+            "type": "scene",
+            "sensor": sensor,
+            "integrator": integrator,
+            "gaussians": {**ellipsoids_shape(gaussians), **shape},
+        }
     )
     params = mi.traverse(scene)
     keys = ["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"]

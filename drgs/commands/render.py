@@ -131,7 +131,7 @@ def render_views(
         advance: Called after each view.
     Returns:
         JSON-serializable: settings, backend, seconds (first, median of the others, total), rays and
-        redone (rays whose exact order took more than one pass; None where the order is not exact),
+        redone (rays whose exact order took more than one pass, on bvh; None where the order is not exact),
         and views (camera, files, seconds, rays, redone).
     """
     outputs = ("depth",) if depth or "exr" in formats else ()
@@ -264,7 +264,7 @@ def _summary(report: dict, folder: Path) -> str:
         f"{len(views)} views of {report['gaussians']} Gaussians in {seconds['total']:.1f} s "
         f"(first {seconds['first']:.2f} s, then {seconds['median']:.3f} s a view): {folder}"
     )
-    if report["redone"] is not None:
+    if report["redone"]:
         share = report["redone"] / max(report["rays"], 1)
         text += f"\nexact order: {report['redone']} of {report['rays']} rays ({share:.2%}) took more than one pass"
     return text

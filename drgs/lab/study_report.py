@@ -191,7 +191,7 @@ def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], n
         for metric in study.metrics:
             one = found[metric.key]
             cells.append(_difference(metric, one) if one else "none")
-            if one:
+            if one and one.units > 1:
                 sizes[metric.key].append(one.seen)
         lines.append([f"{policy} against {reference}" if named else policy, *cells])
     if not lines:
@@ -251,8 +251,11 @@ def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> di
 
 
 def _difference(metric: Metric, found: Effect) -> str:
-    """Mean, interval, verdict, and in how many units it is better."""
-    numbers = f"{found.mean:+.{metric.digits}f} [{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
+    """Mean, interval, verdict, and in how many units it is better; of a single unit the difference alone."""
+    numbers = f"{found.mean:+.{metric.digits}f}"
+    if found.units == 1:
+        return f"{numbers}, 1 unit"
+    numbers += f" [{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
     better = found.positive if metric.larger else found.negative
     word = _verdict(metric, found)
     return f"{numbers}{f' **{word}**' if word else ''}, {better} of {found.units}"

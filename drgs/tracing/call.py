@@ -39,8 +39,8 @@ class Output:
         count: (H, W) int32, composited hits.
         visibility: (N,) sum of w over all pixels; not differentiated.
         features: (H, W, D) when the Gaussians have features.
-        certificate: Of exact order: `rays`, `redone` (rays walked again, along sorted lists); `pairs` listed. Of a
-            list of views one for each.
+        certificate: Of exact order: `rays`, `redone` (of `bvh`: rays walked again, for more hits than a buffer
+            holds); `pairs` listed. Of a list of views one for each.
     """
 
     rgb: torch.Tensor
