@@ -101,7 +101,7 @@ class TileTraversal:
         """
         lib, pixels, begin, first = self.lib, PIXELS, 0, 0
         per_tile = pixels // share
-        lengths = signed(self.lists.end).long() - signed(self.lists.start).long()
+        lengths = signed(self.lists.end - self.lists.start).long()
         ends = lengths.cumsum(0)
         while begin < len(lengths):
             end = int(torch.searchsorted(ends, first + size // (4 * pixels), right=True))
