@@ -271,7 +271,7 @@ class _Diagonal:
         parts, unseen, terms_of = {}, {}, _TERMS[self.criterion]
         for name, variance in self.inverse.items():
             weight, seen_or_not, only_unseen = float(self.weights.get(name, 1.0)), 0.0, 0.0
-            rows = _moved(candidate[name])
+            rows = _told(candidate[name])
             each = (candidate[name], variance, self.wanted[name], self.unseen[name])
             chunks = (x[rows].flatten().split(_CHUNK) for x in each)
             for new, known, wanted, is_unseen in zip(*chunks, strict=True):
@@ -288,7 +288,7 @@ class _Diagonal:
         return Gain(total, parts, dict(self.left_out), unseen)
 
 
-def _moved(candidate: torch.Tensor) -> torch.Tensor | Any:
+def _told(candidate: torch.Tensor) -> torch.Tensor | Any:
     """Rows of which a view says anything: others have the term 0. `...`, all, where they are most."""
     if candidate.dim() == 0 or candidate.numel() < _CHUNK:
         return ...

@@ -49,7 +49,8 @@ class RenderSettings:
         traversal: `tiles` (pinhole cameras, the fast path) or `bvh` (Mitsuba's acceleration structure, any ray).
         depth_key: Key of `order="center"`: `distance` to the camera center or camera-space `z`.
         extent: Cut-off radius in standard deviations; None is the adaptive radius sqrt(2 ln max(alpha_i N / 1e-5, 1))
-            that bounds the sum of all N truncated tails by 1e-5.
+            that bounds the sum of all N truncated tails by 1e-5; order `ray` on tiles leaves out as much as 5e-6 more
+            where a tile lists few of N, unless depth or count is asked for.
         alpha_min: Hits with a < alpha_min are skipped.
         alpha_max: a is clamped to this value.
         alpha_max_gradient: `zero` or `pass`: the derivative of the clamp.

@@ -178,6 +178,17 @@ def test_tails_left_out_of_tiles(rng, monkeypatch):
         assert relative(diagonal[name].double(), x.double()) < 1e-5, name
 
 
+@pytest.mark.parametrize("fields", [{"alpha_min": 1 / 255}, {"max_hits": 3}, {"response": "integral"}], ids=str)
+def test_what_tails_must_not_touch(rng, fields):
+    """Where another cut-off decides, or the bound on tails does not hold, images are what they are with a depth."""
+    cam, g = camera(rng, (40, 32)), gaussians(rng, 3000, 1, scale=0.01, opacity=1.0).detach()
+    settings = EXACT.replace(**fields)
+    short, whole = render(g, cam, settings, outputs=()), render(g, cam, settings)
+    assert float((short.rgb - whole.rgb).abs().max()) < 1e-6
+    if "alpha_min" not in fields:
+        assert short.certificate["pairs"] == whole.certificate["pairs"]
+
+
 def test_many_rays_in_lists_of_their_own(rng, monkeypatch):
     """Where a word has no room for all lanes beside a Gaussian's index, rays are sorted in several lots."""
     monkeypatch.setattr(walk, "BUFFER", 2)

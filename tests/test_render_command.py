@@ -90,7 +90,7 @@ def test_files_hold_the_render(scene, gaussians, camera, tmp_path, capsys):
     assert report["views"][0]["seconds"] > 0
     again = load_cameras_json(out / "cameras.json")
     np.testing.assert_allclose(again[0].w2c, camera.w2c, atol=1e-12)
-    assert "exact order:" in capsys.readouterr().out
+    assert "exact order:" not in capsys.readouterr().out  # it has something to say of `bvh` alone
     assert [path.name for path in out.iterdir() if path.name.startswith(".")] == [".drgs.jsonl"]
 
 

@@ -14,9 +14,9 @@ __all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "require"]
 
 # Measured: what a frame of 1024^2 to 4096^2 pixels adds to the resident set of a fresh process (LLVM, one thread; rgb,
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
-# a pixel in the order of centers, 85 to 91 in that of rays; bvh: 156 to 172; gradients: 54 to 61 more. Lists of
-# Gaussians and kernels come on top, hence "at least": `exact` of a trained splat of 90,586 took 2 GB more.
-_TILES, _RAY, _BVH, _GRADIENT, _FEATURE = 60, 85, 155, 50, 8
+# a pixel in the order of centers, in that of rays as much and their rows; bvh: 156 to 172; gradients: 54 to 61 more.
+# Lists of Gaussians, rows (128 MB at a time) and kernels come on top, hence "at least".
+_TILES, _BVH, _GRADIENT, _FEATURE = 60, 155, 50, 8
 PICTURES = {"png": 12, "exr": 28, "webm": 90}
 """Bytes a pixel that writing a file of a format adds, measured in the same way."""
 TANGENT = 70
@@ -37,7 +37,7 @@ def frame_bytes(pixels: int, settings: RenderSettings, features: int = 0, gradie
         features: Channels besides the colors.
         gradients: Whether it will be differentiated.
     """
-    each = _BVH if settings.traversal == "bvh" else _RAY if settings.order == "ray" else _TILES
+    each = _BVH if settings.traversal == "bvh" else _TILES
     return pixels * (each + _FEATURE * features + _GRADIENT * gradients)
 
 

@@ -119,9 +119,11 @@ class Compositor:
             features: Flat (N count), all of them composited.
         """
         channels = Channels({**self.buffers, "features": features}, count, 0, count, True)
-        states = [part.run(Primal(self.model, channels, frozenset({"replay"}))) for part in self.parts]
-        dr.eval(states)
-        return channels, list(zip(self.parts, states, strict=True))
+        done, kernel = [], Primal(self.model, channels, frozenset({"replay"}))
+        for part in self.parts:
+            done.append((part, part.run(kernel)))
+            dr.eval(done[-1][1])  # one at a time: each has rows to sort
+        return channels, done
 
     def _composited(self, want: frozenset, count: int) -> dict:
         """Flat images, `count` visibilities among them, from all passes."""
@@ -233,9 +235,9 @@ class Compositor:
         dr.eval(g)
         slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
-            for part, finals in done:
+            for walked in done:
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
-                    self._adjoint(g, channels, part, finals, grads, carried, slopes)
+                    self._adjoint(g, channels, walked, grads, carried, slopes)
         if slopes is not None:
             grads["features"] += lib.Float(slopes.view(-1))
         i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
@@ -248,17 +250,10 @@ class Compositor:
         return grads | ({"carried": carried} if carried else {})
 
     def _adjoint(
-        self,
-        g: dict,
-        channels: Channels,
-        part: Part,
-        finals: list[dict],
-        grads: dict,
-        carried: list[Float],
-        slopes: torch.Tensor | None,
+        self, g: dict, channels: Channels, walked: tuple, grads: dict, carried: list[Float], slopes: torch.Tensor | None
     ) -> None:
-        """Of a part: add to `grads`, `carried` and the `slopes` of features."""
-        depth, shared = "depth" in self.want and channels.color, None
+        """Of a part with its final states: add to `grads`, `carried` and the `slopes` of features."""
+        (part, finals), depth, shared = walked, "depth" in self.want and channels.color, None
         cotangents = self._cotangents(g, channels, part)
         if part.weights is not None and slopes is not None:
             shared = self._products(part, part.weights, in_rows(g["features"], self.width), slopes, cotangents)

@@ -34,7 +34,7 @@ __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 TILE = 8
 TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
-(information: twice that); a single tile's may have more.
+(information: twice that, with a semantic channel four times); a single tile's may have more.
 """
 _NOWHERE = 2**64 - 1
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
@@ -47,7 +47,7 @@ class TileTraversal:
 
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
-        trimmed: In `ray` order, leave tails out that together change no color, alpha or feature by more than `_TAILS`.
+        trimmed: In `ray` order, leave tails out whose opacities add up to `_TAILS` at most in a pixel.
     """
 
     world = False
@@ -63,7 +63,9 @@ class TileTraversal:
         trimmed: bool,
     ) -> None:
         self.lib, self.settings, self.projected = lib, settings, projected
-        self.trimmed = trimmed and settings.order == "ray" and settings.extent is None
+        # Its bound is of tails of at most alpha exp(-rho^2 / 2), and a ray that ends behind so many hits counts them.
+        bounded = settings.extent is None and settings.max_hits is None and RESPONSES[settings.response].at_most_alpha
+        self.trimmed = trimmed and settings.order == "ray" and bounded
         self.width, self.height, self.rays = width, height, width * height
         self.certificate: dict = {}
         self.pinhole = [lib.Float(v) for v in pinhole]
@@ -89,6 +91,7 @@ class TileTraversal:
     def weighed(self, share: int, size: int) -> list[Part]:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
         index, made = signed(self.lists.index), []
+        size = min(size, TABLES // 2) if self.settings.order == "ray" else size
         for part, (begin, end, first, lengths) in self._bands(share, size):
             pixels = self._pixels(torch.arange(begin, end, device=lengths.device))
             part.weights = Weights(self.lib, index[first : first + int(lengths.sum())], lengths, pixels)
@@ -280,8 +283,7 @@ def _shorter(lib: Lib, lists: Lists, tile: UInt32, settings: RenderSettings, rec
     listed = lib.Float(lists.end - lists.start)
     cut = dr.maximum(2 * dr.log(_TAILS / 1e-5 * count / dr.maximum(listed, 1)), 0)
     loaded = load_record(lib, record, lists.index, lib.Bool(True))
-    tiles = _Tiles(lib, settings, loaded)
-    tiles.limit = tiles.limit - dr.gather(lib.Float, cut, tile)
+    tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile))
     dx, dy = tiles.center(lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns))
     kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & tiles.may_hit(dx, dy))
     start, end = dr.zeros(lib.UInt32, dr.width(listed)), dr.zeros(lib.UInt32, dr.width(listed))
@@ -319,11 +321,12 @@ class _Tiles:
 
     Args:
         loaded: The first entries of each lane's record.
+        cut: What is taken off squared extents.
     """
 
-    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float]) -> None:
+    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], cut: Float | int = 0) -> None:
         self.lib, self.r, self.response = lib, loaded, RESPONSES[settings.response]
-        self.limit = loaded[layout.EXT2]
+        self.limit = loaded[layout.EXT2] - cut
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
             needed = 2 * dr.log(loaded[layout.ALPHA] / least)

@@ -2,7 +2,7 @@
 
 A `Part` is a set of lanes with one or four rays each and a stream of candidate Gaussians. On tiles the stream is in
 order. That of the list of a tile serves all its pixels: 16 lanes carry four each, so that a record is loaded once for
-64 pixels. In exact order a lane has one pixel, and its stream are its own hits, sorted beforehand (rows.py).
+64 pixels. In exact order a lane has one pixel, and its stream is that of its own hits, sorted beforehand (rows.py).
 
 Rays without lists meet their candidates in any order. A lane has one of them and a sorted buffer of its hits: they
 enter as they come, and the nearest leaves when a new one needs its place. A ray goes wrong only if a hit arrives in
@@ -65,11 +65,6 @@ class ListStream:
         """One entry."""
         return dr.gather(self.lib.UInt32, self.index, i, active), active, [i], EMPTY, i + 1
 
-    def of(self, lanes: UInt32) -> ListStream:
-        """The entries of some lanes."""
-        start, end = (dr.gather(self.lib.UInt32, x, lanes) for x in (self.start, self.end))
-        return ListStream(self.lib, self.index, start, end)
-
 
 @dataclasses.dataclass
 class Slots:
@@ -96,8 +91,8 @@ class Part:
         first: It was not walked before, with a shorter buffer.
         weights: Where the weights of these rays are held; None where they are not.
         columns: Per shared ray, its pixel of the tile.
-        slots: Of rays through tiles, where an entry and a pixel stand in tables; None for others. A place in the order
-            ends with that in the tile's list.
+        slots: Of rays through tiles, where an entry and a pixel stand in tables; None for others. A hit's place is then
+            where it stands in the ray's row and in the tile's list.
         in_lists: Makes a part with the same rays along the lists of their tiles; of rays that walk along rows of
             their own hits.
         buffer: Hits that its rays are sorted among.

@@ -11,8 +11,8 @@ from drgs.tracing.protocols import Float, Lib, UInt32, UInt64
 __all__ = ["BEYOND", "EMPTY", "ascending", "name_of", "push", "word_of"]
 
 EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
-BEYOND = 1e308  # all words of hits
-_FEW = 4  # threads; more of them sort faster together than one does in vector registers
+BEYOND = 1e308  # above the word of any hit
+_FEW = 4  # threads; more of them sort faster together, by digits, than one does in vector registers
 _LEAST = 1.2e-38  # of keys: below, float32 is not normal
 
 
