@@ -48,6 +48,7 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
     if name == "still life":
         from scenes import still_life
 
+        print("still life: 48 views are rendered where they are not there yet", file=sys.stderr, flush=True)
         source = still_life.generate(folder / "still-life-data", views=48, width=320, height=240, seed=1)
     else:
         source = DATA / name
@@ -154,6 +155,7 @@ def child(task: str, name: str, threads: int, args: argparse.Namespace) -> dict 
     """A task of this script in a process of its own."""
     command = [sys.executable, __file__, "--task", task, "--scene", name, "--fits", str(args.fits)]
     command += ["--turns", str(args.turns)]
+    print(f"{task} {name}, {threads} threads ...", flush=True)
     env = {**os.environ, "DRGS_THREADS": str(threads)}
     out = subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True, check=True)
     result = json.loads(out.stdout.strip().splitlines()[-1])

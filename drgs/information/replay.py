@@ -289,9 +289,7 @@ class Replay:
         return (basis[:, :, None] * weights).sum(1) * lit
 
     def _squared_basis(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of some Gaussians (n, K) squares of the SH basis towards them, and (n, 3) 1 where a channel is above 0, else
-        0.
-        """
+        """Of n Gaussians (n, K) squares of the SH basis towards them, and (n, 3) 1 where a channel is above 0, or 0."""
         chosen = lambda x: x.torch().cpu()[rows]  # noqa: E731
         basis, lit = (torch.stack([chosen(x) for x in xs], 1).double() for xs in (self.basis, self.lit))
         return basis.square_(), lit

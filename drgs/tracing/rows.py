@@ -17,12 +17,13 @@ import torch
 from drgs import runtime
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.records import load_record
+from drgs.tracing.walk import ListStream
 from drgs.tracing.weights import PIXELS, signed
 from drgs.tracing.words import BEYOND, EMPTY, name_of, word_of
 
 if TYPE_CHECKING:
     from drgs.tracing.kernels import Ray
-    from drgs.tracing.walk import ListStream, Part
+    from drgs.tracing.walk import Part
 
 __all__ = ["Room", "SortedHits", "SortedRows"]
 
@@ -120,7 +121,7 @@ class SortedHits:
         return entries
 
 
-class SortedRows:
+class SortedRows(ListStream):
     """Sorted hits, of each lane those from `start` to `end`; a `Stream`.
 
     Args:
@@ -128,19 +129,8 @@ class SortedRows:
     """
 
     def __init__(self, lib: Lib, hits: Float | UInt32, start: UInt32, end: UInt32, index: UInt32) -> None:
-        self.lib, self.hits, self.start, self.end, self.index = lib, hits, start, end, index
-
-    def opened(self) -> SortedRows:
-        """Itself."""
-        return self
-
-    def begin(self) -> UInt32:
-        """The place of the first hit."""
-        return self.lib.UInt32(self.start)
-
-    def more(self, i: UInt32) -> Mask:
-        """Whether there is a hit left."""
-        return i < self.end
+        super().__init__(lib, index, start, end)
+        self.hits = hits
 
     def next(self, i: UInt32, active: Mask) -> tuple[UInt32, Mask, list, Float, UInt32]:
         """One hit."""
