@@ -24,6 +24,7 @@ from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
 from drgs.commands.options import (
+    Convert,
     Crossval,
     Demo,
     Eval,
@@ -54,6 +55,7 @@ _OPTIONS = {
     "select": Select,
     "fisher": Fisher,
     "query": Query,
+    "convert": Convert,
     "crossval": Crossval,
     "tradeoff": Tradeoff,
     "stress": Stress,
