@@ -41,6 +41,7 @@ _EXTENDED = 2  # flag
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
 _BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more
 _SMALLEST = 511 * 2**0.5  # a component of at most sqrt(1/2), in 9 bits
+_WHOLE = 1e-3  # of a step: what float32 rounds off at most, some times over
 _log = logging.getLogger(__name__)
 _DAMAGED = "it is truncated or damaged, copy it again"
 
@@ -231,13 +232,21 @@ def _bytes(name: str, values: np.ndarray, clipped: dict[str, int]) -> np.ndarray
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
-    """(N,) uint32 that `_smallest_three` reads."""
+    """(N,) uint32 that `_smallest_three` reads; rotations that came from such a file get the bits that they had.
+
+    Two components that are about as large as each other may change places by rounding. What was stored are whole steps.
+    """
     q = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
     q = (q / np.linalg.norm(q, axis=1, keepdims=True))[:, [1, 2, 3, 0]]
-    largest = np.abs(q).argmax(1)
+    steps = np.abs(q) * _SMALLEST
+    largest = steps.argmax(1)
+    uneven = np.abs(steps - np.rint(steps))
+    for i in range(4):
+        is_stored = np.delete(uneven, i, axis=1).max(1) < _WHOLE
+        largest = np.where(is_stored & (steps[:, i] > steps.max(1) - 2), i, largest)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
     others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
     magnitude = np.minimum(np.floor(np.abs(others) * _SMALLEST + 0.5), 511).astype(np.uint32)
-    codes = magnitude | np.where((others < 0) & (magnitude > 0), 512, 0).astype(np.uint32)
+    codes = magnitude | np.where(np.signbit(others), 512, 0).astype(np.uint32)
     shifted = largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
     return shifted.astype("<u4")

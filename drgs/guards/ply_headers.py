@@ -60,7 +60,7 @@ def read_ply_header(path: Path) -> list[PlyElement]:
         match line.split():
             case ["format", kind, _]:
                 text_format = kind
-            case ["element", name, count] if count.isdecimal() and len(count) < 20:
+            case ["element", name, count] if count.isdecimal() and len(count) < 1000:
                 elements.append(PlyElement(name, int(count)))
             case ["property", kind, name] | ["property", "list", kind, _, name] if elements and kind in _SIZES:
                 elements[-1] = elements[-1].with_column(kind, name)
