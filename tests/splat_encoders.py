@@ -17,7 +17,8 @@ import numpy as np
 def spz_body(positions, alphas, colors, scales, rotations, sh) -> bytes:
     """Arrays of an SPZ: (N, 3) whole numbers of 24 bits, then bytes as they are."""
     fixed = b"".join(int(v & 0xFFFFFF).to_bytes(3, "little") for v in np.asarray(positions).reshape(-1).tolist())
-    return fixed + b"".join(np.ascontiguousarray(x).tobytes() for x in (alphas, colors, scales, rotations, sh))
+    parts = (alphas, colors, scales, rotations, sh)
+    return fixed + b"".join(x if isinstance(x, bytes) else np.ascontiguousarray(x).tobytes() for x in parts)
 
 
 def spz_file(version: int, degree: int, body: bytes, count: int, bits: int = 12, flags: int = 0, packed=True) -> bytes:
@@ -64,7 +65,7 @@ def ksplat_file(level: int, degree: int, sections: list[dict], span=(-1.5, 1.5),
         data += np.asarray(partial, "<u4").tobytes() + np.asarray(centers, "<f4").tobytes()
         for i in range(n):
             data += np.asarray(s["means"][i], mean).tobytes() + np.asarray(s["scales"][i], real).tobytes()
-            data += np.asarray(s["quats"][i], real).tobytes() + bytes(s["rgba"][i])
+            data += np.asarray(s["quats"][i], real).tobytes() + bytes(int(x) for x in s["rgba"][i])
             data += np.asarray(s["sh"][i], harmonic).tobytes()
     return bytes(head) + headers + data
 

@@ -40,10 +40,11 @@ def _spz(version: int, degree: int, packed: bool = True):
         sh = rng.integers(0, 256, (N, (degree + 1) ** 2 - 1, 3), dtype=np.uint8)
         quats = unit(rng)  # wxyz
         if version == 2:
-            quats *= np.sign(quats[:, :1])
+            quats[:, 0] = np.abs(quats[:, 0]) + 0.5  # w is computed of the others: the smaller it is, the less exactly
+            quats /= np.linalg.norm(quats, axis=1, keepdims=True)
             stored = np.round(quats[:, 1:] * 127.5 + 127.5).astype(np.uint8)
         else:
-            stored = np.array([_smallest_three(q[[1, 2, 3, 0]]) for q in quats], "<u4")
+            stored = np.array([smallest_three(q[[1, 2, 3, 0]]) for q in quats], "<u4")
         parts = (positions, alphas, colors, scales, stored, sh)
         if version == 4:
             split = [encode.spz_body(positions, b"", b"", b"", b"", b"")]
@@ -65,7 +66,7 @@ def _spz(version: int, degree: int, packed: bool = True):
     return make
 
 
-def _smallest_three(xyzw) -> int:
+def smallest_three(xyzw) -> int:
     """As the format packs a unit quaternion."""
     largest = int(np.abs(xyzw).argmax())
     sign = -1 if xyzw[largest] < 0 else 1
@@ -125,7 +126,10 @@ def _packed_ply(rng):
     ranges = np.concatenate([low[:, :3], high[:, :3], low[:, 3:6], high[:, 3:6], low[:, 6:], high[:, 6:]], 1).astype(
         "f4"
     )
-    steps = [rng.integers(0, most + 1, (n, 3)) for most in ((2047, 1023, 2047), (2047, 1023, 2047), (255, 255, 255))]
+    steps = [
+        rng.integers(0, np.array(most) + 1, (n, 3))
+        for most in ((2047, 1023, 2047), (2047, 1023, 2047), (255, 255, 255))
+    ]
     alpha, quats, sh = rng.integers(0, 256, n), unit(rng, n), rng.integers(0, 256, (n, 24))
     largest = np.abs(quats).argmax(1)
     quats *= np.sign(quats[np.arange(n), largest])[:, None]

@@ -41,7 +41,7 @@ _EXTENDED = 2  # flag
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
 _BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more
 _SMALLEST = 511 * 2**0.5  # a component of at most sqrt(1/2), in 9 bits
-_WHOLE = 1e-3  # of a step: what float32 rounds off at most, some times over
+_WHOLE = 1e-4  # of a step: what float32 rounds off at most, some times over
 _log = logging.getLogger(__name__)
 _DAMAGED = "it is truncated or damaged, copy it again"
 

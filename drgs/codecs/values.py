@@ -88,7 +88,8 @@ def log_of_scales(path: Path, scales: np.ndarray, least: float) -> np.ndarray:
     Raises:
         ValueError: If one is negative or not finite (the first index is named).
     """
-    scales = scales.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of half floats that are none
+        scales = scales.astype(np.float64)
     bad = ~(np.isfinite(scales) & (scales >= 0)).all(1)
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
