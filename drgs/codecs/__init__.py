@@ -184,7 +184,7 @@ def _kind_of_zip(path: Path) -> str | None:
             names = archive.namelist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         names = []
-    if any(name.rpartition("/")[2] == "data.pkl" for name in names):
+    if any(name.rpartition("/")[2] == "data.pkl" for name in names) or path.suffix.lower() == ".ckpt":
         return "checkpoint"
     known = any(name.rpartition("/")[2] == "meta.json" for name in names)
     return "sog" if known or path.suffix.lower() == ".sog" else None

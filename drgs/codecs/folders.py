@@ -39,7 +39,8 @@ def file_of_folder(folder: Path) -> Path | None:
         raise FileNotFoundError(
             f"{clouds}: must hold iteration_*/point_cloud.ply, holds none; train the model, or name a PLY"
         )
-    if (folder / "nerfstudio_models").is_dir() or any(folder.glob("step-*.ckpt")):
+    models = "nerfstudio_models"
+    if folder.name == models or (folder / models).is_dir() or any(folder.glob("step-*.ckpt")):
         refuse_checkpoint(folder)
     return None
 
