@@ -18,7 +18,7 @@ from splat_samples import NAMES, N, glb_document, smallest_three, sog_scene, uni
 import drgs
 from drgs.codecs import load_gaussians, save_gaussians
 from drgs.codecs.bounded import pixels_of_webp
-from drgs.codecs.values import logits_of_bytes, logits_of_opacities, turned
+from drgs.codecs.values import flipped, logits_of_bytes, logits_of_opacities
 from drgs.oracle import sh_basis
 
 # What a quaternion's components may be off by: half a step of the format, and what that does to the one that is left
@@ -78,7 +78,7 @@ def test_turning_axes_turns_everything(rng, signs):
     quats = torch.from_numpy(unit(rng))
     tensors = [torch.from_numpy(rng.normal(size=shape)) for shape in ((N, 3), (N, 3), (N,), (N, 16, 3))]
     g = drgs.Gaussians(tensors[0], quats, *tensors[1:])
-    t, S = turned(g, signs), torch.tensor(signs, dtype=torch.float64).diag()
+    t, S = flipped(g, signs), torch.tensor(signs, dtype=torch.float64).diag()
     axes, other = (drgs.ellipsoids.semi_axes(x.quats, x.scales) for x in (g, t))
     torch.testing.assert_close(S @ axes @ axes.mT @ S, other @ other.mT)
     torch.testing.assert_close(g.means @ S, t.means)
@@ -86,7 +86,7 @@ def test_turning_axes_turns_everything(rng, signs):
     for degree in range(4):
         k = (degree + 1) ** 2
         toward = torch.einsum("dk,nkc->ndc", sh_basis(d, k), g.sh[:, :k])
-        turned_sh = turned(g.replace(sh=g.sh[:, :k]), signs).sh
+        turned_sh = flipped(g.replace(sh=g.sh[:, :k]), signs).sh
         torch.testing.assert_close(toward, torch.einsum("dk,nkc->ndc", sh_basis(d @ S, k), turned_sh))
 
 
@@ -95,7 +95,7 @@ def test_spz_as_stored_keeps_the_axes_of_the_file(tmp_path, rng):
     write_sample(tmp_path / "a.spz", "v3.spz", rng)
     stored, turned_ = load_gaussians(tmp_path / "a.spz", as_stored=True), load_gaussians(tmp_path / "a.spz")
     assert torch.equal(stored.means, turned_.means * torch.tensor([1.0, -1, -1]))
-    assert torch.equal(turned(stored, (1, -1, -1)).sh, turned_.sh)
+    assert torch.equal(flipped(stored, (1, -1, -1)).sh, turned_.sh)
 
 
 def test_spz_extensions_and_degree_4(tmp_path, rng, caplog):

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["READ", "WRITTEN", "load_gaussians", "save_gaussians"]
+__all__ = ["READ", "WRITTEN", "check_suffix", "load_gaussians", "save_gaussians"]
 
 READ = ".ply, .spz, .splat, .ksplat, .sog and .glb, a SOG folder or a model folder of INRIA's"
 WRITTEN = (".ply", ".spz", ".glb")
@@ -155,7 +155,7 @@ def _kind(path: Path) -> str | None:
         head = file.read(1 << 18)  # the header of a PLY
     suffix = path.suffix.lower()
     if head.startswith((b"ply\n", b"ply\r")):
-        return "packed" if b" packed_position" in head.partition(b"end_header")[0] else "ply"
+        return "packed" if b" packed_position" in head.partition(b"\nend_header")[0] else "ply"
     if head.startswith(b"version https://git-lfs"):
         return None
     if head.startswith(b"NGSP") or (head.startswith(b"\x1f\x8b") and _begin(head).startswith(b"NGSP")):

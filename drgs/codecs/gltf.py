@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.codecs.values import SH_COUNTS, check_count, gaussians_of, log_of_scales, logits_of_opacities, turned
+from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
 from drgs.ellipsoids import Y_00
 from drgs.guards.json_files import check_json, parse_json
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["encode_glb", "load_glb"]
 
-AXES = (-1, -1, 1)
+_AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"
 _FLOAT, _BYTE = 5126, 5121
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 
 def encode_glb(g: Gaussians) -> bytes:
     """A GLB of Gaussians in the axes of PLY files; their features are left out."""
-    g = turned(g, AXES)
+    g = flipped(g, _AXES)
     quats = g.quats.numpy().astype(np.float64)
     quats /= np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -134,8 +134,8 @@ def load_glb(path: Path) -> Gaussians:
         log_scales = scales
     else:
         log_scales = log_of_scales(path, scales, _LEAST)
-    return turned(
-        gaussians_of(path, means, quats[:, [3, 0, 1, 2]], log_scales, logits_of_opacities(opacities[:, 0]), sh), AXES
+    return flipped(
+        assembled(path, means, quats[:, [3, 0, 1, 2]], log_scales, logits_of_opacities(opacities[:, 0]), sh), _AXES
     )
 
 

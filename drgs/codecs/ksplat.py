@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.splat import LEAST_FLOAT
-from drgs.codecs.values import SH_COUNTS, check_count, dc_of_colors, gaussians_of, log_of_scales, logits_of_bytes
+from drgs.codecs.values import SH_COUNTS, assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -85,7 +85,7 @@ def load_ksplat(path: Path) -> Gaussians:
     check_count(path, count, SH_COUNTS[degree])
     parts = [_decoded(path, data, section, level, degree, (low or -1.5, high or 1.5)) for section in found]
     means, quats, scales, colors, sh = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return gaussians_of(
+    return assembled(
         path,
         means,
         quats,

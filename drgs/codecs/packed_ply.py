@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.codecs.values import check_count, dc_of_colors, gaussians_of, logits_of_bytes, quats_of_smallest
+from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
 from drgs.guards.ply_headers import read_ply_header
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def load_packed_ply(path: Path) -> Gaussians:
     sh = dc_of_colors(colors)
     if coefficients > 1:
         sh = np.concatenate([sh, _higher(ply["sh"].data, coefficients - 1)], axis=1)
-    return gaussians_of(
+    return assembled(
         path,
         _between(chunks, ("x", "y", "z"), chunk, _unpacked(position)),
         quats_of_smallest((rotation >> 30).astype(int), (others - 0.5) * 2**0.5),

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.codecs.bounded import Archive, pixels_of_webp
-from drgs.codecs.values import SH_COUNTS, check_count, gaussians_of, logits_of_bytes, quats_of_smallest
+from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
 from drgs.guards.json_files import check_json, parse_json
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class _Reader:
             lerped = self._lerped("sh0", base / 255.0, 4)
             dc, logits = lerped[:, :3], lerped[:, 3]
         sh = np.concatenate([dc[:, None, :].astype(np.float32), self._higher(degree)], axis=1)
-        return gaussians_of(self.path, means, self._quats(), log_scales, logits, sh)
+        return assembled(self.path, means, self._quats(), log_scales, logits, sh)
 
     def _image(self, field: str, index: int = 0) -> np.ndarray:
         """(N, 4) bytes of an image with a pixel a Gaussian."""

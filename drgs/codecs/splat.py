@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.codecs.values import check_count, dc_of_colors, gaussians_of, log_of_scales, logits_of_bytes
+from drgs.codecs.values import assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -37,7 +37,7 @@ def load_splat(path: Path) -> Gaussians:
         )
     check_count(path, size // _ROW.itemsize, 1)
     rows = np.fromfile(path, _ROW)
-    return gaussians_of(
+    return assembled(
         path,
         rows["mean"],
         (rows["quat"].astype(np.float32) - 128) / 128,

@@ -27,15 +27,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.bounded import GzipReader, unzstd
-from drgs.codecs.values import SH_COUNTS, check_count, gaussians_of, logits_of_bytes, quats_of_smallest, turned
+from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["AXES", "encode_spz", "load_spz"]
+__all__ = ["encode_spz", "load_spz"]
 
-AXES = (1, -1, -1)
-"""Signs of x, y and z between SPZ and PLY."""
+_AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
 _COLOR = 0.15
 _EXTENDED = 2  # flag
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
@@ -72,7 +71,7 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
     stored = np.frombuffer(sh, np.uint8).reshape(count, (degree + 1) ** 2 - 1, 3)
     higher = (stored[:, : SH_COUNTS[min(degree, 3)] - 1].astype(np.float32) - 128) / 128
     quats = _first_three(rotations) if version == 2 else _smallest_three(rotations)
-    made = gaussians_of(
+    made = assembled(
         path,
         means,
         quats,
@@ -80,7 +79,7 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
         logits_of_bytes(np.frombuffer(alphas, np.uint8)),
         np.concatenate([dc.astype(np.float32), higher], axis=1),
     )
-    return made if as_stored else turned(made, AXES)
+    return made if as_stored else flipped(made, _AXES)
 
 
 def _sizes(path: Path, version: int, count: int, degree: int, bits: int) -> list[int]:
@@ -195,7 +194,7 @@ def encode_spz(g: Gaussians) -> bytes:
     Raises:
         ValueError: If a mean is farther than 2^23 from 0.
     """
-    g = turned(g, AXES)
+    g = flipped(g, _AXES)
     means = g.means.numpy().astype(np.float64)
     far = float(np.abs(means).max(initial=0.0))
     bits = next((b for b in range(_BITS, -1, -1) if round(far * 2**b) < 1 << 23), None)

@@ -17,14 +17,14 @@ from drgs.guards.memory import require
 
 __all__ = [
     "SH_COUNTS",
+    "assembled",
     "check_count",
     "dc_of_colors",
-    "gaussians_of",
+    "flipped",
     "log_of_scales",
     "logits_of_bytes",
     "logits_of_opacities",
     "quats_of_smallest",
-    "turned",
 ]
 
 SH_COUNTS = (1, 4, 9, 16)
@@ -44,7 +44,7 @@ def check_count(path: Path, count: int, coefficients: int) -> None:
     require(str(path), 8 * count * (11 + 3 * coefficients), f"{count} Gaussians", "take a smaller file")
 
 
-def gaussians_of(
+def assembled(
     path: Path, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
 ) -> Gaussians:
     """Gaussians of decoded arrays, as float32.
@@ -120,7 +120,7 @@ def quats_of_smallest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
-def turned(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
+def flipped(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
     """Gaussians in axes of which some point the other way: means, rotations and SH; no digit changes.
 
     Args:

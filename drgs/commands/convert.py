@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,9 +19,7 @@ if TYPE_CHECKING:
     from drgs.commands.options import Convert
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["run", "uncertainty_columns"]
-
-_log = logging.getLogger(__name__)
+__all__ = ["label_column", "run", "uncertainty_columns"]
 
 
 def run(args: Convert) -> None:
@@ -43,7 +40,7 @@ def run(args: Convert) -> None:
         if args.uncertainty is not None:
             extra |= uncertainty_columns(args.uncertainty, g, prior)
         if args.labels:
-            extra["label"], comments = _labels(args, given, g)
+            extra["label"], comments = label_column(args.scene, given, g)
         with Bar("writing", show=not args.quiet):
             save_gaussians(g, args.out, extra=extra, comments=comments)
     if not args.quiet:
@@ -91,7 +88,7 @@ def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.
         ValueError: If it is none, or about other Gaussians.
     """
     information, _ = load_state(path)
-    known = {name: x for name, x in information.items() if name in GROUPS}
+    known = {name: information[name] for name in GROUPS if name in information}
     for name, x in known.items():
         if x.ndim == 0 or len(x) != len(g):
             raise ValueError(
@@ -107,12 +104,20 @@ def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.
     return {f"uncertainty_{name}": x.reshape(len(g), -1).sum(1).sqrt().float().numpy() for name, x in found.items()}
 
 
-def _labels(args: Convert, given: Given, g: Gaussians) -> tuple[np.ndarray, tuple[str, ...]]:
-    """(N,) label of each Gaussian, and a line of the header for each name."""
+def label_column(path: Path, given: Given, g: Gaussians) -> tuple[np.ndarray, tuple[str, ...]]:
+    """(N,) class 1..K of each Gaussian, that of the largest cosine, and a line of the header for each name.
+
+    Args:
+        path: What was named, for the message.
+        given: The run.
+        g: Its Gaussians.
+    Raises:
+        ValueError: If it has no classes with embeddings, or no features.
+    """
     from drgs.features.segmentation import classify  # not for those that have none
 
     classes = given.classes
     if g.features is None or classes is None or classes.embeddings is None:
-        raise ValueError(f"{args.scene}: --labels must have a run that was fitted with classes, this has none; drop it")
+        raise ValueError(f"{path}: --labels must have a run that was fitted with classes, this has none; drop it")
     labels = classify(g.features, classes, given.decoder).numpy()
     return labels, tuple(f"label {k} {name}" for k, name in enumerate(classes.names, 1))

@@ -18,7 +18,7 @@ __all__ = [
     "Around",
     "Choosing",
     "Common",
-    "Compared",
+    "Comparing",
     "Data",
     "Informed",
     "Moments",
@@ -181,7 +181,7 @@ class Informed(Settings):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Compared(Informed, Around, Views):
+class Comparing(Informed, Around, Views):
     """Options of commands that compare views with known ones."""
 
     scene: SceneFile

@@ -16,7 +16,7 @@ from drgs.commands.option_groups import (
     Around,
     Choosing,
     Common,
-    Compared,
+    Comparing,
     Data,
     Moments,
     Moving,
@@ -182,7 +182,7 @@ class Fit(Choosing, Data, Taught, Moving):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Select(Choosing, Compared):
+class Select(Choosing, Comparing):
     """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
     candidates: str
@@ -196,7 +196,7 @@ class Select(Choosing, Compared):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fisher(Compared):
+class Fisher(Comparing):
     """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
 
     cameras: str | None = None

@@ -40,6 +40,7 @@ def refuse_foreign(path: Path, wanted: str) -> None:
 
 
 def _conversion(path: Path, suffix: str) -> str:
+    """What makes a PLY of Gaussians in a format of somebody else; of most, we do."""
     name = "scene" if path.name == "meta.json" else path.stem.removesuffix(".compressed")
     target = path.with_name(f"{name}.ply")
     if target == path:

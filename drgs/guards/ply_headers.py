@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 __all__ = ["PlyElement", "read_ply_header"]
@@ -50,7 +51,8 @@ def read_ply_header(path: Path) -> list[PlyElement]:
         raise FileNotFoundError(f"{path}: must be a PLY file, found none; check the path")
     with path.open("rb") as file:
         head = file.read(_MAX_HEADER)
-    end = head.find(b"end_header")
+    last = re.search(rb"[\r\n]end_header", head)  # not the word in a comment
+    end = last.start() + 1 if last else -1
     newline = head.find(b"\n", end)
     if not head.startswith((b"ply\n", b"ply\r")) or end < 0 or newline < 0:
         raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; convert it to a 3DGS PLY")
