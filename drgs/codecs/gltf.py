@@ -66,11 +66,13 @@ def encode_glb(g: Gaussians) -> bytes:
     parts = {name: np.ascontiguousarray(x, "<f4") for name, x in arrays.items()}
     # For viewers that show points only.
     parts["COLOR_0"] = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
-    views, accessors, at = [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    at = 0
     for name, x in parts.items():
         views.append({"buffer": 0, "byteOffset": at, "byteLength": x.nbytes, "target": 34962})
         kind = next(key for key, width in _WIDTHS.items() if width == x.shape[1])
-        accessor = {"bufferView": len(accessors), "count": len(g), "type": kind}
+        accessor: dict[str, Any] = {"bufferView": len(accessors), "count": len(g), "type": kind}
         accessor |= {"componentType": _BYTE, "normalized": True} if x.dtype == np.uint8 else {"componentType": _FLOAT}
         if name == "POSITION" and len(g):
             accessor |= {"min": x.min(0).tolist(), "max": x.max(0).tolist()}

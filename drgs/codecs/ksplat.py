@@ -140,7 +140,7 @@ def _decoded(
         means = (means.astype(np.float64) - section.steps) * (section.block / 2 / section.steps) + centers
     stored = rows["sh"].astype(np.float32)
     if level == 2:
-        stored = span[0] + stored / 255 * (span[1] - span[0])
+        stored = (span[0] + stored / 255 * (span[1] - span[0])).astype(np.float32)
     sh = np.zeros((section.count, SH_COUNTS[degree] - 1, 3), np.float32)
     at = 0
     for d in range(1, section.degree + 1):

@@ -217,7 +217,7 @@ def encode_spz(g: Gaussians) -> bytes:
         _log.warning("SPZ: %d %s were out of its range and went to its end", count, name)
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, len(g), g.sh_degree, bits, 0, 0)
     body = header + b"".join(np.ascontiguousarray(x).tobytes() for x in parts)
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31)  # a gzip stream without a time: same Gaussians, same bytes
+    packer = zlib.compressobj(6, zlib.DEFLATED, 31)  # a gzip stream without a time: same Gaussians, same bytes
     return packer.compress(body) + packer.flush()
 
 

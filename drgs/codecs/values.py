@@ -56,8 +56,9 @@ def assembled(
         ValueError: If a value is not finite or a quaternion is 0 (the first index is named).
     """
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-        arrays = [np.ascontiguousarray(x, np.float32) for x in (means, quats, log_scales, logits, sh)]
-    made = Gaussians(*(torch.from_numpy(x) for x in arrays))
+        parts = (means, quats, log_scales, logits, sh)
+        mu, q, s, o, c = (torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in parts)
+    made = Gaussians(mu, q, s, o, c)
     made.validate(str(path))
     return made
 
