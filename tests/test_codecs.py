@@ -257,6 +257,20 @@ def test_spz_says_what_it_cannot_hold(tmp_path, rng, caplog):
     assert load_gaussians(tmp_path / "c.glb").means.tolist() == [[8.0, 8.0, 8.0]]
 
 
+def test_activations_beyond_what_a_format_holds(tmp_path):
+    """Logits of +-1000 and tiny scales come back finite; a scale that no float32 holds is refused for .glb."""
+    g = drgs.Gaussians(*(torch.ones(shape) for shape in ((3, 3), (3, 4), (3, 3), (3,), (3, 1, 3))))
+    g = g.replace(logit_opacities=torch.tensor([-1000.0, 0, 1000]), log_scales=torch.full((3, 3), -200.0))
+    for suffix in ("spz", "glb"):
+        save_gaussians(g, tmp_path / f"a.{suffix}")
+        back = load_gaussians(tmp_path / f"a.{suffix}")
+        np.testing.assert_allclose(back.opacities.numpy(), [0, 0.5, 1], atol=0.5 / 255)
+        assert torch.isfinite(back.log_scales).all()
+    with pytest.raises(ValueError, match="a log scale above 88 is none"):
+        save_gaussians(g.replace(log_scales=torch.full((3, 3), 1000.0)), tmp_path / "b.glb")
+    assert not (tmp_path / "b.glb").exists()
+
+
 def test_scenes_of_no_gaussians(tmp_path):
     """What PLY can hold, the others can."""
     g = drgs.Gaussians(*(torch.zeros(shape) for shape in ((0, 3), (0, 4), (0, 3), (0,), (0, 4, 3))))

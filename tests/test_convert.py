@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import math
@@ -12,13 +13,15 @@ import plyfile
 import pytest
 import torch
 from splat_samples import sog_scene, write_sample
+from test_deform import dynamic
 from test_query import decoder, embeddings, scene
 
 from drgs import cli
 from drgs.cameras import orbit
 from drgs.codecs import load_gaussians, save_gaussians
-from drgs.commands.convert import label_column, uncertainty_columns
+from drgs.commands.convert import label_column, still, uncertainty_columns
 from drgs.commands.given import Given
+from drgs.commands.options import Convert
 from drgs.data.camera_lists import save_cameras_json
 from drgs.features.segmentation import Classes
 from drgs.files import load_ply, load_state, save_ply, save_state
@@ -142,6 +145,18 @@ def test_labels_are_those_of_the_largest_cosine(tmp_path, caplog):
     assert not caplog.records
     save_ply(g, tmp_path / "b.ply", extra={"label": labels * 1000})
     assert plyfile.PlyData.read(tmp_path / "b.ply")["vertex"]["label"].tolist() == (labels * 1000).tolist()
+
+
+def test_a_scene_that_moves_is_converted_at_a_time(tmp_path):
+    """Of a run whose Gaussians move, --time says when; without it, the command that writes all times is named."""
+    scene_ = dynamic(scene().replace(features=None), None)
+    given = Given(scene_.gaussians, moving=scene_)
+    args = Convert(scene=tmp_path / "run", out=tmp_path / "a.ply", time=0.7)
+    found = still(args, given)
+    assert torch.equal(found.means, scene_.at(0.7).means)
+    assert not torch.equal(found.means, scene_.gaussians.means)
+    with pytest.raises(ValueError, match="--time must say when; `drgs render --format ply`"):
+        still(dataclasses.replace(args, time=None), given)
 
 
 def test_extra_columns_that_cannot_be(tmp_path):

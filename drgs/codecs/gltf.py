@@ -47,8 +47,8 @@ def encode_glb(g: Gaussians) -> bytes:
     quats = g.quats.numpy().astype(np.float64)
     quats /= np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    opacities = 1 / (1 + np.exp(-g.logit_opacities.numpy().astype(np.float64)))
-    scales = np.exp(g.log_scales.numpy().astype(np.float64))
+    opacities = g.logit_opacities.double().sigmoid().numpy()
+    scales = g.log_scales.double().exp().numpy()
     sh = g.sh.numpy()
     colors = np.column_stack([sh[:, 0] * Y_00 + 0.5, opacities])
     with np.errstate(over="ignore"):

@@ -203,8 +203,8 @@ def encode_spz(g: Gaussians) -> bytes:
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[..., :3]
     clipped: dict[str, int] = {}
-    opacities = 255 / (1 + np.exp(-g.logit_opacities.numpy().astype(np.float64)))
-    sh = g.sh.numpy().astype(np.float64)
+    opacities = 255 * g.logit_opacities.double().sigmoid().numpy()
+    sh = g.sh.numpy()
     parts = (
         positions,
         _bytes("", opacities, clipped),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drgs.commands.options import Convert
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["label_column", "run", "uncertainty_columns"]
+__all__ = ["label_column", "run", "still", "uncertainty_columns"]
 
 
 def run(args: Convert) -> None:
@@ -34,7 +34,7 @@ def run(args: Convert) -> None:
     with claim(args.out.parent, "convert", [args.out.name], [args.scene, args.uncertainty or ""]):
         with Bar("reading", show=not args.quiet):
             given = _given(args)
-        g = _still(args, given)
+        g = still(args, given)
         extra: dict[str, np.ndarray] = {}
         comments: tuple[str, ...] = ()
         if args.uncertainty is not None:
@@ -60,8 +60,12 @@ def _given(args: Convert) -> Given:
     return Given(load_gaussians(args.scene, as_stored=True))
 
 
-def _still(args: Convert, given: Given) -> Gaussians:
-    """The Gaussians, of a scene that moves at a time."""
+def still(args: Convert, given: Given) -> Gaussians:
+    """The Gaussians; of a scene that moves, as they are at --time.
+
+    Raises:
+        ValueError: If something moves and there is no time, or the other way round.
+    """
     if given.moving is None:
         if args.time is not None:
             raise ValueError("--time must have a scene that moves, this one stands still; drop it")
