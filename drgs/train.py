@@ -38,6 +38,7 @@ from drgs.fitting.trainer import StepResult, Trainer
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
 from drgs.integrator import render
+from drgs.machine import peak_memory
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
@@ -181,7 +182,7 @@ def _fit(
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
     )
-    told = {"motion": moved} if moved else {}
+    told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **told)
     return FitResult(g, written, run, loop.seconds)
 

@@ -51,6 +51,7 @@ __all__ = [
     "Info",
     "Query",
     "Render",
+    "Report",
     "Scene",
     "Select",
     "Sfm",
@@ -156,6 +157,8 @@ class Fit(Choosing, Data, Taught, Moving):
     """After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never."""
     measure: tuple[int, ...] = ActiveConfig.measure
     """Measure the held-out views also when there are so many views, just before the next one is chosen."""
+    report: bool = True
+    """Write report.html into the run folder at the end; --no-report saves its seconds."""
 
     def settings(self) -> RenderSettings:
         """As for every command, with the background that the photographs are composited on."""
@@ -312,6 +315,16 @@ class Eval(Common, Data):
     """Which views."""
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Report(Common):
+    """Write what a fit looked like as one HTML file: curves, views, picks, maps, timings, and how to repeat it."""
+
+    run: Positional[Path]
+    """A run folder; the fit may still be going on, or have been stopped."""
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The HTML file; default report.html in the run folder. While a fit writes there, name another place."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
