@@ -101,7 +101,8 @@ def _check_numbers(path: Path, values: dict) -> None:
 
 def _events(run: Run) -> tuple[list[dict[str, Any]], float]:
     """The log, without what a resumed fit did again or a killed one left half written; the seconds it covers."""
-    path, kept = run.path / "log.jsonl", []
+    path = run.path / "log.jsonl"
+    kept: list[dict[str, Any]] = []
     began = last = None
     wall = 0.0
     lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["camera_map", "is_available", "progress", "score_bars"]
 
 _WIDTH = 5.2  # inches: about a phone's width, where text keeps its size; wider screens enlarge it
-_STYLE = {"svg.fonttype": "none", "font.size": 8.5, "font.family": "sans-serif", "axes.spines.top": False}
+_STYLE: Any = {"svg.fonttype": "none", "font.size": 8.5, "font.family": "sans-serif", "axes.spines.top": False}
 _STYLE |= {"axes.spines.right": False, "axes.grid": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.6}
 _BLUE, _RED, _GREEN, _GRAY = "#1f6fb4", "#c43c39", "#2b8a4b", "#9a9a9a"
 _MOST_BARS = 40  # picks that are drawn, the last ones
@@ -135,9 +135,8 @@ def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Ca
         "held out": ("D", _GREEN, 1.0),
     }
     for name, group in groups.items():
-        marker, color, opacity = styles[name]
-        _stand(axis, group, axes, reach, marker, color, opacity, f"{name} ({len(group)})")
-    _stand(axis, [camera for camera, _ in picked], axes, reach, "o", _RED, 1.0, f"picked, in order ({len(picked)})")
+        _stand(axis, group, axes, reach, styles[name], f"{name} ({len(group)})")
+    _stand(axis, [x for x, _ in picked], axes, reach, ("o", _RED, 1.0), f"picked, in order ({len(picked)})")
     for camera, text in picked:
         x, y = axes @ camera.center
         axis.annotate(_plain(text), (x, y), xytext=(4, 4), textcoords="offset points", color=_RED, fontsize=8)
@@ -149,11 +148,12 @@ def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Ca
 
 
 def _stand(
-    axis: Axes, cameras: Sequence[Camera], axes: np.ndarray, reach: float, marker: str, color: str, opacity: float, name
+    axis: Axes, cameras: Sequence[Camera], axes: np.ndarray, reach: float, style: tuple[str, str, float], name: str
 ) -> None:
-    """Marks of cameras, each with a line the way it looks."""
+    """Marks of cameras, each with a line the way it looks; the style is marker, color and opacity."""
     if not cameras:
         return
+    marker, color, opacity = style
     places = np.array([axes @ camera.center for camera in cameras])
     ways = np.array([axes @ camera.c2w[:3, 2] for camera in cameras]) * reach
     for (x, y), (dx, dy) in zip(places, ways, strict=True):

@@ -246,11 +246,12 @@ def _picks(account: Account) -> dict[str, Any]:
 def _timings(account: Account) -> list[tuple[str, str, str]]:
     """Where the wall time went."""
     steps, wall = _seconds(account), account.wall
-    choosing = sum(pick["seconds"] for pick in account.selection["picks"]) if account.selection else 0.0
+    picks = account.selection["picks"] if account.selection else []
+    choosing = sum(pick["seconds"] for pick in picks)
     per_step = 1000 * steps / max(account.step, 1)
     rows = [(f"steps ({per_step:.0f} ms each)", steps)]
     if choosing:
-        rows.append((f"scores of candidates ({choosing / len(account.selection['picks']):.1f} s a pick)", choosing))  # type: ignore[index]
+        rows.append((f"scores of candidates ({choosing / len(picks):.1f} s a pick)", choosing))
     rows.append(("photographs, points, pictures, checkpoints, measuring", max(wall - steps - choosing, 0.0)))
     share = lambda x: f"{x / wall:.0%}" if wall > 0 else "-"  # noqa: E731
     return [(name, f"{x:.1f}", share(x)) for name, x in rows] + [("all", f"{wall:.1f}", share(wall))]

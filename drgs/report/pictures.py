@@ -115,14 +115,14 @@ def maps(
     """
     if not known or not shown:
         return {}
-    counted, result = spread(known, _KNOWN), {}
+    counted, result = spread(known, _KNOWN), dict[str, tuple[Picture, Picture]]()
     sphere = fisher.backdrop_sphere(scene, [*known, *shown.values()])
     with Bar("maps of information", len(counted) + len(shown)) as bar:
         total: dict[str, torch.Tensor] = {}
         for camera in counted:
             plain = colors_only(scene, camera.time)
-            said = fisher.diagonal(plain, camera, settings)
-            said["backdrop"] = fisher.backdrop(plain, camera, settings, sphere=sphere)
+            behind = fisher.backdrop(plain, camera, settings, sphere=sphere)
+            said = {**fisher.diagonal(plain, camera, settings), "backdrop": behind}
             for name, x in said.items():
                 total[name] = total.get(name, 0) + x * (len(known) / len(counted))
             bar.advance()

@@ -61,7 +61,9 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
         )
     names = _typical(account)
     cast = None if dataset is None else _Cast.of(account, dataset)
-    found, stills, still_name = {}, [], ""
+    found: dict[str, tuple[pictures.Picture, pictures.Picture]] = {}
+    stills: list[pictures.Picture] = []
+    still_name = ""
     if loaded is not None and cast is not None:
         shown = {name: cast.held[name] for name in names if name in cast.held}
         found = pictures.maps(loaded.scene, cast.fitted, shown, account.record.config.settings)
