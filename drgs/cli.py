@@ -23,9 +23,9 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
+from drgs.commands.making_options import Demo, Scene, Sfm, Teach
 from drgs.commands.options import (
     Crossval,
-    Demo,
     Eval,
     Fisher,
     Fit,
@@ -33,11 +33,8 @@ from drgs.commands.options import (
     Query,
     Render,
     Report,
-    Scene,
     Select,
-    Sfm,
     Stress,
-    Teach,
     Tradeoff,
 )
 from drgs.display.progress import Bar
@@ -107,6 +104,16 @@ def main(argv: list[str] | None = None) -> int:
         if args.debug:
             raise
         _complain(name, str(error) or type(error).__name__)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        from drgs.guards.memory import is_out_of_memory
+
+        if args.debug or not is_out_of_memory(error):
+            raise
+        told = str(error) if type(error) is MemoryError else ""  # others speak of single arrays
+        _complain(
+            name, told or "there must be more memory, none was left; free some, or ask for smaller views"
+        )
         return 2
     except KeyboardInterrupt as error:
         if args.debug:

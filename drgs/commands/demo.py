@@ -33,7 +33,7 @@ from drgs.settings import RenderSettings
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Demo
+    from drgs.commands.making_options import Demo
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["Plan", "make_demo", "run"]
