@@ -111,9 +111,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.debug or not is_out_of_memory(error):
             raise
         told = str(error) if type(error) is MemoryError else ""  # others speak of single arrays
-        _complain(
-            name, told or "there must be more memory, none was left; free some, or ask for smaller views"
-        )
+        _complain(name, told or "there must be more memory, none was left; free some, or ask for smaller views")
         return 2
     except KeyboardInterrupt as error:
         if args.debug:
