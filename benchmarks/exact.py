@@ -58,7 +58,7 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
         source = DATA / name
         if not source.is_dir():
             return None
-    dataset, run = data.load(source, lazy=True), folder / name.replace(" ", "-")
+    dataset, run = data.load(source), folder / name.replace(" ", "-")
     if not (run / "point_cloud.ply").exists():
         fit(dataset, run, FitConfig(max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"))
     view = dataset.views[len(dataset.views) // 2]
