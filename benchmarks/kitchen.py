@@ -45,14 +45,15 @@ BLOCKS = {
 }
 CRITERIA = {name: {"policy": "fisher", "criterion": "eig", "blocks": blocks} for name, blocks in BLOCKS.items()}
 LAMBDAS = {f"joint, lambda {text}": {**CRITERIA["joint"], "prior": float(text)} for text in ("0", "1e-7", "1e-5")}
-POLICIES = {**BASELINES, **CRITERIA, "all views": None, **LAMBDAS}
+DEFAULT = "joint+backdrop, v_opt"  # the program's own choice where something moves
+POLICIES = {**BASELINES, **CRITERIA, "all views": None, **LAMBDAS, DEFAULT: {"policy": "fisher"}}
 TABLES = (
     (
         "Policies",
         "What one camera a time is worth, by who picks it (the paper's second table).",
-        (*BASELINES, "joint", "all views"),
+        (*BASELINES, "joint", DEFAULT, "all views"),
         "random",
-        tuple(("joint", name) for name in BASELINES if name != "random"),
+        tuple((name, other) for name in ("joint", DEFAULT) for other in BASELINES if other != "random"),
     ),
     (
         "lambda",

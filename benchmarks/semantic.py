@@ -36,6 +36,7 @@ from drgs.lab.study_report import study_report
 from drgs.train import ActiveConfig, FitConfig
 from scenes import room
 
+DEFAULT = "geometry+semantic+backdrop, v_opt"  # the program's own choice where there is a teacher
 POLICIES = {
     "random": {"policy": "random"},
     "uniform": {"policy": "uniform"},
@@ -47,6 +48,7 @@ POLICIES = {
         for blocks in (("geometry",), ("geometry", "semantic"))
         for criterion in ("eig", "block_logdet")
     },
+    DEFAULT: {"policy": "fisher"},
 }
 COMPARISONS = (
     ("geometry+semantic, eig", "geometry, eig"),
@@ -54,6 +56,10 @@ COMPARISONS = (
     ("geometry+semantic, eig", "fisherrf"),
     ("geometry+semantic, eig", "farthest"),
     ("geometry+semantic, eig", "moments"),
+    (DEFAULT, "farthest"),
+    (DEFAULT, "uniform"),
+    (DEFAULT, "fisherrf"),
+    (DEFAULT, "geometry+semantic, eig"),
 )
 
 

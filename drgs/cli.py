@@ -23,21 +23,19 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
+from drgs.commands.making_options import Demo, Scene, Sfm, Teach
 from drgs.commands.options import (
     Convert,
     Crossval,
-    Demo,
     Eval,
     Fisher,
     Fit,
     Info,
     Query,
     Render,
-    Scene,
+    Report,
     Select,
-    Sfm,
     Stress,
-    Teach,
     Tradeoff,
 )
 from drgs.display.progress import Bar
@@ -52,6 +50,7 @@ _OPTIONS = {
     "render": Render,
     "fit": Fit,
     "eval": Eval,
+    "report": Report,
     "select": Select,
     "fisher": Fisher,
     "query": Query,
@@ -107,6 +106,14 @@ def main(argv: list[str] | None = None) -> int:
         if args.debug:
             raise
         _complain(name, str(error) or type(error).__name__)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        from drgs.guards.memory import is_out_of_memory
+
+        if args.debug or not is_out_of_memory(error):
+            raise
+        told = str(error) if type(error) is MemoryError else ""  # others speak of single arrays
+        _complain(name, told or "there must be more memory, none was left; free some, or ask for smaller views")
         return 2
     except KeyboardInterrupt as error:
         if args.debug:

@@ -23,6 +23,7 @@ from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
 from drgs.guards.ply_headers import read_ply_header
+from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:
     import torch
@@ -369,9 +370,8 @@ class Run:
     def log(self, event: str, **fields: Any) -> None:
         """Append one event to `log.jsonl` in one write: a killed run leaves at most one partial last line."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-        line = json.dumps({"schema": SCHEMA, "time": now, "event": event, **fields}, default=_jsonable)
-        with (self.path / "log.jsonl").open("ab") as file:
-            file.write(line.encode() + b"\n")
+        line = {"schema": SCHEMA, "time": now, "event": event, **fields}
+        append_line(self.path / "log.jsonl", line, default=_jsonable)
 
     def events(self) -> list[dict]:
         """The events of `log.jsonl`; a partial last line is left out."""

@@ -6,7 +6,7 @@ import platform
 import sys
 from pathlib import Path
 
-__all__ = ["commit", "cpu_model", "gpu_name"]
+__all__ = ["commit", "cpu_model", "gpu_name", "peak_memory"]
 
 
 def cpu_model() -> str:
@@ -38,6 +38,16 @@ def commit() -> str | None:
 def gpu_name() -> str | None:
     """Names and driver versions of NVIDIA cards; None without."""
     return _output("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
+
+
+def peak_memory() -> int | None:
+    """The most bytes of memory that this process has held so far; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # not POSIX
+        return None
+    held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return held if sys.platform == "darwin" else 1024 * held
 
 
 def _output(*command: str) -> str | None:

@@ -36,8 +36,10 @@ from drgs.fitting.start import motion_of, start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.guards import interrupts
+from drgs.guards.memory import is_out_of_memory
 from drgs.guards.outputs import claim
 from drgs.integrator import render
+from drgs.machine import peak_memory
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
@@ -94,13 +96,22 @@ def fit(
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
             not finite.
+        MemoryError: When there is none left; the last checkpoint stays.
         KeyboardInterrupt: On Ctrl-C, SIGTERM and SIGHUP, after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
     runtime.backend()  # sets torch's threads too, at first use
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
-        return _fit(dataset, out_dir, config, active, parts, resume)
+        try:
+            return _fit(dataset, out_dir, config, active, parts, resume)
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise MemoryError(
+                f"{out_dir}: there must be more memory, none was left; what the last checkpoint holds is kept, free "
+                "some and go on with --resume, or fit again with fewer --max-pixels or --max-gaussians"
+            ) from error
 
 
 def _fit(
@@ -181,7 +192,7 @@ def _fit(
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
     )
-    told = {"motion": moved} if moved else {}
+    told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **told)
     return FitResult(g, written, run, loop.seconds)
 
@@ -252,6 +263,7 @@ class _Loop:
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
+        self._saved_at = time.monotonic()
 
     def run(self, bar: Bar) -> None:
         """All steps that are left, or as many as there are until the fit is interrupted."""
@@ -288,7 +300,8 @@ class _Loop:
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
                 # What a step has spoiled shows in the next one: good checkpoints stay until losses are finite again.
-                if done % config.save_every == 0 and done < config.max_steps and trainer.is_sound:
+                is_due = done % config.save_every == 0 or time.monotonic() - self._saved_at > 60 * config.save_minutes
+                if is_due and done < config.max_steps and trainer.is_sound:
                     self.save()
             self.save()
 
@@ -307,7 +320,7 @@ class _Loop:
         keep_previous(self.run_folder)
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index)
-        self._saved = now
+        self._saved, self._saved_at = now, time.monotonic()
 
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""

@@ -40,6 +40,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"fitting"}, "the parts of a fit"),
     ({"metrics"}, "pictures against photographs"),
     ({"train"}, "fits, for users"),
+    ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
     ({"crossval", "ladder", "testing"}, "the lab's doors, for users"),
     ({"commands"}, "one module a command: options in, files out"),

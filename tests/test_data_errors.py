@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import struct
 
 import numpy as np
@@ -299,3 +300,28 @@ def test_view_files_that_do_not_fit(tmp_path):
     write_image(tmp_path / "images" / "0.png", gradient(20, 20))
     with pytest.raises(ValueError, match="must be 24x16 pixels as its camera, got 20x20"):
         view.image()
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path", "depth_file_path", "ply_file_path"])
+@pytest.mark.parametrize("name", ["../secret.png", "images/../../secret.png", "/etc/hostname", "./../data2/x.png"])
+def test_transforms_name_nothing_outside(tmp_path, key, name):
+    """A data set from elsewhere opens no file of its user's."""
+    folder = tmp_path / "data"
+    top = {key: name} if key == "ply_file_path" else {}
+    write_transforms(folder, extra={} if top else {key: name}, **top)
+    write_image(tmp_path / "secret.png", gradient())
+    with pytest.raises(ValueError, match=f"{key} must name a file in {folder}, got '{re.escape(name)}'; move or link"):
+        load(folder)
+
+
+def test_a_link_that_the_user_has_put_there_is_followed(tmp_path):
+    """Photographs may lie on another disk, and absolute names may lead into the folder."""
+    folder = tmp_path / "data"
+    write_transforms(folder)
+    (folder / "images").rename(tmp_path / "elsewhere")
+    (folder / "images").symlink_to(tmp_path / "elsewhere")
+    assert len(load(folder).views) == 3
+    data = write_transforms(tmp_path / "data")
+    data["frames"][0]["file_path"] = str(folder / data["frames"][0]["file_path"])
+    save(folder, data)
+    assert len(load(folder).views) == 3

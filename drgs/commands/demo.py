@@ -19,6 +19,7 @@ import torch
 
 from drgs import metrics, reference, runtime
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.commands.report import report_of
 from drgs.data import load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -27,11 +28,12 @@ from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import psnr_of
 from drgs.guards.outputs import Claim, claim
 from drgs.integrator import render
+from drgs.report.write import FILE
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Demo
+    from drgs.commands.making_options import Demo
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["Plan", "make_demo", "run"]
@@ -44,7 +46,7 @@ _PRESETS = {
     "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
 }
 _GAIN = 8  # of difference pictures
-_OWN = ("demo", "eval")  # commands whose files in the run may be replaced
+_OWN = ("demo", "eval", "report")  # commands whose files in the run may be replaced
 _TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
 _DISTANCE = 1.1
 
@@ -190,9 +192,11 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
     start = time.perf_counter()
     pictures.write_png(out_dir / "comparison.png", _sheet(frames, images))
     _turntable(g, out_dir / "turntable.webm", plan, progress)
+    page = fitted.run.path / FILE
+    report_of(fitted.run, page, dataset)
     lap("pictures", start)
     seconds["total"] = time.perf_counter() - began
-    say(f"6. Pictures: {out_dir / 'comparison.png'}, {out_dir / 'turntable.webm'}, {out_dir / 'run' / 'renders'}")
+    say(f"6. Pictures: {out_dir / 'comparison.png'}, {out_dir / 'turntable.webm'}; the fit's report: {page}")
     say(f"All of it took {seconds['total']:.0f} s; numbers: {out_dir / 'demo.json'}")
     report = {
         "schema": SCHEMA,

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 from drgs import data
 from drgs.commands.eval import print_table
+from drgs.commands.report import report_of
 from drgs.files import Run
 from drgs.fitting.resume import claim_run
+from drgs.report.write import FILE
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
@@ -38,7 +40,12 @@ def run(args: Fit) -> None:
         semantics=config.semantics != "ignore",
     )
     result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
+    page = result.run.path / FILE
+    if args.report:
+        report_of(result.run, page, dataset)
     if args.quiet:
         return
     print_table(result.metrics)
     print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
+    if args.report:
+        print(f"report: {page}")

@@ -26,7 +26,6 @@ from drgs.commands.option_groups import (
     Settings,
     Split,
     Taught,
-    Timed,
     Views,
 )
 from drgs.commands.overrides import check_color
@@ -46,18 +45,15 @@ from drgs.settings import Preset, RenderSettings
 __all__ = [
     "Convert",
     "Crossval",
-    "Demo",
     "Eval",
     "Fisher",
     "Fit",
     "Info",
     "Query",
     "Render",
-    "Scene",
+    "Report",
     "Select",
-    "Sfm",
     "Stress",
-    "Teach",
     "Tradeoff",
 ]
 
@@ -135,6 +131,8 @@ class Fit(Choosing, Data, Taught, Moving):
     """Continue from the last checkpoint in the run folder."""
     save_every: int = FitConfig.save_every
     """Steps between checkpoints."""
+    save_minutes: float = FitConfig.save_minutes
+    """Minutes after which one is written all the same."""
     mask: MaskUse = FitConfig.mask
     """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
     background: tuple[float, float, float] = RenderSettings.background
@@ -157,6 +155,8 @@ class Fit(Choosing, Data, Taught, Moving):
     """After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never."""
     measure: tuple[int, ...] = ActiveConfig.measure
     """Measure the held-out views also when there are so many views, just before the next one is chosen."""
+    report: bool = True
+    """Write report.html into the run folder at the end; --no-report saves its seconds."""
 
     def settings(self) -> RenderSettings:
         """As for every command, with the background that the photographs are composited on."""
@@ -319,72 +319,10 @@ class Eval(Common, Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Sfm(Common):
-    """Recover cameras and points from plain photographs (COLMAP on the CPU)."""
+class Report(Common):
+    """Write what a fit looked like as one HTML file: curves, views, picks, maps, timings, and how to repeat it."""
 
-    images: Positional[Path]
-    """A folder of photographs."""
-    output: OutputPath
-    """Folder for the data set."""
-    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
-        "SIMPLE_RADIAL"
-    )
-    """COLMAP's name of the lens; photographs of one size share one camera."""
-    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match all pairs, or neighbors by name (video); auto decides by their number."""
-    seed: int = 0
-    """Seed of all random sampling."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Teach(Common, Timed):
-    """Add a teacher to a data set: feature maps of its photographs by a local CLIP model, and text embeddings."""
-
-    data: Positional[Path]
-    """A data set; the files are written into its folder, where drgs fit finds them. Nothing there is replaced."""
-    model: Path
-    """Folder of a CLIP model as transformers saves it; needs pip install 'drgs[teacher]'. Nothing is downloaded."""
-    classes: str | None = None
-    """Names with commas between, or a file of them (.txt, .json); default those that the data set names."""
-    size: str | None = None
-    """WIDTHxHEIGHT of a map in cells; default 80 along the longer side, of the photograph's shape."""
-    scales: str = "0.75,1,1.5"
-    """Of the photographs as the model sees them, averaged; 1: the short side is twice the model's image size."""
-    flip: bool = True
-    """Average with the mirrored photographs, too; --no-flip takes half the time."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Demo(Common):
-    """Make a still life, fit it, render it and compare presets: a tour in minutes."""
-
-    output: OutputPath = Path("out/demo")
-    """Folder for pictures and tables."""
-    quick: bool = False
-    """Half a minute with poor pictures, to see that everything runs."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Scene(Common):
-    """Make a data set by path tracing: a room or a kitchen in motion, with labels and a teacher, or a still life."""
-
-    name: Positional[Literal["room", "kitchen", "still_life"]]
-    """What to make. Room and kitchen have classes, points and a simulated teacher; in the kitchen, things move."""
-    output: OutputPath
-    """Folder for the data set; an interrupted command is continued there."""
-    size: str | None = None
-    """WIDTHxHEIGHT of the images in pixels; default 320x240, of the kitchen 240x180 (even numbers)."""
-    views: int | None = None
-    """How many images; default 75 (room) or 32 (still_life)."""
-    cameras: int | None = None
-    """How many cameras film (kitchen); default 15. cam00, in the middle of their arc, is the test view."""
-    times: int | None = None
-    """How many frames each camera films (kitchen); default 40."""
-    seed: int = 0
-    """Of shapes, textures, motions, cameras, light paths and all errors that are made on purpose."""
-    spp: int | None = None
-    """Light paths a pixel; default 25 (room), 16 (kitchen), 30 (still_life)."""
-    teacher_size: str | None = None
-    """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
-    test_every: int | None = None
-    """One in how many views is for testing (room); default 5, which is 15 of 75 views."""
+    run: Positional[Path]
+    """A run folder; the fit may still be going on, or have been stopped."""
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The HTML file; default report.html in the run folder. While a fit writes there, name another place."""

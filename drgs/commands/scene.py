@@ -12,7 +12,7 @@ from drgs.commands.overrides import parsed_size
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Scene
+    from drgs.commands.making_options import Scene
 
 __all__ = ["run"]
 

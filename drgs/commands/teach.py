@@ -30,7 +30,7 @@ from drgs.guards.json_files import read_json
 from drgs.guards.outputs import Claim, claim
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Teach
+    from drgs.commands.making_options import Teach
     from drgs.data import View
 
 __all__ = ["run"]

@@ -26,6 +26,7 @@ from drgs.guards.foreign import refuse_foreign
 __all__ = [
     "IMAGE_SUFFIXES",
     "image_size",
+    "inside",
     "inverse_pose",
     "is_file",
     "list_images",
@@ -55,6 +56,25 @@ _log = logging.getLogger(__name__)
 def list_images(folder: Path) -> list[Path]:
     """Image files directly in a folder, by name; hidden files are left out."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+
+
+def inside(folder: Path, name: str, where: str) -> Path:
+    """The file that a data set's own file names: data sets come from elsewhere, and may name nothing outside of theirs.
+
+    Links that lie in the folder are followed: whoever put them there knows where they lead.
+
+    Args:
+        folder: That the name is relative to.
+        name: What the file says.
+        where: Place of the name, for the message.
+    Raises:
+        ValueError: If it leaves the folder.
+    """
+    if not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder)):
+        raise ValueError(
+            f"{where} must name a file in {folder}, got {name[:80]!r}; move or link the file there and name it so"
+        )
+    return folder / name
 
 
 def is_file(path: Path) -> bool:

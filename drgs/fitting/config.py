@@ -34,6 +34,7 @@ __all__ = [
     "InitPoints",
     "MaskUse",
     "PickPoints",
+    "SAVING",
     "Schedule",
     "SemanticUse",
     "Start",
@@ -51,9 +52,13 @@ FeatureSize = Literal["image", "teacher"]
 Dynamics = Literal["auto", "ignore"]
 FieldPreset = Literal["neu3d", "dnerf"]
 
+SAVING = ("save_every", "save_minutes")
+"""Fields of `FitConfig` that change nothing of what is fitted: a fit may go on with others."""
+
 _COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
 _RANGES = {
     **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
+    "save_minutes": (1e-3, 1e9),
     "test_every": (0, 10**9),
     "test_offset": (0, 10**9),
     "seed": (0, 2**31 - 1),  # what COLMAP takes
@@ -97,6 +102,7 @@ class FitConfig:
         sh_degree: Highest degree of the view-dependent color.
         deterministic: One Dr.Jit thread, hence the same bits for the same seed.
         save_every: Steps between checkpoints.
+        save_minutes: A checkpoint is written after so many minutes, too, however few steps these were.
         mask: `object` (nothing is outside), `valid` (anything may be outside), `ignore`, or `auto`: `object` where
             the data set has mask files, `valid` where undistorted photographs have empty corners.
         means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
@@ -161,6 +167,7 @@ class FitConfig:
     sh_degree: Degree = 3
     deterministic: bool = False
     save_every: int = 1000
+    save_minutes: float = 10.0
     mask: MaskUse = "auto"
     means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
     dc_rate: float = 2.5e-3

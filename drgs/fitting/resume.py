@@ -31,6 +31,7 @@ FILES = (
     "selection.json",
     EMBEDDINGS,
     "point_cloud.ply",
+    "report.html",
     *_CHECKPOINTS,
 )
 """What a fit writes into its run folder, besides `renders/`."""

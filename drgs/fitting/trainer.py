@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.config import FitConfig
+from drgs.fitting.config import SAVING, FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
@@ -222,7 +222,7 @@ class Trainer:
         """Continue from a checkpoint.
 
         Args:
-            config, frames: As they were; `save_every` may change.
+            config, frames: As they were; when checkpoints are written (`SAVING`) may change.
             tensors, header: Of the checkpoint.
             where: It, for messages.
             parts: As they were at the first step; networks are overwritten by those of the checkpoint.
@@ -230,11 +230,10 @@ class Trainer:
         Raises:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
-        free = ("save_every",)
         # What an older drgs did not know, it did as the defaults say.
         new, old = config.to_json(), FitConfig().to_json() | header["config"]
         for key in new:
-            if key not in free and new[key] != old[key]:
+            if key not in SAVING and new[key] != old[key]:
                 raise ValueError(
                     f"{where}: --resume must continue the same fit, {key} was {old[key]!r} and is {new[key]!r}; "
                     "repeat the options or choose another run folder"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "require"]
+__all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of_memory", "require"]
 
 # Measured: what a frame of 1024^2 to 4096^2 pixels adds to the resident set of a fresh process (LLVM, one thread; rgb,
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
@@ -59,6 +59,12 @@ def require(where: str, needed: int, what: str, advice: str, cuda: bool = False)
             f"{where}: there must be memory for {what}, which takes at least {_gigabytes(needed)}, "
             f"got {_gigabytes(max(there, 0))} available; {advice}"
         )
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory has run out: Python's and NumPy's do by type, torch's and Dr.Jit's in words."""
+    words = ("can't allocate memory", "out of memory", "bad allocation", "std::bad_alloc")
+    return isinstance(error, MemoryError) or any(word in str(error).lower() for word in words)
 
 
 def available() -> int | None:

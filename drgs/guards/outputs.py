@@ -9,7 +9,6 @@ else's, or was edited, and stays. The same is asked again when a file is put in 
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import logging
 import os
@@ -20,6 +19,7 @@ from pathlib import Path
 
 from drgs.guards import locks, unfinished
 from drgs.guards.authors import author_of, fingerprint, is_log, is_there
+from drgs.guards.writing import append_line, named
 
 __all__ = [
     "Claim",
@@ -31,7 +31,6 @@ __all__ = [
 ]
 
 JOURNAL = ".drgs.jsonl"
-_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 _log = logging.getLogger(__name__)
 _claims: dict[Path, Claim] = {}
@@ -114,8 +113,7 @@ class Claim:
         if known.get(row["sha256"]) == row["command"]:
             return
         known[row["sha256"]] = row["command"]
-        with (self.path / JOURNAL).open("ab") as file:
-            file.write(json.dumps(row).encode() + b"\n")
+        append_line(self.path / JOURNAL, row)
 
     def adopt(self, names: Iterable[str], command: str) -> None:
         """Take what is there for a command's own, where there is no record: a copy without hidden files."""
@@ -319,10 +317,7 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
                 held.record(inside, name)
             os.replace(name, path)
     except OSError as error:
-        if error.errno not in _FULL:
-            raise
-        reason = f"must be written, got: {error.strerror}; free some space or choose another folder"
-        raise OSError(f"{path}: {reason}") from None
+        raise named(path, error) from None
 
 
 def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim:

@@ -23,7 +23,7 @@ import numpy as np
 from drgs import data
 from drgs.files import Run
 from drgs.fitting.active import SELECTION, ActiveViews
-from drgs.fitting.config import ActiveConfig, FitConfig, Start
+from drgs.fitting.config import SAVING, ActiveConfig, FitConfig, Start
 from drgs.fitting.resume import claim_run
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
@@ -341,7 +341,7 @@ def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> Non
         found = found or {}
         was = wanted.recorded(found) if isinstance(wanted, ActiveConfig) else {**FitConfig().to_json(), **found}
         for key, value in now.items():
-            if value != was[key] and key != "save_every":
+            if value != was[key] and key not in SAVING:
                 raise ValueError(
                     f"{run.path}: must be the run of this cell, {key} was {was[key]!r} and is {value!r}; "
                     "give the study another name, or move the folder away"

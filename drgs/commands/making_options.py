@@ -1,0 +1,85 @@
+"""What the commands that make data can be asked for: photographs to cameras, teachers, made scenes, and the demo."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from drgs.commands.option_groups import Common, OutputPath, Timed
+
+__all__ = ["Demo", "Scene", "Sfm", "Teach"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sfm(Common):
+    """Recover cameras and points from plain photographs (COLMAP on the CPU)."""
+
+    images: Positional[Path]
+    """A folder of photographs."""
+    output: OutputPath
+    """Folder for the data set."""
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
+        "SIMPLE_RADIAL"
+    )
+    """COLMAP's name of the lens; photographs of one size share one camera."""
+    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Match all pairs, or neighbors by name (video); auto decides by their number."""
+    seed: int = 0
+    """Seed of all random sampling."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Teach(Common, Timed):
+    """Add a teacher to a data set: feature maps of its photographs by a local CLIP model, and text embeddings."""
+
+    data: Positional[Path]
+    """A data set; the files are written into its folder, where drgs fit finds them. Nothing there is replaced."""
+    model: Path
+    """Folder of a CLIP model as transformers saves it; needs pip install 'drgs[teacher]'. Nothing is downloaded."""
+    classes: str | None = None
+    """Names with commas between, or a file of them (.txt, .json); default those that the data set names."""
+    size: str | None = None
+    """WIDTHxHEIGHT of a map in cells; default 80 along the longer side, of the photograph's shape."""
+    scales: str = "0.75,1,1.5"
+    """Of the photographs as the model sees them, averaged; 1: the short side is twice the model's image size."""
+    flip: bool = True
+    """Average with the mirrored photographs, too; --no-flip takes half the time."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo(Common):
+    """Make a still life, fit it, render it and compare presets: a tour in minutes."""
+
+    output: OutputPath = Path("out/demo")
+    """Folder for pictures and tables."""
+    quick: bool = False
+    """Half a minute with poor pictures, to see that everything runs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scene(Common):
+    """Make a data set by path tracing: a room or a kitchen in motion, with labels and a teacher, or a still life."""
+
+    name: Positional[Literal["room", "kitchen", "still_life"]]
+    """What to make. Room and kitchen have classes, points and a simulated teacher; in the kitchen, things move."""
+    output: OutputPath
+    """Folder for the data set; an interrupted command is continued there."""
+    size: str | None = None
+    """WIDTHxHEIGHT of the images in pixels; default 320x240, of the kitchen 240x180 (even numbers)."""
+    views: int | None = None
+    """How many images; default 75 (room) or 32 (still_life)."""
+    cameras: int | None = None
+    """How many cameras film (kitchen); default 15. cam00, in the middle of their arc, is the test view."""
+    times: int | None = None
+    """How many frames each camera films (kitchen); default 40."""
+    seed: int = 0
+    """Of shapes, textures, motions, cameras, light paths and all errors that are made on purpose."""
+    spp: int | None = None
+    """Light paths a pixel; default 25 (room), 16 (kitchen), 30 (still_life)."""
+    teacher_size: str | None = None
+    """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
+    test_every: int | None = None
+    """One in how many views is for testing (room); default 5, which is 15 of 75 views."""

@@ -1,0 +1,77 @@
+"""The command that repeats a fit, from what its run folder says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+import typing
+from pathlib import Path
+from typing import Any
+
+from drgs.commands.options import Fit
+from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.settings import Preset, RenderSettings
+
+__all__ = ["fit_command"]
+
+
+def fit_command(config: FitConfig, active: ActiveConfig | None, data: Path, output: Path) -> tuple[str, list[str]]:
+    """`drgs fit ...` with every option that is not the default's.
+
+    Args:
+        config, active: Of the fit; None: it was fitted to all views.
+        data, output: The data set and the run folder.
+    Returns:
+        The line for a shell, and the fields of `config` that no option sets, as `name=value`: these need Python.
+    """
+    options = {field.name: field.default for field in dataclasses.fields(Fit)}
+    words, beyond = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings)], []
+    usual = FitConfig()
+    for field in dataclasses.fields(FitConfig):
+        value = getattr(config, field.name)
+        if field.name == "settings":
+            continue
+        if field.name in options:
+            words += _option(field.name, value, options[field.name])
+        elif value != getattr(usual, field.name):
+            beyond.append(f"{field.name}={json.dumps(value)}")
+    if active is not None:
+        words += ["--views", "active"]
+        for field in dataclasses.fields(ActiveConfig):
+            words += _option(field.name, getattr(active, field.name), options[field.name])
+    return shlex.join(words), beyond
+
+
+def _settings(settings: RenderSettings) -> list[str]:
+    """The preset that is nearest, and what replaces its fields."""
+    differences = {}
+    for name in typing.get_args(Preset):
+        preset = RenderSettings.preset(name, background=settings.background)
+        fields = [field.name for field in dataclasses.fields(RenderSettings)]
+        differences[name] = {x: getattr(settings, x) for x in fields if getattr(settings, x) != getattr(preset, x)}
+    usual = Fit.preset
+    nearest = min(differences, key=lambda name: (len(differences[name]), name != usual))
+    words = [] if nearest == usual else ["--preset", nearest]
+    for name, value in differences[nearest].items():
+        words += ["--set", f"{name}={_value(value)}"]
+    return words + _option("background", settings.background, RenderSettings.background)
+
+
+def _option(name: str, value: Any, default: Any) -> list[str]:
+    """The words of an option, none if it has its default."""
+    if value == default:
+        return []
+    option = "--" + name.replace("_", "-")
+    if isinstance(value, bool):
+        return [option if value else "--no-" + option[2:]]
+    if name in ("blocks", "test_cameras"):
+        return [option, ",".join(value) or "none"]
+    return [option, *(map(_value, value) if isinstance(value, tuple | list) else [_value(value)])]
+
+
+def _value(value: Any) -> str:
+    """As the command line reads it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, float) else str(value)

@@ -1,0 +1,89 @@
+"""`drgs report`: what a fit looked like, as one HTML file."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs import data
+from drgs.commands.repeat import fit_command
+from drgs.files import Run
+from drgs.fitting.config import ActiveConfig
+from drgs.fitting.records import fit_record
+from drgs.fitting.resume import claim_run
+from drgs.guards.arguments import ArgumentError
+from drgs.guards.outputs import check_file
+from drgs.report.page import GENERATOR
+from drgs.report.write import FILE, write_report
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Report
+    from drgs.data import Dataset
+
+__all__ = ["report_of", "run"]
+
+_log = logging.getLogger(__name__)
+
+
+def run(args: Report) -> None:
+    """`drgs report RUN`."""
+    folder = Run(args.run)
+    record = fit_record(folder)
+    path = args.output
+    if path is None:
+        path = folder.path / FILE
+        claim_run(folder, "report").check([FILE])
+    else:
+        if path.suffix.lower() not in (".html", ".htm"):
+            raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")
+        check_file(path, "report", [folder.path / "config.json"], is_report)
+    config = record.config
+    try:
+        dataset = data.load(
+            record.data,
+            test_every=config.test_every,
+            test_offset=config.test_offset,
+            times=config.times,
+            test_cameras=config.test_cameras,
+            background=config.settings.background,
+            lazy=True,
+            points=False,
+            semantics=False,
+        )
+    except (OSError, ValueError) as error:
+        _log.warning("%s; the report goes without the data set's cameras", str(error).partition(";")[0])
+        dataset = None
+    report_of(folder, path, dataset)
+    if not args.quiet:
+        print(f"report: {path}")
+
+
+def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
+    """Write the page of a run.
+
+    Args:
+        run: The run folder.
+        path: The HTML file.
+        dataset: What was fitted; None where it is no longer there.
+    """
+    record = fit_record(run)
+    active = None
+    if record.is_active:
+        known = {name: x for name, x in ActiveConfig.recorded(run.config()["active"]).items()}
+        try:
+            active = ActiveConfig(**{name: tuple(x) if isinstance(x, list) else x for name, x in known.items()})
+        except (TypeError, ValueError, ArgumentError) as error:
+            text = " ".join(str(error).split())
+            raise ValueError(f"{run.path / 'config.json'}: active: {text}; restore the file") from None
+    command, beyond = fit_command(record.config, active, record.data, run.path)
+    text = "The command that repeats this fit, in another folder:"
+    if beyond:
+        text = f"Fitted from Python: FitConfig({', '.join(beyond)}), beside what this command says:"
+    write_report(run, path, command, text, dataset)
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file says that `drgs report` wrote it."""
+    with path.open("rb") as file:
+        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(1000)

@@ -1,0 +1,300 @@
+"""The page of a run: an HTML file that loads nothing from outside, reads well on a phone, and can be printed.
+
+Whatever a file said is text on it: Jinja escapes it, pictures are encoded anew, and the page's own policy
+(Content-Security-Policy) lets a browser run nothing but the one script that is written here.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.report.pictures import Picture
+
+if TYPE_CHECKING:
+    from drgs.report.account import Account
+
+__all__ = ["GENERATOR", "Shown", "page_html"]
+
+GENERATOR = "drgs report"
+"""What the page says of itself: a file that does is one that may be replaced."""
+
+_HERE = Path(__file__).parent
+_DIGITS = {"psnr": 2, "psnr_moving": 2}
+_NO_CHARTS = "Charts are left out: they need matplotlib, pip install 'drgs[report]'."
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What was drawn for a page.
+
+    Attributes:
+        charts: `progress`, `scores`, `cameras` -> SVG, or None.
+        previews: Pictures of the way.
+        views: Names of the views that are shown, with pictures by name: `photos`, `semantics` and `maps`.
+        moments: Stills of one camera, and its name.
+        notes: What is left out, and why.
+    """
+
+    charts: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
+    previews: Sequence[Picture] = ()
+    views: Sequence[str] = ()
+    photos: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
+    semantics: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
+    maps: Mapping[str, Sequence[Picture]] = dataclasses.field(default_factory=dict)
+    moments: Sequence[Picture] = ()
+    moments_of: str = ""
+    notes: Sequence[str] = ()
+
+
+def page_html(account: Account, shown: Shown, command: str, command_text: str) -> str:
+    """The page.
+
+    Args:
+        account: How the fit went.
+        shown: Charts and pictures.
+        command: That repeats the fit.
+        command_text: What it does not repeat, if anything.
+    """
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+    script = (_HERE / "page.js").read_text()
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    metrics = account.metrics or {}
+    context: dict[str, Any] = {
+        "generator": GENERATOR,
+        "script": Markup(script),  # ours, as the charts are: matplotlib has escaped their texts
+        "script_hash": f"sha256-{digest}",
+        "title": account.run.path.resolve().name or "run",
+        "subtitle": _subtitle(account),
+        "tiles": _tiles(account),
+        "notes": [*shown.notes, *([] if any(shown.charts.values()) else [_NO_CHARTS])],
+        "charts": {name: Markup(svg) for name, svg in shown.charts.items() if svg},
+        "previews": shown.previews,
+        "previewed": "Photograph and rendering of the first held-out view, as it came along."
+        if account.record.test
+        else "Photograph and rendering of the first view, as it came along.",
+        "split": {"test": "Held-out", "train": "Fitted"}.get(metrics.get("split", ""), "Measured"),
+        **_views(metrics, shown),
+        "segmentation": _segmentation(metrics),
+        "moments": shown.moments,
+        "moments_text": f"Camera {shown.moments_of}, stopped where it is, at times of the sequence.",
+        **_picks(account),
+        "timings": _timings(account),
+        "memory": _memory(account),
+        "command": command,
+        "command_text": command_text,
+        "configuration": _configuration(account),
+        "environment": _environment(account),
+    }
+    context["sections"] = _sections(context)
+    environment = Environment(autoescape=True, trim_blocks=True)
+    return environment.from_string((_HERE / "page.html").read_text()).render(**context) + "\n"
+
+
+def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Anchors of what is on the page."""
+    there = {
+        "fit": ("How it went", context["charts"].get("progress") or context["previews"]),
+        "views": ("Views", context["views"]),
+        "labels": ("Labels", context["segmentation"]),
+        "time": ("Over time", context["moments"]),
+        "cameras": ("Cameras", context["charts"].get("cameras") or context["picks"]),
+        "time-spent": ("Time and memory", True),
+        "repeat": ("Again", True),
+    }
+    return [(key, name) for key, (name, is_there) in there.items() if is_there]
+
+
+def _subtitle(account: Account) -> str:
+    made = account.env
+    when = account.events[-1]["time"][:16].replace("T", " ") + " UTC" if account.events else "before its first step"
+    by = f"drgs {made['drgs']}" + (f", commit {made['commit']}" if made.get("commit") else "") if "drgs" in made else ""
+    kinds = ["active fit"] if account.record.is_active else ["fit"]
+    kinds += ["with semantics"] * (account.record.semantics is not None) + ["of what moves"] * bool(
+        account.record.times
+    )
+    return "; ".join(part for part in (f"{' '.join(kinds)} of {account.record.data}", account.state, when, by) if part)
+
+
+def _tiles(account: Account) -> list[tuple[str, str]]:
+    """The few numbers that a reader looks for first."""
+    metrics, tiles = account.metrics, []
+    if metrics is not None:
+        units = {"psnr": " dB", "psnr_moving": " dB"}
+        names = {"psnr": "PSNR", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS", "psnr_moving": "PSNR of what moves"}
+        for name, text in names.items():
+            if (value := metrics["mean"].get(name)) is not None:
+                what = f"{text}, {metrics['count']} {metrics['split']} views"
+                tiles.append((_shown(name, value) + units.get(name, ""), what))
+        labels = (metrics.get("segmentation") or {}).get("run") or {}
+        if isinstance(labels.get("miou"), float):
+            tiles.append((f"{labels['miou']:.3f}", "mIoU"))
+    count = next((row["gaussians"] for row in reversed(account.of("train"))), None)
+    if count is not None:
+        tiles.append((f"{count:,}", "Gaussians"))
+    if account.selection is not None:
+        chosen = account.selection
+        views = len(chosen["start"]) + len(chosen["picks"])
+        tiles.append((f"{views} of {len(chosen['pool'])}", "views, the last ones picked"))
+    else:
+        tiles.append((str(len(account.record.train)), "views fitted to"))
+    return [*tiles, (_duration(_seconds(account)), "of steps")]
+
+
+def _seconds(account: Account) -> float:
+    return max((row["seconds"] for row in account.events if row["event"] in ("train", "done")), default=0.0)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def _shown(name: str, value: float | None) -> str:
+    return "-" if value is None else f"{value:.{_DIGITS.get(name, 3)}f}"
+
+
+def _views(metrics: Mapping[str, Any], shown: Shown) -> dict[str, Any]:
+    """Views with their pictures, and the table of all."""
+    rows = {row["name"]: row for row in metrics.get("views", ())}
+    views = []
+    for name in shown.views:
+        psnr = rows[name].get("psnr") if name in rows else None
+        text = "" if psnr is None else f"{psnr:.2f} dB"
+        pictures = {"photo": shown.photos.get(name), "semantics": shown.semantics.get(name)}
+        views.append({"name": name, "text": text, "maps": shown.maps.get(name), **pictures})
+    names = [name for name, value in metrics.get("mean", {}).items() if value is not None]
+    table = [(name, *(_shown(key, row.get(key)) for key in names)) for name, row in rows.items()]
+    if rows:
+        table.append(("mean", *(_shown(key, metrics["mean"][key]) for key in names)))
+    several = len(views) > 1
+    text = "From the worst to the best by PSNR." if several else ""
+    if shown.maps:
+        text += (
+            " Predictive variance: how uncertain the color of each pixel is by what the fitted views say (unit noise, "
+            "lambda = 1; bright is uncertain, and what no view has shown is brightest). Not covered: white where no "
+            "Gaussian is."
+        )
+    definitions = metrics.get("variants")
+    listed = [(str(key), str(x)) for key, x in definitions.items()] if isinstance(definitions, dict) else []
+    return {
+        "views": views,
+        "views_text": text,
+        "metrics_head": ("view", *names),
+        "metrics_rows": table,
+        "definitions": listed,
+    }
+
+
+def _segmentation(metrics: Mapping[str, Any]) -> dict[str, Any] | None:
+    """How well labels agree with their reference."""
+    found = metrics.get("segmentation")
+    if not isinstance(found, dict):
+        return None
+    names = {"pixel_accuracy": "pixel accuracy", "class_accuracy": "class accuracy", "miou": "mIoU"}
+    names["miou_top7"] = "mIoU of the seven most frequent"
+    rows = []
+    for who in ("run", "teacher"):
+        values = found.get(who)
+        if isinstance(values, dict):
+            numbers = [values.get(key) for key in names]
+            rows.append((who, *(f"{x:.3f}" if isinstance(x, int | float) else "-" for x in numbers)))
+    reference = {"labels": "the data set's labels", "teacher": "the teacher's labels, which are not the truth"}
+    text = f"Compared with {reference.get(str(found.get('reference')), 'a reference')} ({found.get('folder')})."
+    return {"text": text, "head": ("", *names.values()), "rows": rows} if rows else None
+
+
+def _picks(account: Account) -> dict[str, Any]:
+    """What was picked, and what the held-out views had on the way."""
+    selection, rows = account.selection, []
+    if selection is None:
+        return {"picks": [], "measured": []}
+    for pick in selection["picks"]:
+        best = max(pick["parts"].items(), key=lambda part: abs(part[1] or 0.0), default=("-", 0.0))[0]
+        numbers = ["-" if x is None else f"{x:.4g}" for x in (pick["score"], pick["margin"])]
+        where = f"{pick['number']}", pick["name"], best
+        rows.append((*where, *numbers, f"{pick['step']:,}", len(pick["candidates"]), f"{pick['seconds']:.1f}"))
+    policies = sorted({pick["policy"] for pick in selection["picks"]})
+    criteria = sorted({str(pick["criterion"]) for pick in selection["picks"] if pick.get("criterion")})
+    how = ", ".join([*policies, *criteria])
+    leak = " Initial points are of the whole data set, views that were not picked included." * selection["pool_leak"]
+    measured, names = [], ("psnr", "ssim", "flip")
+    for row in selection.get("measured") or ():
+        if isinstance(row, dict) and isinstance(row.get("mean"), dict):
+            values = [row["mean"].get(name) for name in names]
+            measured.append((row.get("views"), *(f"{x:.3f}" if isinstance(x, int | float) else "-" for x in values)))
+    head = ("", "view", "largest part", "score", "margin to the next", "step", "candidates", "seconds")
+    return {
+        "picks": rows,
+        "picks_head": head,
+        "picks_text": f"Picked by {how}.{leak}",
+        "measured": measured,
+        "measured_head": ("views", *names),
+    }
+
+
+def _timings(account: Account) -> list[tuple[str, str, str]]:
+    """Where the wall time went."""
+    steps, wall = _seconds(account), account.wall
+    picks = account.selection["picks"] if account.selection else []
+    choosing = sum(pick["seconds"] for pick in picks)
+    per_step = 1000 * steps / max(account.step, 1)
+    rows = [(f"steps ({per_step:.0f} ms each)", steps)]
+    if choosing:
+        rows.append((f"scores of candidates ({choosing / len(picks):.1f} s a pick)", choosing))
+    rows.append(("photographs, points, pictures, checkpoints, measuring", max(wall - steps - choosing, 0.0)))
+    share = lambda x: f"{x / wall:.0%}" if wall > 0 else "-"  # noqa: E731
+    return [(name, f"{x:.1f}", share(x)) for name, x in rows] + [("all", f"{wall:.1f}", share(wall))]
+
+
+def _memory(account: Account) -> str:
+    peaks = [row["peak_memory"] for row in account.of("done") if isinstance(row.get("peak_memory"), int)]
+    threads = account.env.get("threads")
+    text = f"Peak memory of the process: {max(peaks) / 1e9:.2f} GB. " if peaks else ""
+    if isinstance(threads, dict) and isinstance(threads.get("drjit"), int):
+        text += f"{threads['drjit']} threads of Dr.Jit on {account.env.get('cpu')}."
+    return text
+
+
+def _configuration(account: Account) -> list[tuple[str, str, bool]]:
+    """Name, value and whether it is not the default, of every field."""
+    config, rows = account.record.config.to_json(), []
+    usual = FitConfig().to_json()
+    for name, value in config.pop("settings").items():
+        rows.append((f"settings.{name}", _text(value), value != usual["settings"][name]))
+    rows += [(name, _text(value), value != usual[name]) for name, value in config.items()]
+    active = account.config.get("active")
+    if isinstance(active, dict):
+        usual = ActiveConfig().to_json()
+        rows += [(f"active.{name}", _text(value), value != usual.get(name)) for name, value in active.items()]
+    return rows
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _environment(account: Account) -> list[tuple[str, str]]:
+    """env.json, a line a field, without where else an LLVM was found."""
+    rows = []
+    for name, value in account.env.items():
+        if isinstance(value, dict):
+            inner = {key: x for key, x in value.items() if not isinstance(x, list | dict) and x is not None}
+            rows.append((name, ", ".join(f"{key} {_plain(x)}" for key, x in inner.items())))
+        elif value is not None and not isinstance(value, list):
+            rows.append((name, _plain(value)))
+    return rows
+
+
+def _plain(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) and math.isfinite(value) else str(value)

@@ -1,0 +1,161 @@
+"""Pictures of a page: those that a fit has left in its folder, and those that are drawn of its last checkpoint."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs import fisher
+from drgs.display import pictures
+from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
+from drgs.gain import Prior, variances
+from drgs.integrator import render
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Scene
+    from drgs.report.account import Account
+    from drgs.settings import RenderSettings
+
+__all__ = ["Picture", "drawn", "maps", "previews", "spread", "stills", "view_pictures"]
+
+_QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
+_WIDEST = 1200  # pixels; more than a page is wide
+_PREVIEWS = 12
+_MAP_WIDTH = 480  # pixels, about
+_LARGEST = 1 << 28  # bytes of a PNG in a run folder that is opened
+_PRIOR = Prior(1.0)  # as for the maps of `drgs fisher`
+_KNOWN = 24  # views whose information is added up; of more, these stand for all
+_MOMENTS = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A picture with what is said below it.
+
+    Attributes:
+        data: base64 of a JPEG.
+        text: The caption.
+        width, height: Pixels.
+    """
+
+    data: str
+    text: str
+    width: int
+    height: int
+
+
+def drawn(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
+    """An (H, W, 3) picture, uint8 or in [0, 1], at most so many pixels wide; small ones keep sharp pixels."""
+    import cv2
+
+    pixels = image if image.dtype == np.uint8 else pictures.to_bytes(image)
+    height, width = pixels.shape[:2]
+    if width > widest:
+        size = widest, max(1, round(height * widest / width))
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return Picture(base64.b64encode(data.tobytes()).decode(), text, pixels.shape[1], pixels.shape[0])
+
+
+def spread(items: Sequence, count: int) -> list:
+    """At most so many of them, the first and the last included."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, count)]
+
+
+def previews(account: Account) -> list[Picture]:
+    """What the fit looked like on the way: photograph and rendering, side by side."""
+    found = []
+    for path in account.run.renders.glob("preview_*.png"):
+        if (number := re.fullmatch(r"preview_(\d+)", path.stem)) and int(number[1]) <= account.step:
+            found.append((int(number[1]), path))
+    shown = [(step, _read(path)) for step, path in spread(sorted(found), _PREVIEWS)]
+    return [drawn(image, f"step {step:,}", 800) for step, image in shown if image is not None]
+
+
+def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str, Picture]:
+    """View -> the picture of it that the last measurement has left: `png` or `semantics.png`."""
+    if account.metrics is None:
+        return {}
+    every = [row["name"] for row in account.metrics["views"]]
+    files, found = dict(zip(every, pictures.file_names(every), strict=True)), {}
+    for name in names:
+        image = _read(account.run.renders / account.metrics["split"] / f"{files[name]}.{kind}")
+        if image is not None:
+            found[name] = drawn(image, name)
+    return found
+
+
+def _read(path: Path) -> np.ndarray | None:
+    """An 8-bit picture; None where there is none that can be read."""
+    import cv2
+
+    if not path.is_file() or path.stat().st_size > _LARGEST:
+        return None
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def maps(
+    scene: Scene, known: Sequence[Camera], shown: Mapping[str, Camera], settings: RenderSettings
+) -> dict[str, tuple[Picture, Picture]]:
+    """View -> how uncertain each pixel is by what the fitted views say, and what no Gaussian covers.
+
+    The first is `drgs.fisher.variance_map` of the colors, with the color behind everything among the parameters
+    (lambda = 1); of more than 24 known views, 24 evenly chosen ones stand for all.
+    """
+    if not known or not shown:
+        return {}
+    counted, result = spread(known, _KNOWN), dict[str, tuple[Picture, Picture]]()
+    sphere = fisher.backdrop_sphere(scene, [*known, *shown.values()])
+    with Bar("maps of information", len(counted) + len(shown)) as bar:
+        total: dict[str, torch.Tensor] = {}
+        for camera in counted:
+            plain = colors_only(scene, camera.time)
+            behind = fisher.backdrop(plain, camera, settings, sphere=sphere)
+            said = {**fisher.diagonal(plain, camera, settings), "backdrop": behind}
+            for name, x in said.items():
+                total[name] = total.get(name, 0) + x * (len(known) / len(counted))
+            bar.advance()
+        weights = variances(total, _PRIOR)
+        for name, camera in shown.items():
+            plain = colors_only(scene, camera.time)
+            variance = fisher.variance_map(plain, camera, weights, settings, sphere=sphere).numpy()
+            with torch.no_grad():  # a picture
+                alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
+            bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
+            result[name] = (
+                drawn(pictures.map_picture(_enlarged(variance)), "predictive variance"),
+                drawn(_enlarged(bare), "not covered: 1 - alpha"),
+            )
+            bar.advance()
+    return result
+
+
+def _enlarged(values: np.ndarray) -> np.ndarray:
+    """Each pixel as a square, so that a small map is not dwarfed by its color bar."""
+    times = max(1, round(_MAP_WIDTH / values.shape[1]))
+    return values.repeat(times, 0).repeat(times, 1)
+
+
+def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: RenderSettings) -> list[Picture]:
+    """One camera at several times, evenly over all."""
+    found = []
+    with Bar("stills of the sequence", min(len(times), _MOMENTS)) as bar:
+        for time in spread(times, _MOMENTS):
+            now = dataclasses.replace(camera, time=time)
+            with torch.no_grad():  # a picture
+                image = render(colors_only(scene, time), now, settings, outputs=()).rgb.cpu().numpy()
+            found.append(drawn(image, f"time {time:.3g}", 640))
+            bar.advance()
+    return found

@@ -1,0 +1,149 @@
+"""Gathers what there is about a run and writes its page."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs.display.progress import Bar
+from drgs.files import Run, atomic_write
+from drgs.fitting.records import load_run
+from drgs.report import charts, pictures
+from drgs.report.account import Account, account_of
+from drgs.report.page import Shown, page_html
+from drgs.sizes import at_most
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.data import Dataset, View
+    from drgs.fitting.records import LoadedRun
+
+__all__ = ["FILE", "write_report"]
+
+FILE = "report.html"
+_VIEWS = 4  # that are shown with pictures
+
+_log = logging.getLogger(__name__)
+
+
+def write_report(run: Run, path: Path, command: str, command_text: str, dataset: Dataset | None) -> None:
+    """Write the page of a run, atomically.
+
+    Args:
+        run: The run folder, of a fit that is done or is not.
+        path: The HTML file.
+        command, command_text: What repeats the fit, and what that leaves out, for the page.
+        dataset: What was fitted, for its cameras and times; None where it is no longer there, which the page says.
+    Raises:
+        FileNotFoundError: If it is no run folder.
+        ValueError: If one of its files is damaged.
+    """
+    with Bar("report"):
+        account = account_of(run)
+        page = page_html(account, _shown(account, dataset), command, command_text)
+        with atomic_write(path) as file:
+            file.write(page.encode())
+
+
+def _shown(account: Account, dataset: Dataset | None) -> Shown:
+    """Everything that can be drawn."""
+    notes = []
+    try:
+        loaded = load_run(account.run)
+    except FileNotFoundError:
+        loaded = None
+        notes.append("The fit has not reached its first checkpoint: nothing of it can be drawn yet.")
+    if dataset is None:
+        notes.append(
+            f"The data set is not at {account.record.data} any more: no map of cameras, of information or over time."
+        )
+    names = _typical(account)
+    cast = None if dataset is None else _Cast.of(account, dataset)
+    found: dict[str, tuple[pictures.Picture, pictures.Picture]] = {}
+    stills: list[pictures.Picture] = []
+    still_name = ""
+    if loaded is not None and cast is not None:
+        shown = {name: cast.held[name] for name in names if name in cast.held}
+        found = pictures.maps(loaded.scene, cast.fitted, shown, account.record.config.settings)
+        stills, still_name = _stills(account, loaded, cast)
+    picks = account.selection["picks"] if account.selection else []
+    drawn: dict[str, str | None] = {}
+    if charts.is_available():
+        drawn = {"progress": charts.progress(account), "scores": charts.score_bars(picks)}
+        drawn["cameras"] = None if cast is None else charts.camera_map(cast.groups, cast.picked)
+    return Shown(
+        charts=drawn,
+        previews=pictures.previews(account),
+        views=names,
+        photos=pictures.view_pictures(account, names, "png"),
+        semantics=pictures.view_pictures(account, names, "semantics.png") if account.record.semantics else {},
+        maps=found,
+        moments=stills,
+        moments_of=still_name,
+        notes=notes,
+    )
+
+
+def _typical(account: Account) -> list[str]:
+    """Names of a few measured views, from the worst to the best."""
+    rows = [] if account.metrics is None else account.metrics["views"]
+    ranked = sorted(rows, key=lambda row: row["psnr"] if row.get("psnr") is not None else float("inf"))
+    return [row["name"] for row in pictures.spread(ranked, _VIEWS)]
+
+
+def _stills(account: Account, loaded: LoadedRun, cast: _Cast) -> tuple[list[pictures.Picture], str]:
+    """One camera over all times, of a scene that moves."""
+    if loaded.moving is None or not account.record.times:
+        return [], ""
+    name, camera = next(iter(cast.held.items()), ("", None))
+    if camera is None:
+        return [], ""
+    return pictures.stills(loaded.scene, camera, account.record.times, account.record.config.settings), name
+
+
+@dataclasses.dataclass(frozen=True)
+class _Cast:
+    """The cameras of a fit.
+
+    Attributes:
+        fitted: Those whose photographs it has seen.
+        held: Of the measured views, by name.
+        groups, picked: As `charts.camera_map` takes them.
+    """
+
+    fitted: list[Camera]
+    held: dict[str, Camera]
+    groups: dict[str, list[Camera]]
+    picked: list[tuple[Camera, str]]
+
+    @classmethod
+    def of(cls, account: Account, dataset: Dataset) -> _Cast:
+        """By the split of the fit."""
+        config = account.record.config
+        train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
+
+        def camera(view: View) -> Camera:
+            plain = dataclasses.replace(view.camera.undistorted(), name=view.name)
+            return at_most(plain, config.max_pixels)
+
+        cameras = {view.name: camera(view) for view in train}
+        tested = {view.name: camera(view) for view in test}
+        measured = account.metrics["split"] if account.metrics else "test"
+        held = {"test": tested, "train": cameras}.get(measured, cameras | tested)
+        if account.selection is None:
+            fitted = [cameras[name] for name in account.record.train if name in cameras]
+            return cls(fitted, held, {"fitted": fitted, "held out": list(tested.values())}, [])
+        start = [view["name"] for view in account.selection["start"]]
+        numbers: dict[str, list[str]] = {}
+        for pick in account.selection["picks"]:
+            numbers.setdefault(pick["name"], []).append(str(pick["number"]))
+        seen = [name for name in (*start, *numbers) if name in cameras]
+        groups = {
+            "not picked": [x for name, x in cameras.items() if name not in seen],
+            "held out": list(tested.values()),
+            "start": [cameras[name] for name in start if name in cameras],
+        }
+        picked = [(cameras[name], ", ".join(found)) for name, found in numbers.items() if name in cameras]
+        return cls([cameras[name] for name in seen], held, groups, picked)
