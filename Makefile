@@ -44,6 +44,8 @@ smoke: setup
 	$(BIN)/drgs fit out/smoke/room -o out/smoke/semantic --max-steps 40 --feature-width 8
 	$(BIN)/drgs query out/smoke/semantic --class wall --threshold 0 --limit 1 -o out/smoke/query
 	$(BIN)/drgs teach --help
+	$(BIN)/drgs convert out/smoke/semantic out/smoke/labelled.ply --labels
+	$(BIN)/drgs convert out/smoke/run out/smoke/run.spz
 	$(BIN)/drgs scene kitchen -o out/smoke/kitchen --size 64x48 --cameras 3 --times 3 --spp 2
 	rm -rf out/smoke/moving
 	$(BIN)/drgs fit out/smoke/kitchen -o out/smoke/moving --max-steps 40 --max-gaussians 2000 --feature-width 8

@@ -25,6 +25,7 @@ from tyro.conf import FlagCreatePairsOff, subcommand
 import drgs
 from drgs.commands.making_options import Demo, Scene, Sfm, Teach
 from drgs.commands.options import (
+    Convert,
     Crossval,
     Eval,
     Fisher,
@@ -53,6 +54,7 @@ _OPTIONS = {
     "select": Select,
     "fisher": Fisher,
     "query": Query,
+    "convert": Convert,
     "crossval": Crossval,
     "tradeoff": Tradeoff,
     "stress": Stress,

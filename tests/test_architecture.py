@@ -24,6 +24,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"guards.doors", "splats"}, "what public functions take: cameras and Gaussians, or the tensors that make them"),
     ({"oracle", "volume", "reference"}, "the truth: below the engine, so that it cannot borrow from what it checks"),
     ({"files", "display"}, "what is written, for machines and people"),
+    ({"codecs"}, "Gaussians in the formats of others"),
     ({"tracing"}, "the engine"),
     ({"integrator", "plugin"}, "rendering with it, from torch and from Mitsuba"),
     ({"rasterize"}, "the same under gsplat's names"),

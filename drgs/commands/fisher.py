@@ -71,7 +71,8 @@ def run(args: Fisher) -> None:
     if text is None and given.run is None:
         if args.cameras in (None, "orbit", "dome"):
             raise ValueError(
-                "a PLY has no record of its views: --train or --cameras must name a data set, a run or a cameras.json"
+                "a file of Gaussians has no record of its views: --train or --cameras must name a data set, a run or a "
+                "cameras.json"
             )
         text = args.cameras
     known = known_views(text, args, given)

@@ -18,11 +18,13 @@ __all__ = [
     "Around",
     "Choosing",
     "Common",
+    "Comparing",
     "Data",
     "Informed",
     "Moments",
     "Moving",
     "OutputPath",
+    "SceneFile",
     "Seen",
     "Settings",
     "Split",
@@ -32,6 +34,10 @@ __all__ = [
 ]
 
 OutputPath = Annotated[Path, arg(aliases=["-o"])]
+SceneFile = Annotated[
+    Positional[Path],
+    arg(help="A run folder, or Gaussians: .ply, .spz, .splat, .ksplat, .sog, .glb, a SOG or INRIA model folder."),
+]
 Split = Literal["all", "train", "test"]
 
 # One text, `geometry,semantic`; what is none of the names is refused where the blocks are used.
@@ -141,8 +147,7 @@ class Around:
 class Seen(Settings, Around, Views):
     """Options of commands that look at a scene from a few cameras."""
 
-    scene: Positional[Path]
-    """A 3DGS point_cloud.ply or a run folder."""
+    scene: SceneFile
     cameras: str | None = None
     """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
     split: Split = "all"
@@ -173,6 +178,21 @@ class Informed(Settings):
     """What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop (gaps)."""
     probes: int = ActiveConfig.probes
     """Random probes of each view, for what it tells about a deformation field, and for --method probes."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparing(Informed, Around, Views):
+    """Options of commands that compare views with known ones."""
+
+    scene: SceneFile
+    train: str | None = None
+    """Views that are known: a data set, a run, or a cameras.json; default the run's."""
+    split: Split = "all"
+    """Which of the other views, where they are a data set's."""
+    count: int = 40
+    """Cameras of an orbit or a dome."""
+    time: float | None = None
+    """Of cameras that state none, in a run that moves: e.g. those of an orbit."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -26,7 +26,7 @@ from drgs.guards.foreign import refuse_foreign
 __all__ = [
     "IMAGE_SUFFIXES",
     "image_size",
-    "inside",
+    "file_inside",
     "inverse_pose",
     "is_file",
     "list_images",
@@ -58,7 +58,7 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
-def inside(folder: Path, name: str, where: str) -> Path:
+def file_inside(folder: Path, name: str, where: str) -> Path:
     """The file that a data set's own file names: data sets come from elsewhere, and may name nothing outside of theirs.
 
     Links that lie in the folder are followed: whoever put them there knows where they lead.
