@@ -38,6 +38,7 @@ from drgs.commands.options import (
     Stress,
     Teach,
     Tradeoff,
+    View,
 )
 from drgs.display.progress import Bar
 from drgs.guards import interrupts
@@ -49,6 +50,7 @@ __all__ = ["main"]
 _OPTIONS = {
     "info": Info,
     "render": Render,
+    "view": View,
     "fit": Fit,
     "eval": Eval,
     "select": Select,

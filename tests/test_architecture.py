@@ -40,6 +40,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"metrics"}, "pictures against photographs"),
     ({"train"}, "fits, for users"),
     ({"lab"}, "experiments on all of the above"),
+    ({"viewing"}, "a scene in the browser, whatever command says which"),
     ({"crossval", "ladder", "testing"}, "the lab's doors, for users"),
     ({"commands"}, "one module a command: options in, files out"),
     ({"cli"}, "which command it is"),
