@@ -288,11 +288,7 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
 
 
 def state_header(path: str | os.PathLike) -> dict:
-    """The header of `save_state` alone; no tensor is read.
-
-    Raises:
-        FileNotFoundError, ValueError: As `load_state`.
-    """
+    """The header of `save_state` alone, without its tensors; raises as `load_state`."""
     with _opened_state(Path(path)) as (_, header):
         return header
 

@@ -54,6 +54,7 @@ FACADE = {"cli": "the program", "runtime": "`__version__`, which the package sta
 SHARED = {
     "run": "what the program calls of each command",
     "Scene": "the options of the command of that name, beside what is rendered",
+    "View": "the options of the command of that name, beside what a data set holds",
     "coverage": "a policy's name is that of the information it goes by",
     "render": "the truth takes the arguments of what it checks",
     "sh_basis": "the truth has its own, so that it cannot borrow from what it checks",

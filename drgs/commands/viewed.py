@@ -64,7 +64,7 @@ def subject_of(args: View, given: Given, before: Subject | None = None) -> Subje
     if before is not None and _same(before.stations, stations) and before.ranking == ranking:
         stations = before.stations
     return Subject(
-        name=args.scene.resolve().name,
+        name="/".join(args.scene.resolve().parts[-2:]),
         state=_state(given),
         count=len(given.gaussians),
         scene=given.scene,

@@ -72,7 +72,7 @@ class Session:
         self._timer: asyncio.TimerHandle | None = None
         self._playing: asyncio.Task | None = None
         self._frusta: list[Any] = []
-        self._chosen: Any = None  # the frustum that the camera has flown into
+        self._near = 0.0  # a camera is in a frustum within this distance
         self.time = subject.times[0] if subject.times else None
         self.pose, self.size = self._seen_pose()
         self._build(preset)
@@ -111,7 +111,8 @@ class Session:
     def _build_times(self) -> None:
         """The slider and the button of what moves; neither where nothing does."""
         gui, times = self.client.gui, self.subject.times
-        self._slider = self._button = None
+        self._slider: Any = None
+        self._button: Any = None
         if len(times) < 2:
             return
         step = (times[-1] - times[0]) / 1000
@@ -171,8 +172,7 @@ class Session:
         if pose.is_near(self.pose) and size == self.size:
             return
         self.pose, self.size = pose, size
-        if self._chosen is not None:
-            self._chosen.visible, self._chosen = True, None
+        self._show_frusta()
         self._hide()
         self._ask_later()
 
@@ -212,8 +212,7 @@ class Session:
                 await asyncio.sleep(0.02)
 
     async def _stations_toggled(self, _: Any) -> None:
-        for frustum in self._frusta:
-            frustum.visible = self._are_shown.value
+        self._show_frusta()
 
     # -------------------------------------------------------------------------------------- cameras
 
@@ -221,7 +220,7 @@ class Session:
         """A frustum for each place, in the color of its score."""
         for frustum in self._frusta:
             frustum.remove()
-        subject, self._frusta, self._chosen = self.subject, [], None
+        subject, self._frusta = self.subject, []
         colors, _ = score_colors(subject.stations)
         self._cameras.visible = bool(subject.stations)
         self._legend.content = panel.legend(subject.stations, subject.ranking.title if subject.ranking else "")
@@ -240,35 +239,41 @@ class Session:
                 color=color,
                 wxyz=pose.wxyz,
                 position=pose.position,
-                visible=self._are_shown.value,
                 variant="filled",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            frustum.on_click(self._clicked(station, frustum))
+            frustum.on_click(self._clicked(station))
             self._frusta.append(frustum)
+        self._near = 1.5 * size
+        self._show_frusta()
 
-    def _clicked(self, station: Station, frustum: Any) -> Callable[[Any], Any]:
-        """What a click on a frustum does: the camera flies there, and the panel says what is known of the place."""
+    def _show_frusta(self) -> None:
+        """All, or none, but for those that the camera stands in: they would lie over all that it sees."""
+        for frustum in self._frusta:
+            away = float(np.linalg.norm(np.asarray(frustum.position) - self.pose.position))
+            shown = self._are_shown.value and away > self._near
+            if frustum.visible != shown:
+                frustum.visible = shown
+
+    def _clicked(self, station: Station) -> Callable[[Any], Any]:
+        """What a click on a frustum does."""
 
         async def clicked(_: Any) -> None:
             self.visit(station)
-            self._chosen = frustum
-            frustum.visible = False  # the camera stands in it
 
         return clicked
 
     def visit(self, station: Station) -> None:
         """Fly to a place, and show what is known of it, with its photograph."""
         sight, camera = station.at(self.time), self.client.camera
-        if self._chosen is not None:
-            self._chosen.visible, self._chosen = True, None
         pose = pose_of(sight.camera, self.subject.origin)
         with self.client.atomic():
             camera.position = pose.position
             camera.wxyz = pose.wxyz
             camera.fov = looking(pose, camera.aspect)
         self.pose, _ = self._seen_pose()  # what the browser sends back is no movement of its own
+        self._show_frusta()
         if self._slider is not None and sight.camera.time is not None and self._playing is None:
             self._slider.value = sight.camera.time
         self._hide()

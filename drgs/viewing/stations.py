@@ -159,12 +159,16 @@ def read_ranking(path: Path) -> Ranking:
         )
         last = found["picks"][-1] if found["picks"] else {"candidates": [], "criterion": None, "policy": ""}
         rows, criterion, policy = last["candidates"], last["criterion"], last["policy"]
-    cameras = [camera_described(f"{where}: {row['name']}", row["camera"]) for row in rows if "camera" in row]
+    cameras = [
+        dataclasses.replace(camera_described(f"{where}: {row['name']}", row["camera"]), name=row["name"])
+        for row in rows
+        if "camera" in row
+    ]
     return Ranking(
         f"{policy}, {criterion}" if criterion else policy,
         _scores(where, rows),
         tuple(pick["name"] for pick in found["picks"]),
-        tuple(dataclasses.replace(x, name=row["name"]) for x, row in zip(cameras, _with_camera(rows), strict=True)),
+        tuple(cameras),
     )
 
 
@@ -195,17 +199,13 @@ def _scores(where: str, rows: list[dict[str, Any]]) -> dict[str, Score]:
     """Name -> score, with its rank, of the rows that have one."""
     scored = [row for row in rows if row["score"] is not None]
     ordered = sorted(scored, key=lambda row: -row["score"])
-    made = {}
+    made: dict[str, Score] = {}
     for rank, row in enumerate(ordered, 1):
         parts = row["parts"] or {}
         check_json(f"{where}: {row['name']}: parts", list(parts.values()), [float], _ADVICE)
         check_json(f"{where}: {row['name']}: parts", list(parts), [str], _ADVICE)
         made.setdefault(row["name"], Score(float(row["score"]), parts, rank, len(ordered)))
     return made
-
-
-def _with_camera(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [row for row in rows if "camera" in row]
 
 
 def _reader(view: View) -> Callable[[int], np.ndarray]:

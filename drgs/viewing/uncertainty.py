@@ -1,4 +1,4 @@
-"""What the photographs leave uncertain: their information is added up once, view by view, when it is first asked for."""
+"""What the photographs leave uncertain: their information is added up once, view by view, when it is asked for."""
 
 from __future__ import annotations
 
