@@ -19,7 +19,7 @@ import torch
 pytest.importorskip("viser", reason="no viser: pip install 'drgs[view]'")
 
 from test_select_command import place  # noqa: F401 (a data set, and a run that chose its views)
-from test_semantic_fit import dataset, taught  # noqa: F401 (a run with features)
+from test_semantic_fit import dataset, run, taught  # noqa: F401 (a run with features)
 from viewing_client import Client, gaussians
 
 import drgs
@@ -179,13 +179,13 @@ def test_a_small_picture_comes_first():
     assert ratio(first) == pytest.approx(ratio(last)) == pytest.approx(ratio(camera))
 
 
-def test_layers_are_what_there_is(taught_run):  # noqa: F811
+def test_layers_are_what_there_is(run):  # noqa: F811
     """Bare Gaussians have colors, depth and what is missing; features and labels come with a run that has some, in the
     colors of `drgs render`, and paint the client's Gaussians, too."""
     plain = layers_of({}, None, 10_000)
     assert [layer.name for layer in plain] == ["rgb", "depth", "missing"]
-    given = Given.of(View(scene=taught_run.run.path))
-    looked = subject_of(View(scene=taught_run.run.path), given)
+    given = Given.of(View(scene=run.run.path))
+    looked = subject_of(View(scene=run.run.path), given)
     assert [layer.name for layer in looked.layers] == ["rgb", "depth", "missing", "features", "labels", "overlay"]
     camera = camera_of(looked.first.pose, 40, 30, looked.origin)
     pictures = {layer.name: finished(layer.draw(looked.scene, camera, FAST)) for layer in looked.layers}

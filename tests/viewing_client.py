@@ -84,7 +84,8 @@ class Client:
         """The next picture behind the scene that is wider than `least` pixels: (H, W, 3) uint8."""
 
         def wide(message: dict[str, Any]) -> bool:
-            return message["type"] == "BackgroundImageMessage" and decoded(message).shape[1] > least
+            is_picture = message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None
+            return is_picture and decoded(message).shape[1] > least
 
         return decoded(self.wait(wide, after=after))
 
