@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from drgs.viewing.stations import Station, score_colors
+from drgs.viewing.stations import Station, scale_colors, score_colors
 
 if TYPE_CHECKING:
     from drgs.viewing.stations import Sight
@@ -41,14 +41,7 @@ def legend(stations: Sequence[Station], title: str) -> str:
     rows = [f"{_swatch(kinds['training'])} fitted to"] if "training" in kinds else []
     rows += [f"{_swatch(kinds['held out'])} not fitted to, no score"] if "held out" in kinds else []
     if ends is not None:
-        scored = [
-            (station.best.score.total, color)
-            for station, color in zip(stations, colors, strict=True)
-            if station.kind == "candidate" and station.best.score is not None
-        ]
-        scored.sort()
-        chosen = [scored[round(k * (len(scored) - 1) / (_STEPS - 1))][1] for k in range(_STEPS)]
-        bar = ", ".join(_css(color) for color in chosen)
+        bar = ", ".join(_css(color) for color in scale_colors(_STEPS))
         rows.append(
             f"candidates by score ({escape(title)})<br>{ends[0]:.4g} "
             f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(to right, {bar})">'

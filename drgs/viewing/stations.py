@@ -16,7 +16,7 @@ from drgs.guards.json_files import check_json, read_json
 if TYPE_CHECKING:
     from drgs.data import View
 
-__all__ = ["Ranking", "Score", "Sight", "Station", "read_ranking", "score_colors", "stations_of"]
+__all__ = ["Ranking", "Score", "Sight", "Station", "read_ranking", "scale_colors", "score_colors", "stations_of"]
 
 Kind = Literal["training", "held out", "candidate"]
 
@@ -177,22 +177,31 @@ def score_colors(stations: Sequence[Station]) -> tuple[list[tuple[int, int, int]
 
     Places of photographs that were fitted to are blue, those without a score gray.
     """
-    import cv2
-
     totals = [station.best.score.total for station in stations if station.kind == "candidate" and station.best.score]
     if not totals:
         return [_TRAINING if station.kind == "training" else _PLAIN for station in stations], None
     low, high = min(totals), max(totals)
-    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
     colors = []
     for station in stations:
         if station.kind == "candidate" and station.best.score:
             share = (station.best.score.total - low) / (high - low) if high > low else 1.0
-            red, green, blue = table[round(255 * share)]
-            colors.append((int(red), int(green), int(blue)))
+            colors.append(_on_scale(share))
         else:
             colors.append(_TRAINING if station.kind == "training" else _PLAIN)
     return colors, (low, high)
+
+
+def scale_colors(count: int) -> list[tuple[int, int, int]]:
+    """Colors of the scale of scores, evenly from the lowest to the highest; at least two."""
+    return [_on_scale(k / (count - 1)) for k in range(count)]
+
+
+def _on_scale(share: float) -> tuple[int, int, int]:
+    """The color of a place on the scale, 0 to 1."""
+    import cv2
+
+    red, green, blue = cv2.applyColorMap(np.array([[round(255 * share)]], np.uint8), cv2.COLORMAP_PLASMA)[0, 0, ::-1]
+    return int(red), int(green), int(blue)
 
 
 def _scores(where: str, rows: list[dict[str, Any]]) -> dict[str, Score]:
