@@ -29,6 +29,7 @@ from drgs.commands.given import Given
 from drgs.commands.options import View
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.data import load
+from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
 from drgs.viewing import panel
 from drgs.viewing.drawing import bands, drawn, stages
@@ -188,7 +189,7 @@ def test_layers_are_what_there_is(run):  # noqa: F811
     looked = subject_of(View(scene=run.run.path), given)
     assert [layer.name for layer in looked.layers] == ["rgb", "depth", "missing", "features", "labels", "overlay"]
     camera = camera_of(looked.first.pose, 40, 30, looked.origin)
-    pictures = {layer.name: finished(layer.draw(looked.scene, camera, FAST)) for layer in looked.layers}
+    pictures = {layer.name: finished(layer.draw(looked.scene, camera, FAST)).picture for layer in looked.layers}
     assert all(x.shape == (30, 40, 3) and x.dtype == np.uint8 for x in pictures.values())
     out = drgs.render(given.gaussians, camera, FAST)
     assert np.abs(pictures["rgb"] - (255 * out.rgb.clamp(0, 1)).round().numpy()).max() <= 1
@@ -483,9 +484,9 @@ def test_information_is_added_up_once_and_shown(place, viewers):  # noqa: F811
         picture = client.picture(after=at)
         assert looked.uncertainty.is_known
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
-        from drgs.display.pictures import map_picture
-
-        wanted = map_picture(looked.uncertainty.map(camera))[:, : picture.shape[1]]
+        wanted, (low, high) = map_colors(looked.uncertainty.map(camera))
+        html(client, f"{low:.3g} ", after=at)
+        html(client, f" {high:.3g} variance, logarithmic", after=at)
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0
 
 

@@ -24,7 +24,7 @@ class View(Informed, Around, Views):
     """Views whose cameras are shown, and that are known: a data set, a run, or a cameras.json; default the run's."""
     selection: Path | None = None
     """Scores of cameras, as drgs select writes them; default those of the run, if it chose its views."""
-    blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ("geometry",)
+    blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ("geometry", "backdrop")
     """What of an image tells, for the map of information: geometry, semantic, deformation, backdrop."""
     max_pixels: int = 500_000
     """Our pictures have at most this many pixels, whatever the window."""

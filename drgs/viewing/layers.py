@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.display import pictures
 from drgs.integrator import Output
-from drgs.viewing.drawing import Steps, drawn
+from drgs.viewing.drawing import drawn
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -18,12 +18,37 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
     from drgs.viewing.uncertainty import Uncertainty
 
-__all__ = ["INFORMATION", "Layer", "layers_of", "tinted"]
+__all__ = ["INFORMATION", "Drawing", "Layer", "Scale", "layers_of", "tinted"]
 
 INFORMATION = "information"
 _WIDE_PIXELS = 200_000  # of a picture of features: 100 MB of 128 channels
-_NARROW = 240  # pixels of width, below which a scale would hide the picture
 _ROW = 4096  # Gaussians that are painted at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """What the colors of a picture mean.
+
+    Attributes:
+        dark, bright: The values of its ends.
+        of: What has these values.
+    """
+
+    dark: float
+    bright: float
+    of: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawing:
+    """A picture (H, W, 3) uint8, and its scale, if it has one."""
+
+    picture: np.ndarray
+    scale: Scale | None = None
+
+
+Drawings = Generator[None, None, Drawing]
+Draw = Callable[["Scene", "Camera", "RenderSettings"], Drawings]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,14 +58,14 @@ class Layer:
     Attributes:
         name: As the browser offers it.
         hint: What it shows, in a few words.
-        draw: (scene, camera, settings) -> steps that return (H, W, 3) uint8.
+        draw: (scene, camera, settings) -> steps that return a `Drawing`.
         pixels: At most so many, whatever the window.
         tint: (N, 3) uint8 colors of the Gaussians that the client draws; None: their own.
     """
 
     name: str
     hint: str
-    draw: Callable[[Scene, Camera, RenderSettings], Steps]
+    draw: Draw
     pixels: int | None = None
     tint: Callable[[Gaussians], np.ndarray] | None = None
 
@@ -79,38 +104,38 @@ def tinted(layer: Layer, gaussians: Gaussians) -> np.ndarray | None:
     return None if layer.tint is None else layer.tint(gaussians)
 
 
-def _rgb(scene: Scene, camera: Camera, settings: RenderSettings) -> Steps:
-    return (yield from drawn(scene, camera, settings, lambda out: pictures.to_bytes(out.rgb.cpu().numpy())))
+def _rgb(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+    return Drawing((yield from drawn(scene, camera, settings, lambda out: pictures.to_bytes(out.rgb.cpu().numpy()))))
 
 
-def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Steps:
+def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     def read(out: Output) -> np.ndarray:
         assert out.depth is not None  # asked for
         return np.stack([out.depth.cpu().numpy(), out.alpha.cpu().numpy()], axis=-1)
 
     found = yield from drawn(scene, camera, settings, read)
-    return _scaled(pictures.depth_picture(found[..., 0], found[..., 1]), camera.width)
+    picture, (near, far) = pictures.depth_colors(found[..., 0], found[..., 1])
+    return Drawing(picture, Scale(far, near, "distance"))
 
 
-def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Steps:
-    import cv2
-
-    open_ = yield from drawn(scene, camera, settings, lambda out: pictures.to_bytes(1 - out.alpha.cpu().numpy()))
-    return np.ascontiguousarray(cv2.applyColorMap(open_, cv2.COLORMAP_INFERNO)[..., ::-1])
+def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+    found = yield from drawn(scene, camera, settings, lambda out: 1 - out.alpha.cpu().numpy())
+    return Drawing(pictures.inferno(found), Scale(0.0, 1.0, "share of the light"))
 
 
-def _painted(painter: Callable[[Output], np.ndarray]) -> Callable[[Scene, Camera, RenderSettings], Steps]:
-    def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Steps:
-        return (yield from drawn(scene, camera, settings, painter, features=True))
+def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
+    def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+        return Drawing((yield from drawn(scene, camera, settings, painter, features=True)))
 
     return draw
 
 
-def _mapped(uncertainty: Uncertainty) -> Callable[[Scene, Camera, RenderSettings], Steps]:
-    def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Steps:
+def _mapped(uncertainty: Uncertainty) -> Draw:
+    def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         found = uncertainty.map(camera)
         yield
-        return _scaled(pictures.map_picture(found), camera.width)
+        picture, (low, high) = pictures.map_colors(found)
+        return Drawing(picture, Scale(low, high, "variance, logarithmic"))
 
     return draw
 
@@ -128,11 +153,3 @@ def _tint_of(painter: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], n
         return np.concatenate(rows) if rows else np.zeros((0, 3), np.uint8)
 
     return tint
-
-
-def _scaled(picture: np.ndarray, width: int) -> np.ndarray:
-    """A picture whose scale stood at its right: now at its left edge, over it, where no panel is."""
-    shown, scale = np.ascontiguousarray(picture[:, :width]), picture[:, width:]
-    if width >= _NARROW:
-        shown[:, : scale.shape[1]] = scale
-    return shown

@@ -9,9 +9,13 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from drgs.display.pictures import inferno
 from drgs.viewing.stations import Station, scale_colors, score_colors
 
 if TYPE_CHECKING:
+    from drgs.viewing.layers import Scale
     from drgs.viewing.stations import Sight
     from drgs.viewing.subject import Subject
 
@@ -29,9 +33,13 @@ def header(subject: Subject) -> str:
     return _block("drgs-header", rows)
 
 
-def status(text: str) -> str:
-    """What is being done."""
-    return _block("drgs-status", [escape(text) or "&nbsp;"])
+def status(text: str, scale: Scale | None = None) -> str:
+    """What is being done, or what is shown, with the scale of its colors."""
+    rows = [escape(text) or "&nbsp;"]
+    if scale is not None:
+        shares = np.linspace(0, 1, _STEPS)
+        rows.append(f"{scale.dark:.3g} {_gradient(inferno(shares[None])[0])} {scale.bright:.3g} {escape(scale.of)}")
+    return _block("drgs-status", rows)
 
 
 def legend(stations: Sequence[Station], title: str) -> str:
@@ -41,12 +49,8 @@ def legend(stations: Sequence[Station], title: str) -> str:
     rows = [f"{_swatch(kinds['training'])} fitted to"] if "training" in kinds else []
     rows += [f"{_swatch(kinds['held out'])} not fitted to, no score"] if "held out" in kinds else []
     if ends is not None:
-        bar = ", ".join(_css(color) for color in scale_colors(_STEPS))
-        rows.append(
-            f"candidates by score ({escape(title)})<br>{ends[0]:.4g} "
-            f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(to right, {bar})">'
-            f"</span> {ends[1]:.4g}"
-        )
+        bar = _gradient(scale_colors(_STEPS))
+        rows.append(f"candidates by score ({escape(title)})<br>{ends[0]:.4g} {bar} {ends[1]:.4g}")
     return _block("drgs-legend", rows or ["no cameras"])
 
 
@@ -78,9 +82,15 @@ def _block(name: str, rows: list[str]) -> str:
     return f'<div id="{name}" style="{_STYLE}">' + "<br>".join(rows) + "</div>"
 
 
-def _css(color: tuple[int, int, int]) -> str:
+def _gradient(colors: Sequence[Sequence[int]] | np.ndarray) -> str:
+    shown = ", ".join(_css(color) for color in colors)
+    size = "display:inline-block;width:7em;height:0.8em"
+    return f'<span style="{size};background:linear-gradient(to right, {shown})"></span>'
+
+
+def _css(color: Sequence[int] | np.ndarray) -> str:
     return f"rgb({color[0]},{color[1]},{color[2]})"
 
 
-def _swatch(color: tuple[int, int, int]) -> str:
+def _swatch(color: Sequence[int]) -> str:
     return f'<span style="display:inline-block;width:0.9em;height:0.9em;background:{_css(color)}"></span>'

@@ -27,6 +27,7 @@ from drgs.viewing.stations import Station, score_colors
 if TYPE_CHECKING:
     import viser
 
+    from drgs.viewing.layers import Scale
     from drgs.viewing.subject import Subject
     from drgs.viewing.worker import Worker
 
@@ -139,9 +140,9 @@ class Session:
             self._show_stations()
         self._ask_later()
 
-    def say(self, text: str) -> None:
-        """Say in the panel what is being done. From any thread."""
-        self._status.content = panel.status(text)
+    def say(self, text: str, scale: Scale | None = None) -> None:
+        """Say in the panel what is being done, or shown. From any thread."""
+        self._status.content = panel.status(text, scale)
 
     def redraw(self) -> None:
         """Draw what is shown once more: something that it needs has become known."""
@@ -369,17 +370,17 @@ class Session:
         whole = camera_of(self.pose, width, height, subject.origin, self.time)
         for camera in stages(whole, min(self._pixels, layer.pixels or self._pixels)):
             self.say(f"{layer.name}, {preset}: drawing {camera.width}x{camera.height} ...")
-            picture = yield from layer.draw(subject.scene, camera, settings)
+            drawing = yield from layer.draw(subject.scene, camera, settings)
             with self._lock:
                 if wanted != self._wanted:
                     return
                 self._is_over = True
                 with self.client.atomic():
-                    self.client.scene.set_background_image(picture, format="png")
+                    self.client.scene.set_background_image(drawing.picture, format="png")
                     if self._gaussians is not None:
                         self._gaussians.visible = False
             took = time.perf_counter() - began
-            self.say(f"{layer.name}, {preset}: {camera.width}x{camera.height} in {took:.1f} s")
+            self.say(f"{layer.name}, {preset}: {camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
             yield
 
     def _seen_pose(self) -> tuple[Pose, tuple[int, int]]:
