@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import http.server
 import shutil
 import threading
@@ -19,13 +20,15 @@ from playwright import sync_api
 from test_select_command import place  # noqa: F401 (a data set, and a run that chose its views)
 from test_view import EVIL, blobs, subject
 
+from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.commands import view
 from drgs.commands.given import Given
 from drgs.commands.options import View
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.files import load_state, save_state
-from drgs.viewing.poses import camera_of
+from drgs.viewing.poses import camera_of, pose_of
 from drgs.viewing.server import Viewer
+from drgs.viewing.subject import FirstView
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WIDTH, HEIGHT = 640, 480
@@ -137,30 +140,28 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     noticed and shown, with its step."""
     args = View(scene=place / "run", preset="fast")
     looked = subject_of(args, Given.of(args))
+    station = next(station for station in looked.stations if station.kind == "candidate")
+    tip, middle = station.camera.center, looked.first.target
+    body = tip + station.camera.c2w[:3, :3] @ np.array([0.0, 0.0, 0.1])
+    # From behind it, so that it is at the left and below, where neither the panel nor a word about WebGL is.
+    eye = middle + 1.5 * (tip - middle)
+    behind = Camera(K=intrinsics_from_fov(60, 4, 3), w2c=look_at(eye, tip, looked.first.up), width=4, height=3)
+    right, down, forward = behind.c2w[:3, :3].T
+    target = eye + 2 * (forward + 0.25 * right - 0.2 * down)
+    behind = dataclasses.replace(behind, w2c=look_at(eye, target, looked.first.up))
+    looked = dataclasses.replace(looked, first=FirstView(pose_of(behind, looked.origin), target, looked.first.up))
     viewer, page = shown(looked)
     first = picture(page)
-    page.mouse.move(160, 360)
-    for _ in range(5):
-        page.mouse.wheel(0, 300)
-        page.wait_for_timeout(100)
-    said = rests(page, but=text(page, "status"))
-    session = next(iter(viewer.sessions.values()))
-    camera = camera_of(session.pose, WIDTH, HEIGHT, looked.origin)
-    places = []
-    for number, station in enumerate(looked.stations):
-        tip = station.camera.center
-        base = station.camera.c2w[:3, :3] @ np.array([0.0, 0.0, 0.1]) + tip
-        x, y = camera.project(base[None])[0][0]
-        if 20 < x < 300 and 220 < y < 460:
-            places.append((number, x, y))
-    assert places, "no frustum where a click can reach it"
-    for _, x, y in places:
-        page.mouse.click(x, y)
-        page.wait_for_timeout(1500)
-        if text(page, "photograph"):
-            break
-    name = text(page, "photograph").split("\n")[0]
-    assert name in {station.camera.name for station in looked.stations}
+    where = camera_of(looked.first.pose, WIDTH, HEIGHT, looked.origin).project(body[None])[0][0]
+    assert 20 < where[0] < 300
+    assert 240 < where[1] < 460
+    said = text(page, "status")
+    page.mouse.click(*where)
+    page.wait_for_function("(document.getElementById('drgs-photograph') || {}).innerText")
+    shown_text = text(page, "photograph")
+    assert shown_text.startswith(station.camera.name)
+    assert f"rank {station.best.score.rank} of {station.best.score.of}" in shown_text
+    np.testing.assert_allclose(next(iter(viewer.sessions.values())).pose.position, tip, atol=1e-3)
     page.wait_for_selector("img[src^='blob:'], img[src^='data:image']")
     rests(page, but=said)
     assert np.abs(picture(page) - first).max() > 20

@@ -38,10 +38,11 @@ _FIRST_SIZE = 640, 480  # pixels of the view that a browser begins with: its sha
 
 def watched_files(args: View) -> list[Path]:
     """The files that are read again when they change."""
-    scene = [args.scene]
-    if args.scene.is_dir():
-        scene = [Run(args.scene).state, Run(args.scene).point_cloud]
-    return [*scene, args.selection or args.scene / _SELECTION]
+    named = [] if args.selection is None else [args.selection]
+    if not args.scene.is_dir():
+        return [args.scene, *named]
+    run = Run(args.scene)
+    return [run.state, run.point_cloud, *(named or [run.path / _SELECTION])]
 
 
 def subject_of(args: View, given: Given, before: Subject | None = None) -> Subject:

@@ -68,6 +68,7 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
         self._wanted = 0
+        self._is_closed = False
         self._is_over = False  # our picture lies there, and the Gaussians are hidden
         self._gaussians: Any = None
         self._timer: asyncio.TimerHandle | None = None
@@ -142,7 +143,8 @@ class Session:
 
     def say(self, text: str, scale: Scale | None = None) -> None:
         """Say in the panel what is being done, or shown. From any thread."""
-        self._status.content = panel.status(text, scale)
+        if not self._is_closed:
+            self._status.content = panel.status(text, scale)
 
     def redraw(self) -> None:
         """Draw what is shown once more: something that it needs has become known."""
@@ -156,6 +158,7 @@ class Session:
             self._playing.cancel()
         with self._lock:
             self._wanted += 1
+            self._is_closed = True
         for job in ("picture", "gaussians", "photograph"):
             self._worker.drop((self, job))
 
@@ -312,6 +315,8 @@ class Session:
         found = ClientGaussians.of(seen, tinted(layer, seen))
         arrays = found.centers, found.covariances, found.rgbs, found.opacities
         with self._lock, self.client.atomic():
+            if self._is_closed:
+                return
             if self._gaussians is None:
                 self._clear()
                 self._gaussians = self.client.scene.add_gaussian_splats(
