@@ -162,7 +162,7 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     assert shown_text.startswith(station.camera.name)
     assert f"rank {station.best.score.rank} of {station.best.score.of}" in shown_text
     np.testing.assert_allclose(next(iter(viewer.sessions.values())).pose.position, tip, atol=1e-3)
-    page.wait_for_selector("img[src^='blob:'], img[src^='data:image']")
+    page.wait_for_function("[...document.images].some(image => image.naturalWidth === 24)")  # the photograph
     rests(page, but=said)
     assert np.abs(picture(page) - first).max() > 20
     # a fit goes on
