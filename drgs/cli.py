@@ -37,6 +37,7 @@ from drgs.commands.options import (
     Select,
     Stress,
     Tradeoff,
+    View,
 )
 from drgs.display.progress import Bar
 from drgs.guards import interrupts
@@ -48,6 +49,7 @@ __all__ = ["main"]
 _OPTIONS = {
     "info": Info,
     "render": Render,
+    "view": View,
     "fit": Fit,
     "eval": Eval,
     "report": Report,

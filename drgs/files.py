@@ -38,6 +38,7 @@ __all__ = [
     "load_state",
     "save_ply",
     "save_state",
+    "state_header",
     "write_json",
 ]
 
@@ -284,9 +285,21 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no checkpoint, damaged, or of another schema version.
     """
+    with _opened_state(Path(path)) as (file, header):
+        return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
+
+
+def state_header(path: str | os.PathLike) -> dict:
+    """The header of `save_state` alone, without its tensors; raises as `load_state`."""
+    with _opened_state(Path(path)) as (_, header):
+        return header
+
+
+@contextlib.contextmanager
+def _opened_state(path: Path) -> Iterator[tuple[Any, dict]]:
+    """A checkpoint that is open, and its header; what is wrong with either is one ValueError."""
     from safetensors import SafetensorError, safe_open
 
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a checkpoint, found none; check the path")
     refuse_foreign(path, "a checkpoint")
@@ -298,7 +311,7 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
                 raise ValueError(
                     f"{path}: checkpoint schema must be {SCHEMA}, got {schema!r}; fit into another run folder (-o)"
                 )
-            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
+            yield file, header
     except (SafetensorError, struct.error) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: must be a checkpoint, got {text}; copy it again") from None

@@ -42,6 +42,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"train"}, "fits, for users"),
     ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
+    ({"viewing"}, "a scene in the browser, whatever command says which"),
     ({"crossval", "ladder", "testing"}, "the lab's doors, for users"),
     ({"commands"}, "one module a command: options in, files out"),
     ({"cli"}, "which command it is"),
@@ -55,6 +56,7 @@ FACADE = {"cli": "the program", "runtime": "`__version__`, which the package sta
 SHARED = {
     "run": "what the program calls of each command",
     "Scene": "the options of the command of that name, beside what is rendered",
+    "View": "the options of the command of that name, beside what a data set holds",
     "coverage": "a policy's name is that of the information it goes by",
     "render": "the truth takes the arguments of what it checks",
     "sh_basis": "the truth has its own, so that it cannot borrow from what it checks",

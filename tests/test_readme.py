@@ -35,9 +35,9 @@ _SMALLER = {
     "query": ["--limit", "1", "--threshold", "0"],  # six steps have taught nothing
     "demo": ["--quick"],
 }
-# Structure from motion needs real texture, the demo half a minute, a room ten seconds, a teacher a model:
-# tests/test_sfm.py, test_demo.py, test_room.py, test_teach.py.
-_ELSEWHERE = ("sfm", "demo", "scene", "teach")
+# Structure from motion needs real texture, the demo half a minute, a room ten seconds, a teacher a model,
+# a viewer ends by Ctrl-C alone: tests/test_sfm.py, test_demo.py, test_room.py, test_teach.py, test_view.py.
+_ELSEWHERE = ("sfm", "demo", "scene", "teach", "view")
 _KITCHEN = "kitchen"  # of what moves: tests/test_dynamic_fit.py, and `make smoke`
 
 

@@ -15,6 +15,7 @@ from drgs.information.choices import Block, Combine, Criterion, Method, NetworkS
 from drgs.settings import Preset, RenderSettings
 
 __all__ = [
+    "BLOCKS_TEXT",
     "Around",
     "Choosing",
     "Common",
@@ -41,7 +42,7 @@ SceneFile = Annotated[
 Split = Literal["all", "train", "test"]
 
 # One text, `geometry,semantic`; what is none of the names is refused where the blocks are used.
-_BLOCKS: Any = PrimitiveConstructorSpec(
+BLOCKS_TEXT: Any = PrimitiveConstructorSpec(
     nargs=1,
     metavar="BLOCK,BLOCK",
     instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
@@ -174,7 +175,7 @@ class Informed(Settings):
     """lambda is --prior times the median information of a parameter's group, where it is not 0."""
     info_pixels: int | None = ActiveConfig.info_pixels
     """Information is computed on views of at most this many pixels; default as in the fit."""
-    blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
+    blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ActiveConfig.blocks
     """What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop (gaps)."""
     probes: int = ActiveConfig.probes
     """Random probes of each view, for what it tells about a deformation field, and for --method probes."""

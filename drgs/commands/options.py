@@ -29,6 +29,7 @@ from drgs.commands.option_groups import (
     Views,
 )
 from drgs.commands.overrides import check_color
+from drgs.commands.view_options import View
 from drgs.fitting.config import (
     ActiveConfig,
     Degree,
@@ -55,6 +56,7 @@ __all__ = [
     "Select",
     "Stress",
     "Tradeoff",
+    "View",
 ]
 
 

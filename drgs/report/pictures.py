@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from drgs.report.account import Account
     from drgs.settings import RenderSettings
 
-__all__ = ["Picture", "drawn", "maps", "previews", "spread", "stills", "view_pictures"]
+__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "view_pictures"]
 
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels; more than a page is wide
@@ -53,7 +53,7 @@ class Picture:
     height: int
 
 
-def drawn(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
+def jpeg(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
     """An (H, W, 3) picture, uint8 or in [0, 1], at most so many pixels wide; small ones keep sharp pixels."""
     import cv2
 
@@ -80,7 +80,7 @@ def previews(account: Account) -> list[Picture]:
         if (number := re.fullmatch(r"preview_(\d+)", path.stem)) and int(number[1]) <= account.step:
             found.append((int(number[1]), path))
     shown = [(step, _read(path)) for step, path in spread(sorted(found), _PREVIEWS)]
-    return [drawn(image, f"step {step:,}", 800) for step, image in shown if image is not None]
+    return [jpeg(image, f"step {step:,}", 800) for step, image in shown if image is not None]
 
 
 def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str, Picture]:
@@ -92,7 +92,7 @@ def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str
     for name in names:
         image = _read(account.run.renders / account.metrics["split"] / f"{files[name]}.{kind}")
         if image is not None:
-            found[name] = drawn(image, name)
+            found[name] = jpeg(image, name)
     return found
 
 
@@ -135,8 +135,8 @@ def maps(
                 alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
             bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
             result[name] = (
-                drawn(pictures.map_picture(_enlarged(variance)), "predictive variance"),
-                drawn(_enlarged(bare), "not covered: 1 - alpha"),
+                jpeg(pictures.map_picture(_enlarged(variance)), "predictive variance"),
+                jpeg(_enlarged(bare), "not covered: 1 - alpha"),
             )
             bar.advance()
     return result
@@ -156,6 +156,6 @@ def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: Rende
             now = dataclasses.replace(camera, time=time)
             with torch.no_grad():  # a picture
                 image = render(colors_only(scene, time), now, settings, outputs=()).rgb.cpu().numpy()
-            found.append(drawn(image, f"time {time:.3g}", 640))
+            found.append(jpeg(image, f"time {time:.3g}", 640))
             bar.advance()
     return found
