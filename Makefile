@@ -1,5 +1,6 @@
 # make demo    environment, then a still life made, fitted, rendered and compared: pictures in out/demo
 # make test    environment, then the tests
+# make browser Chromium by apt, for tests of the report and the viewer that are skipped without one
 #
 # PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
 # PIP_FLAGS   more options for pip. On Linux, plain PyPI has torch with CUDA (gigabytes); for the CPU build:
@@ -13,7 +14,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed
 
-.PHONY: setup demo test smoke lint llvm clean
+.PHONY: setup demo test browser smoke lint llvm clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP) llvm
@@ -23,6 +24,9 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+browser:
+	command -v chromium || command -v google-chrome || { apt-get update && apt-get install -y --no-install-recommends chromium; }
 
 # The commands of the README on a scene that is made in seconds; about a minute on two cores.
 smoke: setup
