@@ -25,6 +25,7 @@ from tyro.conf import FlagCreatePairsOff, subcommand
 import drgs
 from drgs.commands.making_options import Demo, Scene, Sfm, Teach
 from drgs.commands.options import (
+    Cite,
     Crossval,
     Eval,
     Fisher,
@@ -60,6 +61,7 @@ _OPTIONS = {
     "teach": Teach,
     "scene": Scene,
     "demo": Demo,
+    "cite": Cite,
 }
 
 

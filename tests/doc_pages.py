@@ -139,7 +139,8 @@ def make_folder(folder: Path) -> Path:
     """Fill a folder with what pages speak of.
 
     `scene`, nine posed pictures of a few Gaussians; `data/room`, the same with a teacher's maps; `point_cloud.ply` and
-    `scene.ply`, the Gaussians; `cameras.json`, poses alone; `my_package/rasterizer.py`, a rasterizer in plain torch.
+    `scene.ply`, the Gaussians; `cameras.json`, poses alone; `phone.mp4`, seconds of video, and `photos`, an empty folder;
+    `my_package/rasterizer.py`, a rasterizer in plain torch.
     """
     import cv2
     import numpy as np
@@ -191,6 +192,12 @@ def make_folder(folder: Path) -> Path:
         torch.save(maps, room / f"rgb_feature_langseg/{i}_fmap_CxHxW.pt")
     np.save(room / "text_embeddings.npy", np.eye(2, dtype=np.float32))
     (room / "classes.txt").write_text("chair\nwall\n")
+    (folder / "photos").mkdir()
+    video = cv2.VideoWriter(str(folder / "phone.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
+    for i in range(24):
+        frame = cv2.imread(str(folder / f"scene/{i % 9}.png"))
+        video.write(cv2.resize(frame, (64, 48)))
+    video.release()
     (folder / "my_package").mkdir()
     shutil.copy(ROOT / "tests/torch_model.py", folder / "my_package/rasterizer.py")
     return folder
