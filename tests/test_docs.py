@@ -178,6 +178,16 @@ def test_tests_that_pages_name_exist():
     assert named > 30
 
 
+def test_limits_are_the_readmes():
+    """The page of the site says what the README says, links aside."""
+    said = []
+    for path in (_README, ROOT / "docs" / "limits.md"):
+        text = path.read_text(encoding="utf-8").partition("# Limits\n")[2].partition("\n## ")[0]
+        text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text[text.index("\n- ") :]).replace("docs/", "")
+        said.append(text.split())
+    assert said[0] == said[1]
+
+
 def test_every_page_is_on_the_site():
     """The navigation of mkdocs.yml names every page below docs/, and pages that are there."""
     named = set(re.findall(r"[\w/-]+\.md", _navigation()))
