@@ -1,6 +1,7 @@
 # make demo    environment, then a still life made, fitted, rendered and compared: pictures in out/demo
 # make test    environment, then the tests
 # make browser Chromium by apt, for tests of the report and the viewer that are skipped without one
+# make docs    environment, then the documentation as a site: out/site/index.html
 #
 # PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
 # PIP_FLAGS   more options for pip. On Linux, plain PyPI has torch with CUDA (gigabytes); for the CPU build:
@@ -14,7 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed
 
-.PHONY: setup demo test browser smoke lint llvm clean
+.PHONY: setup demo test browser smoke docs lint llvm clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP) llvm
@@ -35,6 +36,7 @@ smoke: setup
 	$(BIN)/drgs demo --quick -o out/smoke
 	$(BIN)/drgs eval out/smoke/run
 	$(BIN)/drgs report out/smoke/run -o out/smoke/report.html
+	$(BIN)/drgs cite out/smoke/run
 	$(BIN)/drgs render out/smoke/run --frames 3 --width 64 --format png,exr,webm --depth -o out/smoke/render
 	rm -rf out/smoke/active
 	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 40
@@ -54,6 +56,10 @@ smoke: setup
 	rm -rf out/smoke/moving
 	$(BIN)/drgs fit out/smoke/kitchen -o out/smoke/moving --max-steps 40 --max-gaussians 2000 --feature-width 8
 	$(BIN)/drgs render out/smoke/moving --time 0..1 --frames 3 --width 48 --format webm,ply --set order=center -o out/smoke/times
+
+# Strict: a broken link, or a page that the navigation does not name, fails.
+docs: setup
+	$(BIN)/python -m mkdocs build --strict --quiet
 
 lint: setup
 	$(BIN)/ruff check .

@@ -167,7 +167,7 @@ def main():
     page = report(results, crossed, f"{at['machine']}, {at['date']}, commit {at['commit']}")
     pictures = ROOT / "docs" / "pictures"
     pictures.mkdir(exist_ok=True)
-    lines = ["", "", "Held-out views, photograph left, rendering right:", ""]
+    lines = ["", "", "Held-out views, photograph left, rendering right, by `python benchmarks/real.py`:", ""]
     for name in (n for n in ("banana", "office", "head") if n in results):
         source = sorted((args.runs / name / "renders" / "test").glob("*.png"))[0]
         picture(source, pictures / f"{name}.jpg")

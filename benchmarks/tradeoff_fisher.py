@@ -182,6 +182,7 @@ def report(result: dict, made: str, notes: str) -> str:
             ),
         ]
     lines += ["", "![error against time](pictures/tradeoff-fisher.png)", ""]
+    lines += ["By `python benchmarks/tradeoff_fisher.py`, as the tables.", ""]
     return "\n".join(lines) + (f"\n## What to use{notes}" if notes else "")
 
 

@@ -25,6 +25,7 @@ from tyro.conf import FlagCreatePairsOff, subcommand
 import drgs
 from drgs.commands.making_options import Demo, Scene, Sfm, Teach
 from drgs.commands.options import (
+    Cite,
     Convert,
     Crossval,
     Eval,
@@ -64,6 +65,7 @@ _OPTIONS = {
     "teach": Teach,
     "scene": Scene,
     "demo": Demo,
+    "cite": Cite,
 }
 
 

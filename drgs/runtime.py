@@ -43,6 +43,7 @@ __all__ = [
     "optix_status",
     "prepare",
     "setup",
+    "version",
 ]
 
 _Arguments = ParamSpec("_Arguments")
@@ -240,6 +241,13 @@ def optix_status() -> tuple[bool, str | None]:
     except OSError:
         return False, f"{name} was not found (containers: NVIDIA_DRIVER_CAPABILITIES=all)"
     return True, None
+
+
+def version() -> str:
+    """Of drgs."""
+    import drgs
+
+    return drgs.__version__
 
 
 def info() -> dict:

@@ -44,6 +44,7 @@ from drgs.fitting.config import (
 from drgs.settings import Preset, RenderSettings
 
 __all__ = [
+    "Cite",
     "Convert",
     "Crossval",
     "Eval",
@@ -328,3 +329,11 @@ class Report(Common):
     """A run folder; the fit may still be going on, or have been stopped."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     """The HTML file; default report.html in the run folder. While a fit writes there, name another place."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cite(Common):
+    """Print BibTeX of what a run used, by its config.json; without a run, of what every use rests on."""
+
+    run: Positional[Path | None] = None
+    """A run folder; the fit may still be going on."""

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 from drgs import data
 from drgs.commands.repeat import fit_command
 from drgs.files import Run
-from drgs.fitting.config import ActiveConfig
-from drgs.fitting.records import fit_record
+from drgs.fitting.records import active_record, fit_record
 from drgs.fitting.resume import claim_run
-from drgs.guards.arguments import ArgumentError
 from drgs.guards.outputs import check_file
 from drgs.report.page import GENERATOR
 from drgs.report.write import FILE, write_report
@@ -68,15 +66,7 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
         dataset: What was fitted; None where it is no longer there.
     """
     record = fit_record(run)
-    active = None
-    if record.is_active:
-        known = {name: x for name, x in ActiveConfig.recorded(run.config()["active"]).items()}
-        try:
-            active = ActiveConfig(**{name: tuple(x) if isinstance(x, list) else x for name, x in known.items()})
-        except (TypeError, ValueError, ArgumentError) as error:
-            text = " ".join(str(error).split())
-            raise ValueError(f"{run.path / 'config.json'}: active: {text}; restore the file") from None
-    command, beyond = fit_command(record.config, active, record.data, run.path)
+    command, beyond = fit_command(record.config, active_record(run), record.data, run.path)
     text = "The command that repeats this fit, in another folder:"
     if beyond:
         text = f"Fitted from Python: FitConfig({', '.join(beyond)}), beside what this command says:"

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.files import load_ply, load_state
-from drgs.fitting.config import FitConfig
+from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
+from drgs.guards.arguments import ArgumentError
 from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "FitRecord",
     "LoadedRun",
+    "active_record",
     "check_checkpoint",
     "config_record",
     "fit_record",
@@ -85,6 +87,24 @@ class FitRecord:
         if not self.data.exists():
             advice = f"move it back, or {otherwise}" if otherwise else "move it back"
             raise FileNotFoundError(f"{run}: the data set of the run must be at {self.data}, found none; {advice}")
+
+
+def active_record(run: Run) -> ActiveConfig | None:
+    """How the views of a run were chosen; None where none were.
+
+    Raises:
+        FileNotFoundError: If it is no run folder.
+        ValueError: If config.json is damaged.
+    """
+    if not (recorded := run.config().get("active")):
+        return None
+    try:
+        known: dict[str, Any] = ActiveConfig.recorded(recorded)
+        lists = {name: tuple(x) for name, x in known.items() if isinstance(x, list)}
+        return ActiveConfig(**(known | lists))
+    except (TypeError, ValueError, ArgumentError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{run.path / 'config.json'}: active: {text}; restore the file") from None
 
 
 @dataclasses.dataclass(frozen=True)

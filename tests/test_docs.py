@@ -1,0 +1,217 @@
+"""The documentation is run: every block of every page, its figures' commands, its links, the tests that it names."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+
+import pytest
+from doc_pages import PAGES, ROOT, blocks, elsewhere, figures, inline_commands, lines_of, make_folder, smaller
+
+from drgs import cli
+
+# What has tests of its own, which run the very blocks.
+_README = ROOT / "README.md"
+_LANGUAGES = {"bash", "python", "bibtex", "text", "json"}
+
+
+def _name(page) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """What pages speak of, see `doc_pages.make_folder`."""
+    return make_folder(tmp_path_factory.mktemp("docs"))
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, id=_name(page)) for page in PAGES if page != _README and blocks(page)]
+)
+def test_blocks_run(page, made, tmp_path, monkeypatch, capsys):
+    """Blocks of a page run in its order, in one folder: Python in one namespace, commands on little data.
+
+    A function `test_...` that a block defines is called, as pytest would.
+    """
+    folder = tmp_path / "page"
+    shutil.copytree(made, folder)
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    names: dict = {"__name__": "docs"}
+    for block in blocks(page):
+        where = f"{_name(page)}:{block.line}"
+        if block.language == "python":
+            before = set(names)
+            # A file name that tracebacks can show, and inspect can read.
+            source = folder / f"block_{block.line}.py"
+            source.write_text(block.text)
+            exec(compile(block.text, str(source), "exec"), names)
+            for name in sorted(set(names) - before):
+                if name.startswith("test_"):
+                    names[name]()
+        elif block.language == "bash":
+            for line in lines_of(block):
+                _run(line, where)
+    capsys.readouterr()
+
+
+def _run(line: str, where: str) -> None:
+    """One line of a bash block: `drgs` is run or, where that takes other things, parsed; the rest must exist."""
+    words = shlex.split(line, comments=True)
+    while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
+        words = words[1:]
+    if words[0] != "drgs":
+        _check_line(words, where)
+    elif elsewhere(words[1:]):
+        cli._parse_arguments(words[1:])
+    else:
+        # 1: a wrong gradient was found, which is what a page may show.
+        assert cli.main(smaller(words[1:])) in ((0, 1) if words[1] == "crossval" else (0,)), f"{where}: {line}"
+
+
+def _check_line(words: list[str], where: str) -> None:
+    """Scripts, targets and extras that a line names are there, and a script knows the line's options."""
+    said = f"{where}: {' '.join(words)}"
+    program = words[0].rpartition("/")[2]
+    if program == "make":
+        targets = [word for word in words[1:] if "=" not in word and not word.startswith("-")]
+        makefile = (ROOT / "Makefile").read_text()
+        assert all(re.search(rf"^{name}:", makefile, flags=re.M) for name in targets), said
+    elif program in ("pip", "pip3"):
+        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        for names in re.findall(r"\[([\w,]+)\]", " ".join(words)):
+            assert set(names.split(",")) <= set(extras), said
+    elif program in ("python", "python3"):
+        if words[1].startswith("-"):
+            assert words[1:3] == ["-m", "venv"], said
+            return
+        places = [ROOT / words[1], *sorted((ROOT / "examples").rglob(words[1]))]
+        script = next((path for path in places if path.is_file()), None)
+        assert script is not None, said
+        text = script.read_text(encoding="utf-8")
+        if "import studies" in text:  # whose parser is that of all studies
+            text += (ROOT / "benchmarks/studies.py").read_text(encoding="utf-8")
+        for word in words[2:]:
+            assert not word.startswith("--") or f'"{word}"' in text, f"{said}: no option {word}"
+    elif program == "git":
+        assert words[1] == "clone", said
+    else:
+        raise AssertionError(f"{said}: a command that no test knows")
+
+
+def test_every_block_says_what_it_is():
+    """A block of commands or Python is labelled, so that it runs; what has no label is a drawing."""
+    for page in PAGES:
+        for block in blocks(page):
+            where = f"{_name(page)}:{block.line}"
+            assert not block.language or block.language in _LANGUAGES, where
+            if not block.language:
+                assert not re.search(r"^\s*(drgs|make|python3?|pip|import|from) ", block.text, flags=re.M), where
+        text = page.read_text(encoding="utf-8")
+        assert not re.search(r"^ {4,}(drgs|make|python3?|pip) ", text, flags=re.M), f"{_name(page)}: unfenced commands"
+
+
+def test_commands_in_the_text_exist():
+    """Options, scripts and targets that running text names are there."""
+    import dataclasses
+
+    for page in PAGES:
+        for command in inline_commands(page):
+            where = _name(page)
+            try:
+                words = shlex.split(command)
+            except ValueError:
+                raise AssertionError(f"{where}: {command}") from None
+            if words[0] != "drgs":
+                _check_line(words, where)
+                continue
+            if words[1] in ("--help", "--version"):
+                continue
+            assert words[1] in cli._OPTIONS, f"{where}: {command}"
+            fields = {field.name.replace("_", "-") for field in dataclasses.fields(cli._OPTIONS[words[1]])}
+            fields |= {"set", "class", "help"} | {f"no-{name}" for name in fields}
+            for word in words[2:]:
+                if re.fullmatch(r"--[a-z-]+(=.*)?", word):
+                    assert word[2:].partition("=")[0] in fields, f"{where}: {command}: no option {word}"
+
+
+def test_figures_name_their_commands():
+    """The paragraph before or behind a picture names the command that made it."""
+    for page in PAGES:
+        for path, around in figures(page):
+            where = f"{_name(page)}: {path}"
+            picture = page.parent / path
+            assert picture.is_file(), where
+            assert picture.stat().st_size < 400_000, where
+            assert re.search(r"`(drgs|python|make) [^`]+`", around), f"{where}: by which command?"
+
+
+def test_links_lead_somewhere():
+    """Files, and headings of pages, that the README and the documentation link to are there."""
+    for page in PAGES:
+        text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+        for target, heading in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", text):
+            if "://" in target:
+                continue
+            path = page.parent / target if target else page
+            assert path.exists(), f"{_name(page)}: {target}"
+            if heading and path.suffix == ".md":
+                titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), flags=re.M)
+                slugs = {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
+                assert heading in slugs, f"{_name(page)}: {target}#{heading}"
+
+
+def test_tests_that_pages_name_exist():
+    """`tests/test_x.py::test_y`, or `test_x.py::test_y` in a table of such, is a function of that file."""
+    named = 0
+    for page in PAGES:
+        for file, function in re.findall(r"(test_\w+\.py)::(\w+)", page.read_text(encoding="utf-8")):
+            path = ROOT / "tests" / file
+            assert path.is_file(), f"{_name(page)}: {file}"
+            found = {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
+            assert function in found, f"{_name(page)}: {file}::{function}"
+            named += 1
+    assert named > 30
+
+
+def test_limits_are_the_readmes():
+    """The page of the site says what the README says, links aside."""
+    said = []
+    for path in (_README, ROOT / "docs" / "limits.md"):
+        text = path.read_text(encoding="utf-8").partition("# Limits\n")[2].partition("\n## ")[0]
+        text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text[text.index("\n- ") :]).replace("docs/", "")
+        said.append(text.split())
+    assert said[0] == said[1]
+
+
+def test_every_page_is_on_the_site():
+    """The navigation of mkdocs.yml names every page below docs/, and pages that are there."""
+    named = set(re.findall(r"[\w/-]+\.md", _navigation()))
+    pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+    assert named == pages
+
+
+def _navigation() -> str:
+    text = (ROOT / "mkdocs.yml").read_text()
+    text = text[text.index("\nnav:") :]
+    return re.sub(r"^\s*#.*$", "", text, flags=re.M)
+
+
+def test_the_site_builds(tmp_path):
+    """Strictly: no broken link, no docstring that cannot be read; and nothing of it is fetched from elsewhere."""
+    pytest.importorskip("mkdocs", reason="the site needs pip install 'drgs[docs]'")
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for page in (tmp_path / "site").rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not re.search(r'<(script|img|iframe)[^>]+src="(https?:)?//', text), page
+        for link in re.findall(r"<link[^>]+>", text):
+            assert "canonical" in link or not re.search(r'href="(https?:)?//', link), (page, link)
