@@ -30,6 +30,7 @@ __all__ = ["Picture", "drawn", "maps", "previews", "spread", "stills", "view_pic
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels; more than a page is wide
 _PREVIEWS = 12
+_MAP_WIDTH = 480  # pixels, about
 _LARGEST = 1 << 28  # bytes of a PNG in a run folder that is opened
 _PRIOR = Prior(1.0)  # as for the maps of `drgs fisher`
 _KNOWN = 24  # views whose information is added up; of more, these stand for all
@@ -132,13 +133,19 @@ def maps(
             variance = fisher.variance_map(plain, camera, weights, settings, sphere=sphere).numpy()
             with torch.no_grad():  # a picture
                 alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
-            open_ = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
+            bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
             result[name] = (
-                drawn(pictures.map_picture(variance), "predictive variance"),
-                drawn(open_, "not covered: 1 - alpha"),
+                drawn(pictures.map_picture(_enlarged(variance)), "predictive variance"),
+                drawn(_enlarged(bare), "not covered: 1 - alpha"),
             )
             bar.advance()
     return result
+
+
+def _enlarged(values: np.ndarray) -> np.ndarray:
+    """Each pixel as a square, so that a small map is not dwarfed by its color bar."""
+    times = max(1, round(_MAP_WIDTH / values.shape[1]))
+    return values.repeat(times, 0).repeat(times, 1)
 
 
 def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: RenderSettings) -> list[Picture]:
