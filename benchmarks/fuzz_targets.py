@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
@@ -229,11 +228,6 @@ def _decoder(folder: Path) -> None:
     from drgs.features.decoder import load_decoder
 
     load_decoder(folder / "decoder.pth")
-
-
-def copied(source: Path) -> Callable[[Path], Any]:
-    """A writer of seeds that copies a folder."""
-    return lambda folder: shutil.copytree(source, folder, dirs_exist_ok=True)
 
 
 TARGETS: dict[str, Target] = {

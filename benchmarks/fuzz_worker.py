@@ -47,7 +47,7 @@ def place_of(error: BaseException) -> str:
     """Where in drgs an error came from, file:line, by which findings of one cause are told."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if f"{ROOT}/drgs" in frame.filename] or list(frames)
-    return f"{Path(own[-1].filename).relative_to(ROOT)}:{own[-1].lineno}" if own else "?"
+    return f"{os.path.relpath(own[-1].filename, ROOT)}:{own[-1].lineno}" if own else "?"
 
 
 def tell(**news: Any) -> None:

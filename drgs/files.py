@@ -22,6 +22,7 @@ from drgs.guards import outputs
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
+from drgs.guards.ply_lists import ply_source
 from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ _SIZES = {
 _MAX_HEADER = 1 << 18  # bytes; some 9,000 columns
 _NORMALS = ("nx", "ny", "nz")
 _FEATURE = "semantic_"
+_SHOWN = 200  # characters of a reader's own message
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
@@ -99,28 +101,33 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
         _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
     try:
-        vertex = plyfile.PlyData.read(str(path))["vertex"].data
-    except (plyfile.PlyParseError, ValueError, OSError) as error:
-        text = " ".join(str(error).split())
+        vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
+        arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in columns.items()}
+        higher, described = _columns(vertex, rest), _columns(vertex, features)
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
+        text = " ".join(str(error).split())[:_SHOWN]
         raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
-
-    def read(group: tuple[str, ...]) -> torch.Tensor:
-        out = np.empty((len(vertex), len(group)), np.float32)
-        for i, name in enumerate(group):
-            out[:, i] = vertex[name]
-        return torch.from_numpy(out)
-
-    arrays: dict[str, Any] = {field: read(group) for field, group in columns.items()}
     sh = arrays.pop("dc")[:, None, :]
     if rest:
-        higher = read(rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)
-        sh = torch.cat([sh, higher], dim=1)
+        sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
     if features:
-        arrays["features"] = read(features)
+        arrays["features"] = described
     arrays["logit_opacities"] = arrays["logit_opacities"][:, 0]
     made = Gaussians(**arrays, sh=sh.contiguous())
     made.validate(str(path))
     return made
+
+
+def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> torch.Tensor:
+    """(N, columns) float32."""
+    import torch
+
+    out = np.empty((len(vertex), len(names)), np.float32)
+    for i, name in enumerate(names):
+        out[:, i] = vertex[name]
+    return torch.from_numpy(out)
 
 
 def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
@@ -191,6 +198,8 @@ def _check_ply(path: Path) -> list[str]:
                 pass
             case _:
                 raise ValueError(f"{path}: PLY header must be well-formed, got {line[:60]!r}; export it again")
+    if empty := next((name for name, n, names, _ in elements if n and not names), None):
+        raise ValueError(f"{path}: element {empty!r} of a PLY must have a property, has none; export it again")
     # At least one digit and one separator a value where numbers are text.
     claimed = sum(n * (2 * len(names) if text_format == "ascii" else size) for _, n, names, size in elements)
     held = path.stat().st_size - newline - 1

@@ -137,7 +137,7 @@ def test_colmap_image_of_another_shape(tmp_path):
     ("change", "message"),
     [
         ({"fl_x": None, "fl_y": None}, "frame 0: must have fl_x or camera_angle_x"),
-        ({"fl_x": "wide"}, "frame 0: fl_x must be a finite number, got 'wide'"),
+        ({"fl_x": "wide"}, 'frame 0: fl_x must be a finite number, got "wide"'),
         ({"fl_x": float("nan")}, "frame 0: fl_x must be a finite number, got nan"),
         ({"fl_x": -3}, "focal lengths must be positive"),
         (
