@@ -382,10 +382,14 @@ class Run:
         append_line(self.path / "log.jsonl", line, default=_jsonable)
 
     def events(self) -> list[dict]:
-        """The events of `log.jsonl`; a partial last line is left out."""
+        """The events of `log.jsonl`; a partial last line is left out.
+
+        Raises:
+            ValueError: If a line is no JSON.
+        """
         path = self.path / "log.jsonl"
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
-        return [json.loads(line) for line in lines]
+        return [parse_json(line, f"{path}, line {number}") for number, line in enumerate(lines, 1)]
 
     def _drop_partial_line(self) -> None:
         path = self.path / "log.jsonl"
