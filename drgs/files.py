@@ -22,7 +22,8 @@ from drgs.guards import outputs
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
-from drgs.guards.ply_headers import read_ply_header
+from drgs.guards.ply_headers import EXTRA, extra_kind, read_ply_header
+from drgs.guards.ply_lists import ply_source
 from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 _NORMALS = ("nx", "ny", "nz")
 _FEATURE = "semantic_"
-_EXTRA = ("uncertainty_", "label")  # beginnings of columns that `save_ply` adds
+_SHOWN = 200  # characters of a reader's own message
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
@@ -91,33 +92,38 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
             f"{_layout_hint(names)}"
         )
     known = {name for group in columns.values() for name in group} | {*rest, *features, *_NORMALS}
-    extra = [name for name in names if name not in known and not name.startswith(_EXTRA)]
+    extra = [name for name in names if name not in known and not name.startswith(EXTRA)]
     if extra:
         shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
         _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
     try:
-        vertex = plyfile.PlyData.read(str(path))["vertex"].data
-    except (plyfile.PlyParseError, ValueError, OSError) as error:
-        text = " ".join(str(error).split())
+        vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
+        arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in columns.items()}
+        higher, described = _columns(vertex, rest), _columns(vertex, features)
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
+        text = " ".join(str(error).split())[:_SHOWN]
         raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
-
-    def read(group: tuple[str, ...]) -> torch.Tensor:
-        out = np.empty((len(vertex), len(group)), np.float32)
-        for i, name in enumerate(group):
-            out[:, i] = vertex[name]
-        return torch.from_numpy(out)
-
-    arrays: dict[str, Any] = {field: read(group) for field, group in columns.items()}
     sh = arrays.pop("dc")[:, None, :]
     if rest:
-        higher = read(rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)
-        sh = torch.cat([sh, higher], dim=1)
+        sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
     if features:
-        arrays["features"] = read(features)
+        arrays["features"] = described
     arrays["logit_opacities"] = arrays["logit_opacities"][:, 0]
     made = Gaussians(**arrays, sh=sh.contiguous())
     made.validate(str(path))
     return made
+
+
+def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> torch.Tensor:
+    """(N, columns) float32."""
+    import torch
+
+    out = np.empty((len(vertex), len(names)), np.float32)
+    for i, name in enumerate(names):
+        out[:, i] = vertex[name]
+    return torch.from_numpy(out)
 
 
 def save_ply(
@@ -167,7 +173,7 @@ def save_ply(
         **{f"rot_{i}": fields["quats"][:, i] for i in range(4)},
         **{f"{_FEATURE}{i}": x for i, x in enumerate(fields["features"].T if "features" in fields else ())},
     }
-    kinds = {name: _checked_extra(name, x, len(g)) for name, x in (extra or {}).items()}
+    kinds = {name: extra_kind(name, x, len(g)) for name, x in (extra or {}).items()}
     vertex = np.empty(len(g), [*((name, "<f4") for name in columns), *kinds.items()])
     for name, values in {**columns, **(extra or {})}.items():
         vertex[name] = values
@@ -175,24 +181,6 @@ def save_ply(
     ply = plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")], byte_order="<", comments=lines)
     with atomic_write(path) as file:
         ply.write(file)
-
-
-def _checked_extra(name: str, values: np.ndarray, count: int) -> str:
-    """The type of an extra column; ValueError if it cannot be one."""
-    if not name.startswith(_EXTRA) or not name.isidentifier() or values.shape != (count,):
-        raise ValueError(
-            f"save_ply: extra columns must be named uncertainty_* or label* and have {count} values, got {name!r} of "
-            f"shape {values.shape}; correct it"
-        )
-    if values.dtype.kind in "iu":
-        ends = int(values.min(initial=0)), int(values.max(initial=0))
-        if ends[0] < 0 or ends[1] > 65535:
-            raise ValueError(f"save_ply: {name} must be in 0..65535, got {ends[0]}..{ends[1]}; number them anew")
-        return "u1" if ends[1] < 256 else "<u2"
-    if not np.isfinite(values).all():
-        i = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise ValueError(f"save_ply: {name} must be finite, got {values[i]} at index {i}; leave it out or repair it")
-    return "<f4"
 
 
 def _check_ply(path: Path) -> list[str]:
@@ -387,10 +375,14 @@ class Run:
         append_line(self.path / "log.jsonl", line, default=_jsonable)
 
     def events(self) -> list[dict]:
-        """The events of `log.jsonl`; a partial last line is left out."""
+        """The events of `log.jsonl`; a partial last line is left out.
+
+        Raises:
+            ValueError: If a line is no JSON.
+        """
         path = self.path / "log.jsonl"
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
-        return [json.loads(line) for line in lines]
+        return [parse_json(line, f"{path}, line {number}") for number, line in enumerate(lines, 1)]
 
     def _drop_partial_line(self) -> None:
         path = self.path / "log.jsonl"

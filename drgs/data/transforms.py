@@ -245,7 +245,7 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
     kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(kind, str) or kind not in _LENSES:
         raise ValueError(
-            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort the images"
+            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {str(kind)[:40]!r}; undistort the images"
         )
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model, distortion = _LENSES[kind], ()
@@ -290,8 +290,7 @@ def _focal(where: str, values: dict, key: str, size: float) -> float:
 
 def _number(where: str, values: dict, key: str, default: float | None = None) -> float:
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{where}: {key} must be a finite number, got {value!r}; correct it")
+    check_json(where, {key: value}, {key: float}, "correct it")
     return value
 
 

@@ -117,7 +117,7 @@ def _is_sog(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.rpartition("/")[2] == "meta.json" for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError):
+    except Exception:  # zipfile raises whatever the damage leads to
         return False
 
 

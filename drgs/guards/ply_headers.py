@@ -6,7 +6,12 @@ import dataclasses
 import re
 from pathlib import Path
 
-__all__ = ["PlyElement", "read_ply_header"]
+import numpy as np
+
+__all__ = ["EXTRA", "PlyElement", "extra_kind", "read_ply_header"]
+
+EXTRA = ("uncertainty_", "label")
+"""Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
 
 _SIZES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
@@ -70,6 +75,8 @@ def read_ply_header(path: Path) -> list[PlyElement]:
                 pass
             case _:
                 raise ValueError(f"{path}: PLY header must be well-formed, got {line[:60]!r}; export it again")
+    if empty := next((element.name for element in elements if element.rows and not element.columns), None):
+        raise ValueError(f"{path}: element {empty!r} of a PLY must have a property, has none; export it again")
     is_text = text_format == "ascii"
     claimed = sum(element.least_bytes(is_text) for element in elements)
     held = path.stat().st_size - newline - 1
@@ -80,3 +87,25 @@ def read_ply_header(path: Path) -> list[PlyElement]:
             "it is truncated or damaged, copy it again"
         )
     return elements
+
+
+def extra_kind(name: str, values: np.ndarray, count: int) -> str:
+    """The type of an extra column of (N,) values.
+
+    Raises:
+        ValueError: If it has another name or length, or a value that the file cannot hold.
+    """
+    if not name.startswith(EXTRA) or not name.isidentifier() or values.shape != (count,):
+        raise ValueError(
+            f"save_ply: extra columns must be named uncertainty_* or label* and have {count} values, got {name!r} of "
+            f"shape {values.shape}; correct it"
+        )
+    if values.dtype.kind in "iu":
+        ends = int(values.min(initial=0)), int(values.max(initial=0))
+        if ends[0] < 0 or ends[1] > 65535:
+            raise ValueError(f"save_ply: {name} must be in 0..65535, got {ends[0]}..{ends[1]}; number them anew")
+        return "u1" if ends[1] < 256 else "<u2"
+    if not np.isfinite(values).all():
+        i = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise ValueError(f"save_ply: {name} must be finite, got {values[i]} at index {i}; leave it out or repair it")
+    return "<f4"
