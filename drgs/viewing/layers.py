@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
     from drgs.viewing.uncertainty import Uncertainty
 
-__all__ = ["INFORMATION", "Drawing", "Layer", "Scale", "layers_of", "tinted"]
+__all__ = ["INFORMATION", "Drawing", "Layer", "ColorScale", "layers_of", "tinted"]
 
 INFORMATION = "information"
 _WIDE_PIXELS = 200_000  # of a picture of features: 100 MB of 128 channels
@@ -26,7 +26,7 @@ _ROW = 4096  # Gaussians that are painted at once
 
 
 @dataclasses.dataclass(frozen=True)
-class Scale:
+class ColorScale:
     """What the colors of a picture mean.
 
     Attributes:
@@ -44,7 +44,7 @@ class Drawing:
     """A picture (H, W, 3) uint8, and its scale, if it has one."""
 
     picture: np.ndarray
-    scale: Scale | None = None
+    scale: ColorScale | None = None
 
 
 Drawings = Generator[None, None, Drawing]
@@ -115,12 +115,12 @@ def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
 
     found = yield from drawn(scene, camera, settings, read)
     picture, (near, far) = pictures.depth_colors(found[..., 0], found[..., 1])
-    return Drawing(picture, Scale(far, near, "distance"))
+    return Drawing(picture, ColorScale(far, near, "distance"))
 
 
 def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     found = yield from drawn(scene, camera, settings, lambda out: 1 - out.alpha.cpu().numpy())
-    return Drawing(pictures.inferno(found), Scale(0.0, 1.0, "share of the light"))
+    return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light"))
 
 
 def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
@@ -135,7 +135,7 @@ def _mapped(uncertainty: Uncertainty) -> Draw:
         found = uncertainty.map(camera)
         yield
         picture, (low, high) = pictures.map_colors(found)
-        return Drawing(picture, Scale(low, high, "variance, logarithmic"))
+        return Drawing(picture, ColorScale(low, high, "variance, logarithmic"))
 
     return draw
 

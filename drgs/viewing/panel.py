@@ -15,7 +15,7 @@ from drgs.display.pictures import inferno
 from drgs.viewing.stations import Station, scale_colors, score_colors
 
 if TYPE_CHECKING:
-    from drgs.viewing.layers import Scale
+    from drgs.viewing.layers import ColorScale
     from drgs.viewing.stations import Sight
     from drgs.viewing.subject import Subject
 
@@ -33,7 +33,7 @@ def header(subject: Subject) -> str:
     return _block("drgs-header", rows)
 
 
-def status(text: str, scale: Scale | None = None) -> str:
+def status(text: str, scale: ColorScale | None = None) -> str:
     """What is being done, or what is shown, with the scale of its colors."""
     rows = [escape(text) or "&nbsp;"]
     if scale is not None:

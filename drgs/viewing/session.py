@@ -27,7 +27,7 @@ from drgs.viewing.stations import Station, score_colors
 if TYPE_CHECKING:
     import viser
 
-    from drgs.viewing.layers import Scale
+    from drgs.viewing.layers import ColorScale
     from drgs.viewing.subject import Subject
     from drgs.viewing.worker import Worker
 
@@ -141,7 +141,7 @@ class Session:
             self._show_stations()
         self._ask_later()
 
-    def say(self, text: str, scale: Scale | None = None) -> None:
+    def say(self, text: str, scale: ColorScale | None = None) -> None:
         """Say in the panel what is being done, or shown. From any thread."""
         if not self._is_closed:
             self._status.content = panel.status(text, scale)
@@ -294,6 +294,8 @@ class Session:
             image = to_bytes(read(_PHOTOGRAPH))
         except (OSError, ValueError) as error:
             self.say(str(error))
+            return
+        if self._is_closed:
             return
         self._photograph.image = image
         self._photograph.visible = True
