@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 _EVERY = 2.0  # seconds between two looks at the files
+_LAST = 0.5  # seconds that what is being computed is given to end
 _LEAST, _MOST = 100, 1 << 24  # pixels of our pictures
 
 
@@ -48,8 +49,9 @@ def run(args: View) -> None:
         with quietly():
             _watch(args, viewer, stamps)
     finally:
-        if not viewer.stop():
+        if not viewer.worker.close(_LAST):
             interrupts.leave()
+        viewer.stop()
 
 
 def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]]) -> None:
