@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import threading
+import warnings
 import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +39,8 @@ def run(args: View) -> None:
         raise ValueError(f"view: --max-pixels must be in [{_LEAST}, {_MOST}], got {args.max_pixels}; correct it")
     from drgs.viewing.server import Viewer
 
+    # A browser may be closed while something is on its way to it: that is no news.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with Bar("the scene", show=not args.quiet):
         stamps = _stamps(watched_files(args))
         subject = subject_of(args, Given.of(args))

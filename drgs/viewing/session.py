@@ -68,7 +68,7 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
         self._wanted = 0
-        self._is_closed = False
+        self._is_closed, self.drawn = False, 0  # pictures that were drawn to the end
         self._is_over = False  # our picture lies there, and the Gaussians are hidden
         self._gaussians: Any = None
         self._timer: asyncio.TimerHandle | None = None
@@ -389,6 +389,7 @@ class Session:
             took = time.perf_counter() - began
             self.say(f"{layer.name}, {preset}: {camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
             yield
+        self.drawn += 1
 
     def _seen_pose(self) -> tuple[Pose, tuple[int, int]]:
         """Where the client's camera is, and the pixels of its window."""
