@@ -249,7 +249,7 @@ class Session:
             )
             frustum.on_click(self._clicked(station))
             self._frusta.append(frustum)
-        self._near = 1.5 * size
+        self._near = 3 * size
         self._show_frusta()
 
     def _show_frusta(self) -> None:
