@@ -1,5 +1,6 @@
 # make demo    environment, then a still life made, fitted, rendered and compared: pictures in out/demo
 # make test    environment, then the tests
+# make browser Chromium by apt, for tests of the report and the viewer that are skipped without one
 # make docs    environment, then the documentation as a site: out/site/index.html
 #
 # PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
@@ -14,7 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed
 
-.PHONY: setup demo test smoke docs lint llvm clean
+.PHONY: setup demo test browser smoke docs lint llvm clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP) llvm
@@ -24,6 +25,9 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+browser:
+	command -v chromium || command -v google-chrome || { apt-get update && apt-get install -y --no-install-recommends chromium; }
 
 # The commands of the README on a scene that is made in seconds; about a minute on two cores.
 smoke: setup
@@ -46,6 +50,8 @@ smoke: setup
 	$(BIN)/drgs fit out/smoke/room -o out/smoke/semantic --max-steps 40 --feature-width 8
 	$(BIN)/drgs query out/smoke/semantic --class wall --threshold 0 --limit 1 -o out/smoke/query
 	$(BIN)/drgs teach --help
+	$(BIN)/drgs convert out/smoke/semantic out/smoke/labelled.ply --labels
+	$(BIN)/drgs convert out/smoke/run out/smoke/run.spz
 	$(BIN)/drgs scene kitchen -o out/smoke/kitchen --size 64x48 --cameras 3 --times 3 --spp 2
 	rm -rf out/smoke/moving
 	$(BIN)/drgs fit out/smoke/kitchen -o out/smoke/moving --max-steps 40 --max-gaussians 2000 --feature-width 8

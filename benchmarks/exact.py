@@ -1,11 +1,13 @@
 """What exact order costs on scenes that people have: `exact` against `fast`, on fits, a splat and the cube.
 
     python benchmarks/exact.py [--fits FOLDER] [--turns 7]      tables, docs/benchmarks-exact.md, benchmarks/exact.json
+    python benchmarks/exact.py --parts oracle torch             these parts again, the others as they are
 
-Fits are made once, in FOLDER (default runs/exact), of the captures `office` and `banana` in DRGS_DATA and of a still
-life made here; the splat is `wolf` there. What is not there is left out, and the page says so. Presets take turns in
-one process for each scene and number of threads; figures are medians. The same frames are timed against Mitsuba's
-`volprim_rf_basic` (shapes `ellipsoids` and `ellipsoidsmesh`), and beside two processes that never rest.
+Fits are made once, in FOLDER (default runs/exact), of the captures `office`, `banana` and (for the oracle) `statue` in
+DRGS_DATA and of a still life made here; the splat is `wolf` there. What is not there is left out, and the page says so.
+Presets take turns in one process for each scene and number of threads; figures are medians. The same frames are timed
+against Mitsuba's `volprim_rf_basic` (shapes `ellipsoids` and `ellipsoidsmesh`), and beside two processes that never
+rest; a smaller cube against gsplat's own torch code, by examples/gsplat_torch.py.
 """
 
 from __future__ import annotations
@@ -35,11 +37,13 @@ from drgs.train import FitConfig, fit  # noqa: E402
 
 DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
 PIXELS = 76_800  # of a view: 320x240
-FITTED = ("office", "banana", "still life")
-SCENES = (*FITTED, "wolf", "cube")
+FITTED = ("office", "banana", "still life", "statue")
+SCENES = ("office", "banana", "still life", "wolf", "cube")
+CHECKED = (*SCENES, "statue")  # against the oracle
 KINDS = ("forward", "forward + backward", "Fisher diagonal")
 CROP = (48, 36)  # pixels that the oracle looks at
 MESH = {"type": "ellipsoidsmesh", "extent_adaptive_clamping": True}
+SMALL = 10_000, 128  # Gaussians, and pixels along a side: what torch code can do
 LIMITS = (8, 10, 5)  # that `exact` is to stay below, in multiples of `fast`
 
 
@@ -54,7 +58,7 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
         source = DATA / name
         if not source.is_dir():
             return None
-    dataset, run = data.load(source, lazy=True), folder / name.replace(" ", "-")
+    dataset, run = data.load(source), folder / name.replace(" ", "-")
     if not (run / "point_cloud.ply").exists():
         fit(dataset, run, FitConfig(max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"))
     view = dataset.views[len(dataset.views) // 2]
@@ -148,7 +152,42 @@ def task_peers(name: str, folder: Path, turns: int) -> dict:
     return result
 
 
-TASKS = {"scene": task_scene, "oracle": task_oracle, "memory": task_memory, "peers": task_peers}
+def task_torch(name: str, folder: Path, turns: int) -> dict:
+    """gsplat's torch code against our preset of its model, on a cube that its memory allows."""
+    from examples.gsplat_torch import rasterization
+
+    g, cam, s = cubes.cube(SMALL[0]), cubes.camera(SMALL[1]), Preset("gsplat")
+    raw = {"means": g.means, "quats": g.quats, "log_scales": g.log_scales, "logits": g.logit_opacities, "sh": g.sh}
+    leaves = {key: x.clone().requires_grad_() for key, x in raw.items()}
+    view, K = torch.tensor(np.array(cam.w2c))[None].float(), torch.tensor(cam.K)[None].float()
+
+    def drawn(x: dict) -> torch.Tensor:
+        shape = x["means"], x["quats"], x["log_scales"].exp(), x["logits"].sigmoid(), x["sh"]
+        return rasterization(*shape, view, K, cam.width, cam.height, sh_degree=0)[0][0]
+
+    def alone() -> torch.Tensor:
+        with torch.no_grad():
+            return drawn(raw)
+
+    def differentiated() -> None:
+        drawn(leaves).sum().backward()
+        for leaf in leaves.values():
+            leaf.grad = None
+
+    runs = {"gsplat's torch code, forward": alone, "preset gsplat, forward": forward(g, cam, s)}
+    runs |= {"gsplat's torch code, both": differentiated, "preset gsplat, both": backward(g, cam, s)}
+    difference = (alone() - forward(g, cam, s)().rgb).abs()
+    return {"seconds": interleaved(runs, turns), "difference": float(difference.quantile(0.999))}
+
+
+TASKS = {
+    "scene": task_scene,
+    "oracle": task_oracle,
+    "memory": task_memory,
+    "peers": task_peers,
+    "torch": task_torch,
+}
+PARTS = ("scenes", "oracle", "memory", "peers", "torch")
 
 
 def child(task: str, name: str, threads: int, args: argparse.Namespace) -> dict | None:
@@ -196,7 +235,8 @@ def report(result: dict) -> str:
     lines = [
         "# What exact order costs",
         "",
-        f"Made by `python benchmarks/exact.py` on {result['machine']}, {result['date']}, commit {result['commit']}.",
+        f"Made by `python benchmarks/exact.py` on {result['machine']}, {result['date']}, commit {result['commit']}"
+        + (f" ({result['again']})." if "again" in result else "."),
         "`exact` in multiples of `fast` on the same view; presets take turns in one process, medians. The fits have",
         "1,000 steps at 10,800 pixels. `forward` is without depth: with a depth, the tails of Gaussians that a tile",
         "could do without are not left out ([numerics.md](numerics.md)).",
@@ -232,6 +272,22 @@ def report(result: dict) -> str:
             t = peers[state]
             cells.append(f"{1e3 * t[name]:.0f} | {t['volprim, ellipsoids'] / t[name]:.1f}x")
         lines.append(f"| {name} | {' | '.join(cells)} |")
+    slow = result["torch"]["seconds"]
+    lines += [
+        "",
+        "## Against gsplat's torch code",
+        "",
+        f"{SMALL[0]:,} Gaussians, {SMALL[1]}x{SMALL[1]}, ms, two threads: gsplat 1.5.3's own torch functions on the",
+        "CPU (examples/gsplat_torch.py says which), and our preset of its model; 99.9 % of the values differ by less",
+        f"than {result['torch']['difference']:.0e}.",
+        "",
+        "| | forward | forward + backward |",
+        "|---|---|---|",
+    ]
+    for name in ("gsplat's torch code", "preset gsplat"):
+        lines.append(f"| {name} | {1e3 * slow[f'{name}, forward']:.0f} | {1e3 * slow[f'{name}, both']:.0f} |")
+    ratios = [slow[f"gsplat's torch code, {kind}"] / slow[f"preset gsplat, {kind}"] for kind in ("forward", "both")]
+    lines.append(f"| ratio | {ratios[0]:.0f}x | {ratios[1]:.0f}x |")
     return "\n".join([*lines, ""])
 
 
@@ -239,6 +295,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fits", type=Path, default=ROOT / "runs" / "exact")
     parser.add_argument("--turns", type=int, default=7)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--scene", default="")
     args = parser.parse_args()
@@ -247,13 +304,21 @@ def main() -> None:
         return
     for name in FITTED:
         scene(name, args.fits)
-    result = ran()
-    result["scenes"] = {
-        str(threads): {name: child("scene", name, threads, args) for name in SCENES} for threads in (1, 2)
-    }
-    result["oracle"] = {name: child("oracle", name, 2, args) for name in SCENES}
-    result["memory"], result["peers"] = child("memory", "", 2, args), child("peers", "", 2, args)
-    (ROOT / "benchmarks" / "exact.json").write_text(json.dumps(result, indent=1) + "\n")
+    store, parts = ROOT / "benchmarks" / "exact.json", args.parts
+    result = ran() if set(parts) == set(PARTS) else json.loads(store.read_text())
+    if "scenes" in parts:
+        result["scenes"] = {
+            str(threads): {name: child("scene", name, threads, args) for name in SCENES} for threads in (1, 2)
+        }
+    if "oracle" in parts:
+        result["oracle"] = {name: child("oracle", name, 2, args) for name in CHECKED}
+    for task in ("memory", "peers", "torch"):
+        if task in parts:
+            result[task] = child(task, "", 2, args)
+    if len(parts) < len(PARTS):
+        made = ran()
+        result["again"] = f"{', '.join(parts)}: {made['date']}, commit {made['commit']}"
+    store.write_text(json.dumps(result, indent=1) + "\n")
     (ROOT / "docs" / "benchmarks-exact.md").write_text(report(result))
 
 

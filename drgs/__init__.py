@@ -23,10 +23,12 @@ _NAMES = {
     "DynamicGaussians": "deform",
     "Gaussians": "ellipsoids",
     "RenderSettings": "settings",
+    "load_gaussians": "codecs",
     "load_ply": "files",
     "rasterization": "rasterize",
     "render": "integrator",
     "render_jvp": "integrator",
+    "save_gaussians": "codecs",
     "save_ply": "files",
 }
 _MODULES = frozenset(
@@ -63,12 +65,14 @@ __all__ = [
     "deform",
     "fisher",
     "gain",
+    "load_gaussians",
     "load_ply",
     "rasterization",
     "reference",
     "render",
     "render_jvp",
     "runtime",
+    "save_gaussians",
     "save_ply",
     "select",
 ]
@@ -87,6 +91,7 @@ if TYPE_CHECKING:
     from drgs import testing as testing
     from drgs import train as train
     from drgs.cameras import Camera
+    from drgs.codecs import load_gaussians, save_gaussians
     from drgs.deform import DeformationField, DynamicGaussians
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply

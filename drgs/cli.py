@@ -26,6 +26,7 @@ import drgs
 from drgs.commands.making_options import Demo, Scene, Sfm, Teach
 from drgs.commands.options import (
     Cite,
+    Convert,
     Crossval,
     Eval,
     Fisher,
@@ -37,6 +38,7 @@ from drgs.commands.options import (
     Select,
     Stress,
     Tradeoff,
+    View,
 )
 from drgs.display.progress import Bar
 from drgs.guards import interrupts
@@ -48,12 +50,14 @@ __all__ = ["main"]
 _OPTIONS = {
     "info": Info,
     "render": Render,
+    "view": View,
     "fit": Fit,
     "eval": Eval,
     "report": Report,
     "select": Select,
     "fisher": Fisher,
     "query": Query,
+    "convert": Convert,
     "crossval": Crossval,
     "tradeoff": Tradeoff,
     "stress": Stress,

@@ -12,7 +12,7 @@ import json
 import logging
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -22,6 +22,8 @@ from drgs.guards import outputs
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
+from drgs.guards.ply_headers import EXTRA, extra_kind, read_ply_header
+from drgs.guards.ply_lists import ply_source
 from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:
@@ -37,6 +39,7 @@ __all__ = [
     "load_state",
     "save_ply",
     "save_state",
+    "state_header",
     "write_json",
 ]
 
@@ -45,15 +48,9 @@ SCHEMA = 1
 
 _log = logging.getLogger(__name__)
 
-_SIZES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
-}
-_MAX_HEADER = 1 << 18  # bytes; some 9,000 columns
 _NORMALS = ("nx", "ny", "nz")
 _FEATURE = "semantic_"
+_SHOWN = 200  # characters of a reader's own message
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
@@ -62,7 +59,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     Args:
         path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24 or 45 of them, channel by channel),
             opacity (logit), scale_0..2 (log) and rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS
-            writes them. Normals and features may be missing. Any other column is left out with a warning in the log.
+            writes them. Normals and features may be missing. What `save_ply` added (uncertainty_*, label) is left out;
+            any other column, too, with a warning in the log.
     Returns:
         float32 `Gaussians` with the file's bits.
     Raises:
@@ -94,43 +92,61 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
             f"{_layout_hint(names)}"
         )
     known = {name for group in columns.values() for name in group} | {*rest, *features, *_NORMALS}
-    extra = [name for name in names if name not in known]
+    extra = [name for name in names if name not in known and not name.startswith(EXTRA)]
     if extra:
         shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
         _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
     try:
-        vertex = plyfile.PlyData.read(str(path))["vertex"].data
-    except (plyfile.PlyParseError, ValueError, OSError) as error:
-        text = " ".join(str(error).split())
+        vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
+        arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in columns.items()}
+        higher, described = _columns(vertex, rest), _columns(vertex, features)
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
+        text = " ".join(str(error).split())[:_SHOWN]
         raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
-
-    def read(group: tuple[str, ...]) -> torch.Tensor:
-        out = np.empty((len(vertex), len(group)), np.float32)
-        for i, name in enumerate(group):
-            out[:, i] = vertex[name]
-        return torch.from_numpy(out)
-
-    arrays: dict[str, Any] = {field: read(group) for field, group in columns.items()}
     sh = arrays.pop("dc")[:, None, :]
     if rest:
-        higher = read(rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)
-        sh = torch.cat([sh, higher], dim=1)
+        sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
     if features:
-        arrays["features"] = read(features)
+        arrays["features"] = described
     arrays["logit_opacities"] = arrays["logit_opacities"][:, 0]
     made = Gaussians(**arrays, sh=sh.contiguous())
     made.validate(str(path))
     return made
 
 
-def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
+def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> torch.Tensor:
+    """(N, columns) float32."""
+    import torch
+
+    out = np.empty((len(vertex), len(names)), np.float32)
+    for i, name in enumerate(names):
+        out[:, i] = vertex[name]
+    return torch.from_numpy(out)
+
+
+def save_ply(
+    g: Gaussians,
+    path: str | os.PathLike,
+    *,
+    extra: Mapping[str, np.ndarray] | None = None,
+    comments: tuple[str, ...] = (),
+) -> None:
     """Write Gaussians as INRIA's trainer does: binary little-endian float32, normals 0, the same order of columns.
 
     `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32. Features, where there
     are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.
 
+    Args:
+        g: The Gaussians.
+        path: The file.
+        extra: More columns, which viewers and `load_ply` leave out: (N,) floats named uncertainty_*, and whole numbers
+            named label*, which are written as uchar, or as ushort where one is above 255.
+        comments: Lines of the header.
     Raises:
-        ValueError: If a parameter is not finite (the first index is named).
+        ValueError: If a parameter or an extra number is not finite (the first index is named), or an extra column has
+            another name or length.
     """
     import plyfile
 
@@ -157,53 +173,25 @@ def save_ply(g: Gaussians, path: str | os.PathLike) -> None:
         **{f"rot_{i}": fields["quats"][:, i] for i in range(4)},
         **{f"{_FEATURE}{i}": x for i, x in enumerate(fields["features"].T if "features" in fields else ())},
     }
-    vertex = np.empty(len(g), [(name, "<f4") for name in columns])
-    for name, values in columns.items():
+    kinds = {name: extra_kind(name, x, len(g)) for name, x in (extra or {}).items()}
+    vertex = np.empty(len(g), [*((name, "<f4") for name in columns), *kinds.items()])
+    for name, values in {**columns, **(extra or {})}.items():
         vertex[name] = values
-    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")], byte_order="<")
+    lines = [" ".join(text.split()) for text in comments]
+    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")], byte_order="<", comments=lines)
     with atomic_write(path) as file:
         ply.write(file)
 
 
 def _check_ply(path: Path) -> list[str]:
     """Columns of the vertex element, once the file is known to be as long as its header claims."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a PLY file, found none; check the path")
-    refuse_foreign(path, "a 3DGS PLY file")
-    with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
-    end = head.find(b"end_header")
-    newline = head.find(b"\n", end)
-    if not head.startswith((b"ply\n", b"ply\r")) or end < 0 or newline < 0:
-        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; convert it to a 3DGS PLY")
-    elements: list[tuple[str, int, list[str], int]] = []
-    text_format = None
-    for line in head[:end].decode("ascii", "replace").splitlines():
-        match line.split():
-            case ["format", kind, _]:
-                text_format = kind
-            case ["element", name, count] if count.isdecimal():
-                elements.append((name, int(count), [], 0))
-            case ["property", kind, name] | ["property", "list", kind, _, name] if elements and kind in _SIZES:
-                element, rows, names, size = elements[-1]
-                elements[-1] = element, rows, [*names, name], size + _SIZES[kind]
-            case ["ply"] | ["comment", *_] | ["obj_info", *_] | []:
-                pass
-            case _:
-                raise ValueError(f"{path}: PLY header must be well-formed, got {line[:60]!r}; export it again")
-    # At least one digit and one separator a value where numbers are text.
-    claimed = sum(n * (2 * len(names) if text_format == "ascii" else size) for _, n, names, size in elements)
-    held = path.stat().st_size - newline - 1
-    if claimed > held + (text_format == "ascii"):
-        counts = ", ".join(f"{n} {name}" for name, n, _, _ in elements)
-        raise ValueError(
-            f"{path}: the header claims {counts} ({claimed} bytes), the file holds {held} bytes; "
-            "it is truncated or damaged, copy it again"
-        )
-    vertex = next((names for name, _, names, _ in elements if name == "vertex"), None)
+    if path.is_file():
+        refuse_foreign(path, "a 3DGS PLY file")
+    elements = read_ply_header(path)
+    vertex = next((element.columns for element in elements if element.name == "vertex"), None)
     if vertex is None:
         raise ValueError(f"{path}: a 3DGS PLY must have an element `vertex`, found none; export it again")
-    return vertex
+    return list(vertex)
 
 
 def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:
@@ -231,6 +219,8 @@ def _feature_columns(path: Path, names: list[str]) -> tuple[str, ...]:
 
 
 def _layout_hint(names: list[str]) -> str:
+    if {"red", "green", "blue", "opacity", "scale_0"} <= set(names):
+        return "its colors are RGB: export it with `ns-export gaussian-splat --ply-color-mode sh_coeffs`"
     if {"red", "green", "blue"} & set(names):
         return "this is a plain point cloud, fit Gaussians with `drgs fit`"
     return "export it as a 3DGS point_cloud.ply"
@@ -283,9 +273,21 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no checkpoint, damaged, or of another schema version.
     """
+    with _opened_state(Path(path)) as (file, header):
+        return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
+
+
+def state_header(path: str | os.PathLike) -> dict:
+    """The header of `save_state` alone, without its tensors; raises as `load_state`."""
+    with _opened_state(Path(path)) as (_, header):
+        return header
+
+
+@contextlib.contextmanager
+def _opened_state(path: Path) -> Iterator[tuple[Any, dict]]:
+    """A checkpoint that is open, and its header; what is wrong with either is one ValueError."""
     from safetensors import SafetensorError, safe_open
 
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a checkpoint, found none; check the path")
     refuse_foreign(path, "a checkpoint")
@@ -297,7 +299,7 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
                 raise ValueError(
                     f"{path}: checkpoint schema must be {SCHEMA}, got {schema!r}; fit into another run folder (-o)"
                 )
-            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
+            yield file, header
     except (SafetensorError, struct.error) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: must be a checkpoint, got {text}; copy it again") from None
@@ -373,10 +375,14 @@ class Run:
         append_line(self.path / "log.jsonl", line, default=_jsonable)
 
     def events(self) -> list[dict]:
-        """The events of `log.jsonl`; a partial last line is left out."""
+        """The events of `log.jsonl`; a partial last line is left out.
+
+        Raises:
+            ValueError: If a line is no JSON.
+        """
         path = self.path / "log.jsonl"
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
-        return [json.loads(line) for line in lines]
+        return [parse_json(line, f"{path}, line {number}") for number, line in enumerate(lines, 1)]
 
     def _drop_partial_line(self) -> None:
         path = self.path / "log.jsonl"

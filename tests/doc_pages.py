@@ -49,9 +49,13 @@ _COMMANDS_ELSEWHERE = {
     "demo": "takes half a minute: tests/test_demo.py",
     "scene": "path tracing takes ten seconds: tests/test_room.py, tests/test_kitchen.py",
     "teach": "needs a model: tests/test_teach.py",
+    "view": "ends by Ctrl-C alone: tests/test_view.py",
 }
 _ARGUMENTS_ELSEWHERE = {
     r"(.*/)?kitchen": "is of what moves: tests/test_dynamic_fit.py, and `make smoke`",
+    r"\$DRGS_DATA/.*": "is of real data: `benchmarks/real.py`, and the tests marked real_data",
+    r"runs/td/.*": "is of a run of the demo: tests/test_tradeoff.py",
+    r"scene\.sog": "is written by other programs: tests/test_codecs.py",
     r"examples\..*": "needs a rasterizer that is compiled: tests/test_examples.py",
 }
 
@@ -138,9 +142,9 @@ def figures(page: Path) -> list[tuple[str, str]]:
 def make_folder(folder: Path) -> Path:
     """Fill a folder with what pages speak of.
 
-    `scene`, nine posed pictures of a few Gaussians; `data/room`, the same with a teacher's maps; `point_cloud.ply` and
-    `scene.ply`, the Gaussians; `cameras.json`, poses alone; `phone.mp4`, seconds of video, and `photos`, an empty folder;
-    `my_package/rasterizer.py`, a rasterizer in plain torch.
+    `scene`, nine posed pictures of a few Gaussians; `data/room`, the same with a teacher's maps; `point_cloud.ply`
+    and `scene.ply`, the Gaussians; `cameras.json`, poses alone; `phone.mp4`, seconds of video, and `photos`, an empty
+    folder; `my_package/rasterizer.py`, a rasterizer in plain torch.
     """
     import cv2
     import numpy as np

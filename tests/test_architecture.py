@@ -24,6 +24,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"guards.doors", "splats"}, "what public functions take: cameras and Gaussians, or the tensors that make them"),
     ({"oracle", "volume", "reference"}, "the truth: below the engine, so that it cannot borrow from what it checks"),
     ({"files", "display"}, "what is written, for machines and people"),
+    ({"codecs"}, "Gaussians in the formats of others"),
     ({"tracing"}, "the engine"),
     ({"integrator", "plugin"}, "rendering with it, from torch and from Mitsuba"),
     ({"rasterize"}, "the same under gsplat's names"),
@@ -41,6 +42,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"train"}, "fits, for users"),
     ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
+    ({"viewing"}, "a scene in the browser, whatever command says which"),
     ({"crossval", "ladder", "testing"}, "the lab's doors, for users"),
     ({"commands"}, "one module a command: options in, files out"),
     ({"cli"}, "which command it is"),
@@ -54,6 +56,7 @@ FACADE = {"cli": "the program", "runtime": "`__version__`, which the package sta
 SHARED = {
     "run": "what the program calls of each command",
     "Scene": "the options of the command of that name, beside what is rendered",
+    "View": "the options of the command of that name, beside what a data set holds",
     "coverage": "a policy's name is that of the information it goes by",
     "render": "the truth takes the arguments of what it checks",
     "sh_basis": "the truth has its own, so that it cannot borrow from what it checks",

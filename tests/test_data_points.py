@@ -13,6 +13,7 @@ from drgs.data import Dataset, View, added_points, initial_points, load
 from drgs.data.guesses import points_beside
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
+from drgs.data.points import read_point_ply
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import load_frames
@@ -363,3 +364,25 @@ def test_guesses_are_as_far_away_as_what_is_beside_them(tmp_path, rng):
     assert np.mean(z[first:] < 4) == pytest.approx(near.mean(), abs=0.1)
     columns, rows = pixels.astype(int).T
     np.testing.assert_allclose(views[0].image()[rows[:first], columns[:first]], colors[:first], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ((b"0 255 0 0\n", b"0 -1 0 0\n"), "out of bounds|out of range"),
+        ((b"end_header", b"element face 4000000000\nend_header"), "4000000000 rows without a column"),
+        ((b"element vertex", b"element face 4000000000\nelement vertex"), "4000000000 rows without a column"),
+        ((b"format ascii", b"format " + b"x" * 9999), "must be a PLY point cloud with x, y, z, got .{9,250}$"),
+    ],
+)
+def test_damaged_point_clouds(tmp_path, change, told):
+    """Numbers that are none of their type, rows that take no byte, words of any length: one line of bearable length."""
+    columns = "".join(f"property {kind}\n" for kind in ("float x", "float y", "float z", "uchar red", "uchar green"))
+    head = f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}property uchar blue\nend_header\n"
+    path = tmp_path / "points.ply"
+    path.write_bytes(head.encode() + b"1 2 0 255 0 0\n")
+    assert read_point_ply(path)[1].tolist() == [[1, 0, 0]]
+    path.write_bytes(path.read_bytes().replace(*change))
+    with pytest.raises(ValueError, match=told) as error:
+        read_point_ply(path)
+    assert "\n" not in str(error.value)

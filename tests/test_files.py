@@ -201,6 +201,39 @@ def test_bad_files_are_refused_in_one_line(tmp_path, rng):
         load_ply(tmp_path / "none.ply")
 
 
+def test_lists_and_empty_rows_claim_nothing(tmp_path):
+    """A list says how long it is where no header does, rows without a column take no byte: neither is believed."""
+    from drgs.guards.ply_lists import ply_source
+
+    write(tmp_path / "a.ply", header(["x"]).replace("property float x", "property list uint float x"), b"\xff" * 8)
+    with pytest.raises(ValueError, match="a 3DGS PLY must have the vertex columns"):
+        load_ply(tmp_path / "a.ply")
+    # plyfile would ask a file for 16 GiB; of memory it gets what is there.
+    assert ply_source(tmp_path / "a.ply").read(1 << 34) == (tmp_path / "a.ply").read_bytes()
+    path = tmp_path / "whole.ply"
+    save_ply(gaussians(), path)
+    assert ply_source(path) == str(path)
+    for change in (b"element face 4000000000\n", b"element face 4000000000\nelement other 0\nproperty float x\n"):
+        (tmp_path / "b.ply").write_bytes(path.read_bytes().replace(b"end_header", change + b"end_header"))
+        with pytest.raises(ValueError, match="element 'face' of a PLY must have a property, has none"):
+            load_ply(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize("kind", [b"uchar", b"list uchar float"])
+def test_numbers_that_are_none_of_their_type(tmp_path, kind):
+    """Text that says -1 or a fraction where a byte is meant, and a list where a number is: one line."""
+    import plyfile
+
+    save_ply(gaussians(), tmp_path / "a.ply")
+    ply = plyfile.PlyData.read(str(tmp_path / "a.ply"), mmap=False)
+    plyfile.PlyData(ply.elements, text=True).write(str(tmp_path / "b.ply"))
+    data = (tmp_path / "b.ply").read_bytes().replace(b"property float x", b"property " + kind + b" x")
+    (tmp_path / "b.ply").write_bytes(data.replace(b"end_header\n", b"end_header\n-1 ", 1))
+    with pytest.raises(ValueError, match="b.ply: must be a readable PLY, got") as error:
+        load_ply(tmp_path / "b.ply")
+    assert "\n" not in str(error.value)
+
+
 def test_saving_refuses_what_is_not_finite_and_keeps_the_old_file(tmp_path):
     """A bad save leaves the file that was there."""
     g = gaussians()

@@ -34,7 +34,8 @@ def test_it_runs(monkeypatch, capsys):
     for number, cell in enumerate(CODE, 1):
         exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)
     capsys.readouterr()
-    assert shown and all(count == 1 for count in shown)
+    assert shown
+    assert all(count == 1 for count in shown)
     assert names["forward"] == pytest.approx(names["reverse"], rel=1e-4)
     assert names["central"][5] == pytest.approx(names["reverse"], rel=1e-4)
     left = {policy: names["left"]([0, 1, *chosen]) for policy, chosen in names["picks"].items()}

@@ -10,7 +10,7 @@ import typing
 import pytest
 
 from drgs import cli, fisher, gain, runtime, select
-from drgs.commands import options, orbits
+from drgs.commands import making_options, options, orbits
 from drgs.data import sfm
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.settings import PRESETS, RenderSettings
@@ -62,11 +62,11 @@ def test_choices_are_what_there_is():
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
     assert _choices(options.Render, "up") == ("auto", *orbits.UP)
     parameters = inspect.signature(sfm.run_sfm).parameters
-    assert _choices(options.Sfm, "camera_model") == sfm.CAMERA_MODELS
-    assert _choices(options.Sfm, "matcher") == sfm.MATCHING
-    assert options.Sfm.camera_model == parameters["camera_model"].default
-    assert options.Sfm.matcher == parameters["matching"].default
-    assert options.Sfm.seed == parameters["seed"].default
+    assert _choices(making_options.Sfm, "camera_model") == sfm.CAMERA_MODELS
+    assert _choices(making_options.Sfm, "matcher") == sfm.MATCHING
+    assert making_options.Sfm.camera_model == parameters["camera_model"].default
+    assert making_options.Sfm.matcher == parameters["matching"].default
+    assert making_options.Sfm.seed == parameters["seed"].default
 
 
 @pytest.mark.parametrize("name", cli._OPTIONS)

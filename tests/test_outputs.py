@@ -187,6 +187,16 @@ def test_record_stays_short(tmp_path, monkeypatch):
         assert len((tmp_path / outputs.JOURNAL).read_bytes().splitlines()) == 1
 
 
+def test_a_damaged_journal_is_read_as_far_as_it_goes(tmp_path):
+    """Lines that are no rows, deeper than Python reads, or of other types: the folder can be written all the same."""
+    rows = [b"[" * 100_000, b"5", b"[]", b'{"file": 5, "sha256": "a", "command": "fit"}']
+    rows += [b'{"file": "a", "sha256": ["a"], "command": "fit"}', b'{"file": "\\u0000", "sha256": "a", "command": "x"}']
+    (tmp_path / outputs.JOURNAL).write_bytes(b"\n".join(rows * 60) + b"\n")
+    with outputs.claim(tmp_path, "fit", ["x"]), replacing(tmp_path / "x") as name:
+        Path(name).write_text("whole")
+    assert (tmp_path / "x").read_text() == "whole"
+
+
 # ---- locks
 
 
@@ -196,6 +206,14 @@ def foreign_lock(folder: Path, **fields) -> None:
     pid = os.getppid()
     owner = {**locks._this_process(), "pid": pid, "started": locks._started(pid), "command": "fit", "since": "today"}
     (folder / locks.NAME).write_text(json.dumps({**owner, **fields}))
+
+
+def test_a_lock_that_is_nested_too_deeply_says_nothing(tmp_path):
+    """It is one that cannot be read, as an empty one: old, it is removed."""
+    (tmp_path / locks.NAME).write_bytes(b"[" * 60_000)
+    os.utime(tmp_path / locks.NAME, (0, 0))
+    with outputs.claim(tmp_path, "fit"):
+        pass
 
 
 def test_living_process_is_not_disturbed(tmp_path):

@@ -209,7 +209,7 @@ def test_lens(scene, gaussians, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("nowhere.ply", "nowhere.ply: must be a PLY file, found none"),
+        ("nowhere.ply", "nowhere.ply: must be a file of Gaussians, found none"),
         ("{dir}", "must be a run folder, found no config.json"),
         ("{scene} --set sigma=3", "--set: must be a render setting, got 'sigma=3'"),
         ("{scene} --format gif", "--format must be a list of png, exr, webm, ply, got 'gif'"),

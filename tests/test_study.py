@@ -524,7 +524,7 @@ def test_a_page_comes_from_its_rows(monkeypatch):
 
 
 def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
-    """Whatever has run: all nine policies on a unit before the next, each scene's first unit before any second one, the
+    """Whatever has run: all ten policies on a unit before the next, each scene's first unit before any second one, the
     paper's protocol on the first room alone; every cell's configs are legal and all differ.
     """
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
@@ -533,13 +533,13 @@ def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
     for scale in semantic.SCALES:
         study = semantic.study_of(scale, tmp_path)
         cells = study.cells(semantic.units_of(study, 3))
-        assert len(cells) == len({cell.name for cell in cells}) == 3 * 5 * 9
-        for start in range(0, len(cells), 9):
-            assert [cell.policy for cell in cells[start : start + 9]] == list(semantic.POLICIES)
-            assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 9]}) == 1
+        assert len(cells) == len({cell.name for cell in cells}) == 3 * 5 * 10
+        for start in range(0, len(cells), 10):
+            assert [cell.policy for cell in cells[start : start + 10]] == list(semantic.POLICIES)
+            assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 10]}) == 1
         assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
         assert {cell.scene for cell in cells if cell.protocol == "paper"} == {"room-1"}
-        assert len({repr(study.configs(cell)) for cell in cells[:9]}) == 9
+        assert len({repr(study.configs(cell)) for cell in cells[:10]}) == 10
         assert {policy for pair in study.comparisons for policy in pair} <= set(study.policies)
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
 

@@ -80,7 +80,9 @@ def test_a_run_without_its_log_is_one_for_every_option(place, tmp_path, command)
         assert [camera.name for camera in known.cameras] == ["1", "2", "4", "5", "7", "8"]
     (tmp_path / "run/config.json").write_text('{"schema": 1, "command": "scene"}')
     assert Source.of("--train", str(tmp_path / "run")).kind == "data"
-    with pytest.raises(FileNotFoundError, match=r"run: must be a run folder, found no config\.json of a fit; name a"):
+    with pytest.raises(
+        FileNotFoundError, match=r"run: must be a run folder, found no config\.json of a fit; run `drgs fit`"
+    ):
         Given.at(tmp_path / "run")
     (tmp_path / "run/config.json").write_text("{")
     (tmp_path / "run/state.safetensors").write_text("")

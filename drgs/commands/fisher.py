@@ -45,10 +45,10 @@ if TYPE_CHECKING:
     from drgs.information.backdrop import Sphere
     from drgs.settings import RenderSettings
 
-__all__ = ["KINDS", "Told", "added", "map_weights", "run"]
+__all__ = ["KINDS", "MAP_PRIOR", "Told", "added", "map_weights", "run"]
 
 KINDS = ("variance", "share")  # of maps
-_PRIOR = Prior(1.0)  # with which the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/active-static.md)
+MAP_PRIOR = Prior(1.0)  # with which the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/active-static.md)
 # Block -> groups that it says nothing about.
 _OTHERS = {
     "geometry": ("features", "backdrop", *NETWORK_GROUPS),
@@ -62,7 +62,7 @@ def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
     check_counts(args)
     args.settings()  # refuses what cannot be, before anything is read
-    prior = Prior.given(args.prior, args.relative_prior) or _PRIOR
+    prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = Given.of(args)
@@ -71,7 +71,8 @@ def run(args: Fisher) -> None:
     if text is None and given.run is None:
         if args.cameras in (None, "orbit", "dome"):
             raise ValueError(
-                "a PLY has no record of its views: --train or --cameras must name a data set, a run or a cameras.json"
+                "a file of Gaussians has no record of its views: --train or --cameras must name a data set, a run or a "
+                "cameras.json"
             )
         text = args.cameras
     known = known_views(text, args, given)

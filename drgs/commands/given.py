@@ -1,4 +1,4 @@
-"""What a command was given to look at: a PLY, or a run and what is known of how it was fitted."""
+"""What a command was given to look at: a file of Gaussians, or a run and what is known of how it was fitted."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.files import Run, load_ply
+from drgs.codecs import READ, load_gaussians
+from drgs.codecs.folders import file_of_folder
+from drgs.files import Run
 from drgs.fitting.records import FitRecord, is_run, load_run
-from drgs.guards.foreign import refuse_foreign
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -26,9 +27,9 @@ class Given:
     """Gaussians, and the run that they are of.
 
     Attributes:
-        gaussians: Of the PLY, or of the run's last checkpoint.
-        run: The run folder; None for a PLY.
-        record: How the run was fitted; None for a PLY.
+        gaussians: Of the file, or of the run's last checkpoint.
+        run: The run folder; None for a file.
+        record: How the run was fitted; None for a file.
         fields: Render settings that hold whatever the preset is: what --set says, over the background of the fit. A
             run was fitted over its background; over another one its edges show a halo.
         decoder, classes: Of a run that was fitted with semantics; else None.
@@ -48,7 +49,7 @@ class Given:
         """What the command line names, and says about settings.
 
         Raises:
-            FileNotFoundError: If there is no such PLY, or the run has no checkpoint yet.
+            FileNotFoundError: If there is no such file, or the run has no checkpoint yet.
             ValueError: If --set is wrong or a file damaged.
         """
         replaced, given = args.replaced(), cls.at(args.scene)
@@ -57,18 +58,19 @@ class Given:
 
     @classmethod
     def at(cls, path: Path) -> Given:
-        """What a PLY or a run folder holds.
+        """What a file of Gaussians, a folder of them (SOG, INRIA's), or a run folder holds.
 
         Raises:
-            FileNotFoundError: If there is no such PLY, a folder is no run's, or the run has no checkpoint yet.
-            ValueError: If a file is damaged, or of a format of somebody else's.
+            FileNotFoundError: If there is no such file, a folder is no run's, or the run has no checkpoint yet.
+            ValueError: If a file is damaged, or of a format that is not read.
         """
         if not path.is_dir():
-            return cls(load_ply(path))
-        refuse_foreign(path, "a run folder or a 3DGS PLY file")
+            return cls(load_gaussians(path))
         if not is_run(path):
+            if file_of_folder(path) is not None:
+                return cls(load_gaussians(path))
             raise FileNotFoundError(
-                f"{path}: must be a run folder, found no config.json of a fit; name a 3DGS PLY or run `drgs fit` first"
+                f"{path}: must be a run folder, found no config.json of a fit; run `drgs fit` first, or name {READ}"
             )
         run = Run(path)
         loaded = load_run(run)

@@ -15,14 +15,17 @@ from drgs.information.choices import Block, Combine, Criterion, Method, NetworkS
 from drgs.settings import Preset, RenderSettings
 
 __all__ = [
+    "BLOCKS_TEXT",
     "Around",
     "Choosing",
     "Common",
+    "Comparing",
     "Data",
     "Informed",
     "Moments",
     "Moving",
     "OutputPath",
+    "SceneFile",
     "Seen",
     "Settings",
     "Split",
@@ -32,10 +35,14 @@ __all__ = [
 ]
 
 OutputPath = Annotated[Path, arg(aliases=["-o"])]
+SceneFile = Annotated[
+    Positional[Path],
+    arg(help="A run folder, or Gaussians: .ply, .spz, .splat, .ksplat, .sog, .glb, a SOG or INRIA model folder."),
+]
 Split = Literal["all", "train", "test"]
 
 # One text, `geometry,semantic`; what is none of the names is refused where the blocks are used.
-_BLOCKS: Any = PrimitiveConstructorSpec(
+BLOCKS_TEXT: Any = PrimitiveConstructorSpec(
     nargs=1,
     metavar="BLOCK,BLOCK",
     instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
@@ -141,8 +148,7 @@ class Around:
 class Seen(Settings, Around, Views):
     """Options of commands that look at a scene from a few cameras."""
 
-    scene: Positional[Path]
-    """A 3DGS point_cloud.ply or a run folder."""
+    scene: SceneFile
     cameras: str | None = None
     """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
     split: Split = "all"
@@ -169,10 +175,25 @@ class Informed(Settings):
     """lambda is --prior times the median information of a parameter's group, where it is not 0."""
     info_pixels: int | None = ActiveConfig.info_pixels
     """Information is computed on views of at most this many pixels; default as in the fit."""
-    blocks: Annotated[tuple[Block, ...] | None, _BLOCKS] = ActiveConfig.blocks
+    blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ActiveConfig.blocks
     """What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop (gaps)."""
     probes: int = ActiveConfig.probes
     """Random probes of each view, for what it tells about a deformation field, and for --method probes."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparing(Informed, Around, Views):
+    """Options of commands that compare views with known ones."""
+
+    scene: SceneFile
+    train: str | None = None
+    """Views that are known: a data set, a run, or a cameras.json; default the run's."""
+    split: Split = "all"
+    """Which of the other views, where they are a data set's."""
+    count: int = 40
+    """Cameras of an orbit or a dome."""
+    time: float | None = None
+    """Of cameras that state none, in a run that moves: e.g. those of an orbit."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -16,11 +16,12 @@ from drgs.commands.option_groups import (
     Around,
     Choosing,
     Common,
+    Comparing,
     Data,
-    Informed,
     Moments,
     Moving,
     OutputPath,
+    SceneFile,
     Seen,
     Settings,
     Split,
@@ -28,6 +29,7 @@ from drgs.commands.option_groups import (
     Views,
 )
 from drgs.commands.overrides import check_color
+from drgs.commands.view_options import View
 from drgs.fitting.config import (
     ActiveConfig,
     Degree,
@@ -43,6 +45,7 @@ from drgs.settings import Preset, RenderSettings
 
 __all__ = [
     "Cite",
+    "Convert",
     "Crossval",
     "Eval",
     "Fisher",
@@ -54,6 +57,7 @@ __all__ = [
     "Select",
     "Stress",
     "Tradeoff",
+    "View",
 ]
 
 
@@ -67,10 +71,9 @@ class Info(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(Settings, Around, Views, Moments):
-    """Render a Gaussian PLY, or a finished run, to pictures or a video."""
+    """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
-    scene: Positional[Path]
-    """A 3DGS point_cloud.ply or a run folder."""
+    scene: SceneFile
     cameras: str | None = None
     """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default orbit, or with --view the run."""
     output: OutputPath = Path("out/render")
@@ -182,24 +185,8 @@ class Fit(Choosing, Data, Taught, Moving):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Views(Informed, Around, Views):
-    """Options of commands that compare views with known ones."""
-
-    scene: Positional[Path]
-    """A run folder or a 3DGS point_cloud.ply."""
-    train: str | None = None
-    """Views that are known: a data set, a run, or a cameras.json; default the run's."""
-    split: Split = "all"
-    """Which of the other views, where they are a data set's."""
-    count: int = 40
-    """Cameras of an orbit or a dome."""
-    time: float | None = None
-    """Of cameras that state none, in a run that moves: e.g. those of an orbit."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Select(Choosing, _Views):
-    """Rank cameras by what their views would add to a run, or to a Gaussian PLY."""
+class Select(Choosing, Comparing):
+    """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
     candidates: str
     """A data set or a run (those of its views that are not known), a cameras.json, orbit, or dome."""
@@ -212,7 +199,7 @@ class Select(Choosing, _Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fisher(_Views):
+class Fisher(Comparing):
     """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
 
     cameras: str | None = None
@@ -264,7 +251,7 @@ class Query(Settings, Around, Views):
     """Find what a text means: masks of views, and a PLY of the Gaussians that are it, or of all others."""
 
     scene: Positional[Path]
-    """A run that was fitted with semantics, or a PLY with features."""
+    """A run that was fitted with semantics, or a 3DGS PLY with features."""
     classes: Annotated[tuple[str, ...], arg(name="class", metavar="NAME"), UseAppendAction] = ()
     """A class of the run; may be repeated."""
     text_embedding: Path | None = None
@@ -291,6 +278,25 @@ class Query(Settings, Around, Views):
     """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     output: OutputPath = Path("out/query")
     """Folder for the masks, pictures, query.json, and selected.ply or (--remove) rest.ply."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Convert(Common):
+    """Write Gaussians in another format: .ply of 3DGS, .spz, or .glb (KHR_gaussian_splatting)."""
+
+    scene: SceneFile
+    out: Positional[Path]
+    """The file; its suffix says the format."""
+    as_stored: bool = False
+    """Of an .spz, keep its axes: some programs write those of PLY files and not those that the format states."""
+    time: float | None = None
+    """Of a run that moves: the Gaussians as they are then."""
+    uncertainty: Path | None = None
+    """information.safetensors of drgs fisher: what it leaves uncertain goes into the PLY, a column a group."""
+    prior: float = 1.0
+    """For --uncertainty: how firmly every number counts as known beforehand (lambda), as in the maps of drgs fisher."""
+    labels: bool = False
+    """Of a run that was fitted with classes: a column with the class of each Gaussian is added to the PLY."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

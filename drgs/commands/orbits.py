@@ -5,7 +5,7 @@ Three kinds of capture, told apart by their cameras alone:
 - The optical axes meet, or all cameras look the same way: frames go around the point looked at, on a full circle if
   the cameras surround it, else back and forth within the span that they cover.
 - Neither (a walk through rooms, a drive): frames follow the photographs' own path.
-- No cameras (a bare PLY): frames go around the middle of the Gaussians.
+- No cameras (a file of Gaussians): frames go around the middle of the Gaussians.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`drgs render`: pictures and videos of a Gaussian PLY or a finished run, from any cameras.
+"""`drgs render`: pictures and videos of a file of Gaussians or a finished run, from any cameras.
 
 Which cameras, which settings, which files; the drawing is `drgs.render`, the files are pictures.py.
 """

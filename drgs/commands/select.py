@@ -90,7 +90,15 @@ def run(args: Select) -> None:
             for rank, pick in enumerate(selection.picks, 1)
         ],
         "candidates": [
-            {"index": i, "name": camera.name, "time": camera.time, "score": score, "parts": parts, "unseen": unseen}
+            {
+                "index": i,
+                "name": camera.name,
+                "time": camera.time,
+                "score": score,
+                "parts": parts,
+                "unseen": unseen,
+                "camera": described(camera),
+            }
             for i, (camera, score, parts, unseen) in enumerate(rows)
         ],
         "left_out": selection.left_out,

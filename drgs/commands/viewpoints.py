@@ -1,7 +1,7 @@
 """Which views an option names: --cameras, --candidates and --train, the same for every command.
 
     orbit, dome     cameras made around what there is to see (orbits.py)
-    a cameras.json  its list
+    a cameras.json  its list; a model folder of INRIA's stands for the one in it
     a run           the views of its data set, split as for its fit; as known views, those that it was fitted to
     a data set      its views, split as for the fit of the run that is looked at, if it is one
 
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from drgs import data
+from drgs.codecs.folders import cameras_of_model
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_distance
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.files import Run
@@ -75,7 +76,8 @@ class Source:
         """
         if text in made:
             return cls(option, text, text)
-        path = Path(text)
+        path = cameras_of_model(Path(text)) or Path(text)
+        text = str(path)
         return cls(option, text, "list" if is_camera_list(path) else "run" if is_run(path) else "data")
 
     @functools.cached_property
@@ -251,10 +253,12 @@ def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
         given: Whose run is taken where `text` is None.
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If a PLY comes without `--train`, or a run's data set no longer has its views.
+        ValueError: If a file of Gaussians comes without `--train`, or a run's data set no longer has its views.
     """
     if text is None and given.run is None:
-        raise ValueError("a PLY has no record of its views: --train must name a data set, a run or a cameras.json")
+        raise ValueError(
+            "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json"
+        )
     source = Source("--train", str(given.run.path), "run") if text is None else Source.of("--train", text)
     pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.max_pixels)
     where = str(Path(source.text))

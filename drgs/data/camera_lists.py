@@ -13,8 +13,17 @@ from drgs.data.checks import inverse_pose
 from drgs.files import atomic_write
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["described", "is_camera_list", "load_cameras_json", "save_cameras_json"]
+__all__ = ["camera_described", "described", "is_camera_list", "load_cameras_json", "save_cameras_json"]
 
+_DESCRIBED = {
+    "name": str,
+    "width": int,
+    "height": int,
+    "K": [[float]],
+    "c2w": [[float]],
+    "model": str,
+    "distortion": [float],
+}
 _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position": [float], "rotation": [[float]]}
 
 
@@ -106,3 +115,26 @@ def described(camera: Camera) -> dict:
         "distortion": list(camera.distortion),
         **({} if camera.time is None else {"time": camera.time}),
     }
+
+
+def camera_described(where: str, value: object) -> Camera:
+    """The camera that `described` has made JSON of.
+
+    Args:
+        where: The file and the place in it, for messages.
+        value: As parsed.
+    Raises:
+        ValueError: If it is nothing of the kind, or no camera can be so.
+    """
+    advice = "write the file again"
+    check_json(where, value, _DESCRIBED, advice)
+    assert isinstance(value, dict)  # checked
+    shapes = [len(row) for row in value["K"]], [len(row) for row in value["c2w"]]
+    if shapes != ([3] * 3, [4] * 4):
+        raise ValueError(f"{where}: K must be 3x3 and c2w 4x4, got other sizes; {advice}")
+    fields = {name: value[name] for name in ("name", "width", "height", "model")}
+    w2c, lens = inverse_pose(where, np.array(value["c2w"])), tuple(value["distortion"])
+    try:
+        return Camera(K=np.array(value["K"]), w2c=w2c, distortion=lens, time=value.get("time"), **fields)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None

@@ -5,6 +5,7 @@ numbers within reason.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import re
@@ -12,7 +13,6 @@ import shutil
 import struct
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from drgs.guards.foreign import refuse_foreign
 __all__ = [
     "IMAGE_SUFFIXES",
     "image_size",
-    "inside",
+    "file_inside",
     "inverse_pose",
     "is_file",
     "list_images",
@@ -40,6 +40,7 @@ __all__ = [
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
+_SHOWN = 120  # characters of a reader's own message
 _MAX_PIXELS = 2**31
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
 _ROUNDING = 1e-2
@@ -58,7 +59,7 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
-def inside(folder: Path, name: str, where: str) -> Path:
+def file_inside(folder: Path, name: str, where: str) -> Path:
     """The file that a data set's own file names: data sets come from elsewhere, and may name nothing outside of theirs.
 
     Links that lie in the folder are followed: whoever put them there knows where they lead.
@@ -127,7 +128,7 @@ def read_npy(path: Path) -> np.ndarray:
             shape, _, dtype = read(file, max_header_size=_MAX_NPY_HEADER)
             start = file.tell()
     except Exception as error:  # NumPy's parser of headers raises whatever Python's tokenizer does
-        text = " ".join(str(error).split())
+        text = " ".join(str(error).split())[:_SHOWN]
         raise ValueError(f"{path}: must be a .npy file, got {text}; save it with numpy.save") from None
     if dtype.hasobject or dtype.kind not in "fiub":
         raise ValueError(f"{path}: must hold plain numbers, got dtype {dtype}; save a float array")
@@ -160,19 +161,29 @@ def read_npz(path: Path, name: str) -> np.ndarray:
     refuse_foreign(path, "an .npz file")
     with tempfile.TemporaryDirectory() as folder:
         unpacked = Path(folder) / f"{name}.npy"
-        try:
-            with zipfile.ZipFile(path) as archive:
-                size = archive.getinfo(unpacked.name).file_size
-                memory.require(f"{path}", size, f"{size} bytes of {name}", "make it smaller")
-                with archive.open(unpacked.name) as member, unpacked.open("wb") as file:
-                    shutil.copyfileobj(member, file)
-        except (zipfile.BadZipFile, KeyError, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
-            text = " ".join(str(error).split())
-            raise ValueError(f"{path}: must hold an array {name!r}, got {text}; save it with numpy.savez") from None
+        with _reading_archive(path, name), zipfile.ZipFile(path) as archive:
+            size = archive.getinfo(unpacked.name).file_size
+        memory.require(f"{path}", size, f"{size} bytes of {name}", "make it smaller")
+        with _reading_archive(path, name), zipfile.ZipFile(path) as archive, unpacked.open("wb") as file:
+            shutil.copyfileobj(archive.open(unpacked.name), file)
         try:
             return read_npy(unpacked)
         except ValueError as error:
             raise ValueError(str(error).replace(str(unpacked), f"{path}: {name}")) from None
+
+
+@contextlib.contextmanager
+def _reading_archive(path: Path, name: str) -> Iterator[None]:
+    """Make one ValueError of whatever zipfile and the decoders of its parts raise of a damaged archive."""
+    try:
+        yield
+    except Exception as error:
+        # Decoders raise OSError without a number, and a place before the beginning of a file is invalid; any other is
+        # of the disk.
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in (None, errno.EINVAL)):
+            raise
+        text = " ".join(str(error).split())[:_SHOWN]
+        raise ValueError(f"{path}: must hold an array {name!r}, got {text}; save it with numpy.savez") from None
 
 
 def image_size(path: Path) -> tuple[int, int]:

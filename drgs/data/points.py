@@ -21,6 +21,7 @@ from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
 from drgs.display.progress import Bar
 from drgs.guards.foreign import refuse_foreign
+from drgs.guards.ply_lists import ply_source
 
 __all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_points"]
 
@@ -30,6 +31,7 @@ _MAX_RANDOM = 20_000
 _NEIGHBORS = 10
 _FEATURE_SIZE = 1600
 _MAX_PLY_HEADER = 65536
+_SHOWN = 200  # characters of a reader's own message
 _PLY_BYTES = {
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
@@ -180,7 +182,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     refuse_foreign(path, "a PLY point cloud")
     try:
         _check_ply_size(path)
-        vertex = plyfile.PlyData.read(str(path))["vertex"]
+        vertex = plyfile.PlyData.read(ply_source(path))["vertex"]
         points = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
         names = vertex.data.dtype.names
         colors = np.full(points.shape, 0.5, dtype=np.float32)
@@ -188,8 +190,10 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             raw = np.stack([vertex[channel] for channel in ("red", "green", "blue")], axis=-1)
             whole = raw.dtype.kind in "iu"
             colors = raw.astype(np.float32) / np.float32(np.iinfo(raw.dtype).max if whole else 1)
-    except (plyfile.PlyParseError, ValueError, KeyError, UnicodeDecodeError, EOFError) as error:
-        text = " ".join(str(error).split())
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
+        text = " ".join(str(error).split())[:_SHOWN]
         raise ValueError(f"{path}: must be a PLY point cloud with x, y, z, got {text}; export it again") from None
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
@@ -206,16 +210,21 @@ def _check_ply_size(path: Path) -> None:
     end = head.find(b"end_header")
     if not head.startswith(b"ply") or end < 0:
         raise ValueError("no PLY header")
-    least, count, text = 0, 0, False
+    least, count, columns, text = 0, 0, 1, False
     for words in (line.split() for line in head[:end].decode("ascii").splitlines()):
         if words[:1] == ["format"]:
             text = words[1:2] == ["ascii"]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
-            count = int(words[2])
+            if count and not columns:
+                raise ValueError(f"{count} rows without a column")
+            count, columns = int(words[2]), 0
         elif words[:1] == ["property"] and len(words) >= 3:
             # A list takes at least its length; a number in text at least a digit and a blank.
+            columns += 1
             kind = words[2] if words[1] == "list" else words[1]
             least += count * (2 if text else _PLY_BYTES.get(kind, 1))
+    if count and not columns:
+        raise ValueError(f"{count} rows without a column")
     held = path.stat().st_size - end - len(b"end_header\n")
     if least > held + text:  # text may lack the last line break
         raise ValueError(f"a header that claims at least {least} bytes of data where the file holds {held}")

@@ -122,7 +122,7 @@ class Semantics:
         if unknown := [name for name in names if name not in known]:
             raise ValueError(
                 f"{self.moving_file}: must name classes of {self.class_file or self.labels or self.teacher}, got "
-                f"{unknown[0]!r}; correct it"
+                f"{unknown[0][:80]!r}; correct it"
             )
         return tuple(names)
 

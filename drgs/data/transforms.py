@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, inside, inverse_pose, is_file, repaired_pose
+from drgs.data.checks import IMAGE_SUFFIXES, file_inside, image_size, inverse_pose, is_file, repaired_pose
 from drgs.data.points import read_point_ply
 from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
@@ -100,7 +100,7 @@ def load_transforms(
                 "write fl_x, w, h a frame"
             )
         if points and xyz is None and isinstance(data.get("ply_file_path"), str):
-            ply = inside(file.parent, data["ply_file_path"], f"{file}: ply_file_path")
+            ply = file_inside(file.parent, data["ply_file_path"], f"{file}: ply_file_path")
             xyz, colors = read_point_ply(ply)
             source = f"{ply.name}, {len(xyz)} points"
     dataset.points, dataset.colors, dataset.point_source = xyz, colors, source
@@ -133,7 +133,7 @@ def _listed(read: dict[Path, dict], dataset: Dataset) -> dict[Path, list[View | 
         rows[file] = []
         for index, (frame, split) in enumerate(zip(data["frames"], _splits(file, data), strict=True)):
             name = frame["file_path"]
-            path = inside(file.parent, name, f"{file}: frame {index}: file_path")
+            path = file_inside(file.parent, name, f"{file}: frame {index}: file_path")
             image = _image_file(path)
             view = View(None, _view_name(name), image_path=image or path, split=split)
             listed.append(view)
@@ -245,7 +245,7 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
     kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(kind, str) or kind not in _LENSES:
         raise ValueError(
-            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {kind!r}; undistort the images"
+            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {str(kind)[:40]!r}; undistort the images"
         )
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model, distortion = _LENSES[kind], ()
@@ -290,8 +290,7 @@ def _focal(where: str, values: dict, key: str, size: float) -> float:
 
 def _number(where: str, values: dict, key: str, default: float | None = None) -> float:
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{where}: {key} must be a finite number, got {value!r}; correct it")
+    check_json(where, {key: value}, {key: float}, "correct it")
     return value
 
 
@@ -310,7 +309,7 @@ def _optional_file(folder: Path, where: str, frame: dict, key: str) -> Path | No
     if frame.get(key) is None:
         return None
     check_json(where, frame, {key: str}, "correct it, or remove the key")
-    path = inside(folder, frame[key], f"{where}: {key}")
+    path = file_inside(folder, frame[key], f"{where}: {key}")
     if not is_file(path):
         raise FileNotFoundError(f"{where}: {key} names {path}, found no such file; restore it or remove the key")
     return path

@@ -8,6 +8,7 @@ transfer function. Every file appears under its name only once it is complete.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,8 +23,11 @@ from drgs.guards import outputs
 __all__ = [
     "Video",
     "caption",
+    "depth_colors",
     "depth_picture",
     "file_names",
+    "inferno",
+    "map_colors",
     "map_picture",
     "png_bytes",
     "to_bytes",
@@ -105,27 +109,19 @@ def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
     The scale goes from the 1st to the 99th percentile of the depths shown, in scene units.
     """
-    import cv2
+    picture, (low, high) = depth_colors(depth, alpha)
+    return _with_bar(picture, ((1.0, low), (0.5, (low + high) / 2), (0.0, high)), ".4g")
 
+
+def depth_colors(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
+    """(H, W, 3) uint8 of `depth_picture` without its bar, and the nearest and the farthest depth of its scale."""
     known = (alpha >= _OPAQUE) & np.isfinite(depth)
     low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     # Of one depth, too, the scale has a length to divide by: a millionth of it, which no label shows.
     high = max(high, low + 1e-12 + 1e-6 * abs(low))
-
-    def colors(values: np.ndarray) -> np.ndarray:
-        near = to_bytes((high - values) / (high - low))
-        return cv2.applyColorMap(near, cv2.COLORMAP_INFERNO)[..., ::-1]
-
-    picture = colors(np.where(known, depth, high))
+    picture = inferno((high - np.where(known, depth, high)) / (high - low))
     picture[~known] = round(255 * _UNKNOWN)
-    height = len(depth)
-    bar = np.zeros((height, 76, 3), np.uint8)
-    bar[:, 4:16] = colors(np.linspace(low, high, height)[:, None].repeat(12, 1))
-    font, inset = cv2.FONT_HERSHEY_SIMPLEX, min(12, max(height - 2, 0))
-    for row, value in ((inset, low), (height // 2 + 4, (low + high) / 2), (height - 4, high)):
-        if value in (low, high) or height >= 48:
-            cv2.putText(bar, f"{value:.4g}", (20, row), font, 0.4, _INK, 1, cv2.LINE_AA)
-    return np.concatenate([picture, bar], axis=1)
+    return picture, (float(low), float(high))
 
 
 def map_picture(values: np.ndarray) -> np.ndarray:
@@ -136,26 +132,45 @@ def map_picture(values: np.ndarray) -> np.ndarray:
     Args:
         values: (H, W), finite, >= 0.
     """
-    import cv2
+    picture, (low, top) = map_colors(values)
+    return _with_bar(picture, ((1.0, top), (0.5, math.sqrt(low * top)), (0.0, low)), ".2g")
 
+
+def map_colors(values: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
+    """(H, W, 3) uint8 of `map_picture` without its bar, and the least and the largest value of its scale."""
     known = values > 0
     top = np.log10(values[known].max()) if known.any() else 0.0
     low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
     low = min(max(low, top - _DECADES), top - 1e-3)  # of one value, too, the scale has a length to divide by
-
-    def colors(exponents: np.ndarray) -> np.ndarray:
-        return cv2.applyColorMap(to_bytes((exponents - low) / (top - low)), cv2.COLORMAP_INFERNO)[..., ::-1]
-
-    picture = colors(np.log10(np.where(known, values, 10.0**low)))
+    picture = inferno((np.log10(np.where(known, values, 10.0**low)) - low) / (top - low))
     picture[~known] = _NOTHING
-    height = len(values)
+    return picture, (float(10.0**low), float(10.0**top))
+
+
+def inferno(shares: np.ndarray) -> np.ndarray:
+    """(..., 3) uint8 colors of shares in [0, 1], dark to bright; what is beyond is clamped."""
+    import cv2
+
+    return np.ascontiguousarray(cv2.applyColorMap(to_bytes(shares), cv2.COLORMAP_INFERNO)[..., ::-1])
+
+
+def _with_bar(picture: np.ndarray, labels: tuple[tuple[float, float], ...], digits: str) -> np.ndarray:
+    """The picture with a color bar at its right, bright above.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        labels: Of the upper end, of the middle and of the lower end: share of the scale, and the value there.
+        digits: How values are printed.
+    """
+    import cv2
+
+    height = len(picture)
     bar = np.zeros((height, 76, 3), np.uint8)
-    bar[:, 4:16] = colors(np.linspace(top, low, height)[:, None].repeat(12, 1))
-    inset = min(12, max(height - 2, 0))
-    for row, exponent in ((inset, top), (height // 2 + 4, (low + top) / 2), (height - 4, low)):
-        if exponent in (low, top) or height >= 48:
-            text = f"{10.0**exponent:.2g}"
-            cv2.putText(bar, text, (20, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
+    bar[:, 4:16] = inferno(np.linspace(1.0, 0.0, height)[:, None].repeat(12, 1))
+    font, inset = cv2.FONT_HERSHEY_SIMPLEX, min(12, max(height - 2, 0))
+    for row, (share, value) in zip((inset, height // 2 + 4, height - 4), labels, strict=True):
+        if share in (0.0, 1.0) or height >= 48:
+            cv2.putText(bar, f"{value:{digits}}", (20, row), font, 0.4, _INK, 1, cv2.LINE_AA)
     return np.concatenate([picture, bar], axis=1)
 
 

@@ -6,12 +6,14 @@ Bars nest; the innermost one is shown. A thread writes the lines, so that work w
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["Bar"]
+__all__ = ["Bar", "quietly"]
 
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
@@ -93,6 +95,20 @@ class Bar:
             left = each * (self.total - self.done) - (now - self._reached)
             parts += [f"about {left:.0f} s left"] if left >= 1 else []
         return f"{self.label}: {', '.join(parts)}"
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """For a program that waits for others: no bar says how long that takes, neither those there are nor new ones."""
+    shown = [bar for bar in _bars if bar.is_shown]
+    with Bar("", show=False):
+        for bar in shown:
+            bar.is_shown = False
+        try:
+            yield
+        finally:
+            for bar in shown:
+                bar.is_shown = True
 
 
 def _open(bar: Bar) -> None:

@@ -99,8 +99,9 @@ def active_record(run: Run) -> ActiveConfig | None:
     if not (recorded := run.config().get("active")):
         return None
     try:
-        known = ActiveConfig.recorded(recorded)
-        return ActiveConfig(**{name: tuple(x) if isinstance(x, list) else x for name, x in known.items()})
+        known: dict[str, Any] = ActiveConfig.recorded(recorded)
+        lists = {name: tuple(x) for name, x in known.items() if isinstance(x, list)}
+        return ActiveConfig(**(known | lists))
     except (TypeError, ValueError, ArgumentError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.path / 'config.json'}: active: {text}; restore the file") from None

@@ -39,11 +39,16 @@ def refuse_foreign(path: Path, wanted: str) -> None:
         raise ValueError(f"{path}: must be {wanted}, is {found[0]}; {found[1]}")
 
 
-def _conversion(path: Path) -> str:
+def _conversion(path: Path, suffix: str) -> str:
+    """What makes a PLY of Gaussians in a format of somebody else; of most, we do."""
     name = "scene" if path.name == "meta.json" else path.stem.removesuffix(".compressed")
     target = path.with_name(f"{name}.ply")
     if target == path:
         target = path.with_name(f"{name}_3dgs.ply")
+    if suffix != ".lcc":
+        if path.name == "meta.json":
+            path = path.parent
+        return f"convert it with `drgs convert {path} {target}`, or read it with drgs.load_gaussians"
     return (
         f"convert it with `npx @playcanvas/splat-transform {path} {target}`, "
         "or open it in SuperSplat (superspl.at/editor) and export a PLY that is not compressed"
@@ -73,7 +78,7 @@ def _splats(head: bytes, path: Path) -> tuple[str, str] | None:
         kind = _SPLATS[suffix]
     elif head.startswith(b"ply") and b" packed_position" in head:
         kind = "a PLY in PlayCanvas' compressed layout"
-    return (kind, _conversion(path)) if kind else None
+    return (kind, _conversion(path, suffix)) if kind else None
 
 
 def _other(head: bytes, path: Path) -> tuple[str, str] | None:
@@ -81,7 +86,7 @@ def _other(head: bytes, path: Path) -> tuple[str, str] | None:
     start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:16].lower()
     brand = head[8:12] if head[4:8] == b"ftyp" else b""
     if head.startswith(b"glTF") or path.suffix.lower() == ".gltf":
-        return "a glTF file", "export a 3DGS PLY from the program that wrote it"
+        return "a glTF file", "pack it into one .glb, uncompressed, and read that with drgs.load_gaussians"
     if start.startswith((b"<!doctype", b"<html")):
         return "a web page", "download the file itself (on GitHub: the link named Raw)"
     if brand in (b"heic", b"heix", b"mif1", b"msf1", b"avif"):
@@ -112,7 +117,7 @@ def _is_sog(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.rpartition("/")[2] == "meta.json" for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError):
+    except Exception:  # zipfile raises whatever the damage leads to
         return False
 
 

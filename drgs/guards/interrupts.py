@@ -22,6 +22,7 @@ __all__ = [
     "handled",
     "in_native_code",
     "interruption",
+    "leave",
     "reinstall",
 ]
 
@@ -184,6 +185,14 @@ def in_native_code() -> Iterator[None]:
 def interruption(text: str = "") -> KeyboardInterrupt:
     """The exception for the signal that came, with a text for people."""
     return _active.error(text) if _active is not None and _active.first is not None else KeyboardInterrupt(text)
+
+
+def leave() -> None:
+    """End the process at once, with the command's line, if a signal came: another thread is in native code, which
+    nothing ends, and which must not go on while the libraries that it is in are taken down.
+    """
+    if _active is not None and _active.leave is not None and _active.signum is not None:
+        _active.leave(_active.signum)
 
 
 def exit_code(error: KeyboardInterrupt) -> int:

@@ -10,6 +10,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from drgs.guards.json_files import parse_json
+
 __all__ = ["NAME", "InUse", "acquire", "release"]
 
 NAME = ".drgs.lock"
@@ -79,7 +81,7 @@ def _refuse_if_running(folder: Path, path: Path, owner: dict) -> None:
 def _owner(path: Path) -> dict | None:
     """What a lock says; None: there is none, {}: it cannot be read."""
     try:
-        value = json.loads(path.read_bytes()[:_MAX_BYTES])
+        value = parse_json(path.read_bytes()[:_MAX_BYTES], str(path))
     except FileNotFoundError:
         return None
     except ValueError:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from drgs.guards import locks, unfinished
 from drgs.guards.authors import author_of, fingerprint, is_log, is_there
+from drgs.guards.json_files import parse_json
 from drgs.guards.writing import append_line, named
 
 __all__ = [
@@ -201,9 +202,12 @@ class Claim:
         rows = []
         for line in path.read_bytes().splitlines():
             with contextlib.suppress(ValueError, TypeError, KeyError):  # a killed process leaves half a line
-                row = json.loads(line)
+                row = parse_json(line, str(path))
+                file, digest, command = (row[key] for key in ("file", "sha256", "command"))
+                if not all(isinstance(x, str) and "\0" not in x for x in (file, digest, command)):
+                    continue  # edited: no row of ours
                 rows.append(row)
-                self._made.setdefault(row["file"], {})[row["sha256"]] = row["command"]
+                self._made.setdefault(file, {})[digest] = command
         if len(rows) > 2 * len(self._made) + 100:
             kept = [row for row in rows if is_there(self.path / row["file"], row["sha256"])]
             with replacing(path, claimed=False) as name:

@@ -87,7 +87,7 @@ def score_bars(picks: Sequence[Mapping[str, Any]]) -> str | None:
         scale = max(abs(pick["score"]), 1e-300)
         axis.plot(values / scale, np.full(len(values), row), "|", color=_GRAY, ms=9)
         axis.plot(pick["score"] / scale, row, "o", color=_RED, ms=4)
-    axis.set(xlabel="score of each candidate / of the picked one (red)", ylim=(len(shown) - 0.5, -0.5))
+    axis.set(xlabel="scores / the picked one's (red)", ylim=(len(shown) - 0.5, -0.5))
     panels[0].set_yticks(rows, [f"{pick['number']}  {_plain(pick['name'])}" for pick in shown])
     return _svg(figure, "scores")
 
@@ -137,13 +137,17 @@ def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Ca
     for name, group in groups.items():
         _stand(axis, group, axes, reach, styles[name], f"{name} ({len(group)})")
     _stand(axis, [x for x, _ in picked], axes, reach, ("o", _RED, 1.0), f"picked, in order ({len(picked)})")
+    texts: dict[tuple[float, float], list[str]] = {}  # a camera may be picked at several times
     for camera, text in picked:
-        x, y = axes @ camera.center
-        axis.annotate(_plain(text), (x, y), xytext=(4, 4), textcoords="offset points", color=_RED, fontsize=8)
+        x, y = np.round(axes @ camera.center / reach, 6) * reach
+        texts.setdefault((float(x), float(y)), []).append(text)
+    for place, found in texts.items():
+        text = _plain(", ".join(found))
+        axis.annotate(text, place, xytext=(4, 4), textcoords="offset points", color=_RED, fontsize=8)
     axis.set_aspect("equal", "datalim")
     axis.set(xlabel="from above; ticks are lengths of the data set")
     axis.margins(0.12)
-    axis.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.1), ncols=4)
+    axis.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.16), ncols=2)
     return _svg(figure, "cameras")
 
 

@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from drgs.report.account import Account
     from drgs.settings import RenderSettings
 
-__all__ = ["Picture", "drawn", "maps", "previews", "spread", "stills", "view_pictures"]
+__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "view_pictures"]
 
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels; more than a page is wide
 _PREVIEWS = 12
+_MAP_WIDTH = 480  # pixels, about
 _LARGEST = 1 << 28  # bytes of a PNG in a run folder that is opened
 _PRIOR = Prior(1.0)  # as for the maps of `drgs fisher`
 _KNOWN = 24  # views whose information is added up; of more, these stand for all
@@ -52,7 +53,7 @@ class Picture:
     height: int
 
 
-def drawn(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
+def jpeg(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
     """An (H, W, 3) picture, uint8 or in [0, 1], at most so many pixels wide; small ones keep sharp pixels."""
     import cv2
 
@@ -79,7 +80,7 @@ def previews(account: Account) -> list[Picture]:
         if (number := re.fullmatch(r"preview_(\d+)", path.stem)) and int(number[1]) <= account.step:
             found.append((int(number[1]), path))
     shown = [(step, _read(path)) for step, path in spread(sorted(found), _PREVIEWS)]
-    return [drawn(image, f"step {step:,}", 800) for step, image in shown if image is not None]
+    return [jpeg(image, f"step {step:,}", 800) for step, image in shown if image is not None]
 
 
 def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str, Picture]:
@@ -91,7 +92,7 @@ def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str
     for name in names:
         image = _read(account.run.renders / account.metrics["split"] / f"{files[name]}.{kind}")
         if image is not None:
-            found[name] = drawn(image, name)
+            found[name] = jpeg(image, name)
     return found
 
 
@@ -132,13 +133,19 @@ def maps(
             variance = fisher.variance_map(plain, camera, weights, settings, sphere=sphere).numpy()
             with torch.no_grad():  # a picture
                 alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
-            open_ = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
+            bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
             result[name] = (
-                drawn(pictures.map_picture(variance), "predictive variance"),
-                drawn(open_, "not covered: 1 - alpha"),
+                jpeg(pictures.map_picture(_enlarged(variance)), "predictive variance"),
+                jpeg(_enlarged(bare), "not covered: 1 - alpha"),
             )
             bar.advance()
     return result
+
+
+def _enlarged(values: np.ndarray) -> np.ndarray:
+    """Each pixel as a square, so that a small map is not dwarfed by its color bar."""
+    times = max(1, round(_MAP_WIDTH / values.shape[1]))
+    return values.repeat(times, 0).repeat(times, 1)
 
 
 def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: RenderSettings) -> list[Picture]:
@@ -149,6 +156,6 @@ def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: Rende
             now = dataclasses.replace(camera, time=time)
             with torch.no_grad():  # a picture
                 image = render(colors_only(scene, time), now, settings, outputs=()).rgb.cpu().numpy()
-            found.append(drawn(image, f"time {time:.3g}", 640))
+            found.append(jpeg(image, f"time {time:.3g}", 640))
             bar.advance()
     return found

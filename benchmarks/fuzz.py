@@ -1,0 +1,233 @@
+"""Readers under damaged files: whether any of them crashes, hangs, takes memory that a header claims, or fails with
+anything but one line.
+
+    python benchmarks/fuzz.py [--seconds 60] [--inputs 1000000] [--readers NAME ...] [--again NUMBER] [--atheris]
+
+Each reader gets valid files of a few pixels that are made here, damaged in one place or a few: bits, numbers, lines,
+pieces of other files, JSON of another shape, headers that lie (benchmarks/fuzz_mutators.py, fuzz_formats.py). It reads
+them in a process of its own, one after the other. An input is known by its number, so that every one can be repeated
+(`--again`, with one reader), and counts go on where they ended. What is found is kept in runs/fuzz/findings. Counts go
+to benchmarks/fuzz.json, the table to docs/reliability.md.
+
+With `--atheris`, inputs are chosen by what they reach in the Python code of a reader (pip install atheris); these are
+counted apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from fuzz_targets import TARGETS, Bench  # noqa: E402
+from fuzz_worker import GREEDY, SLOW  # noqa: E402
+from where import ran  # noqa: E402
+
+from drgs.lab.study_report import fill_between  # noqa: E402
+
+COUNTS, PAGE = ROOT / "benchmarks" / "fuzz.json", ROOT / "docs" / "reliability.md"
+FINDINGS = ROOT / "runs" / "fuzz" / "findings"
+_MEMORY = Path("/dev/shm")  # noqa: S108 (millions of files are not for disks)
+_KEPT = 3  # inputs of one cause
+_STUCK = 60.0  # seconds by the clock without an answer, where no processor time is taken
+_START = 300.0  # seconds until a process has made its files
+
+
+class Reader:
+    """One reader's inputs and what they came to, over all processes that it took.
+
+    Args:
+        name: Of `TARGETS`.
+        row: What earlier runs counted; is added to.
+    """
+
+    def __init__(self, name: str, row: dict[str, Any]) -> None:
+        self.name, self.row = name, row
+        for key in ("inputs", "findings", "crashes", "hangs"):
+            row.setdefault(key, 0)
+        row.setdefault("ends", {})
+        row.setdefault("slowest", 0.0)
+        row.setdefault("grown", 0)
+        self.causes: Counter[str] = Counter()
+
+    def go_on(self, inputs: int, seconds: float) -> None:
+        """Read more inputs, until there are so many in all or so much time has passed."""
+        until = time.monotonic() + seconds
+        while self.row["inputs"] < inputs and time.monotonic() < until:
+            with tempfile.TemporaryDirectory(prefix="drgs-fuzz-", dir=_MEMORY if _MEMORY.is_dir() else None) as name:
+                self._process(Path(name), inputs, until)
+
+    def _process(self, scratch: Path, inputs: int, until: float) -> None:
+        """One process, until it is done, time is up, or it is dead or has to be ended."""
+        begin = self.row["inputs"]
+        line = [sys.executable, str(ROOT / "benchmarks" / "fuzz_worker.py"), self.name, str(begin), str(inputs)]
+        with (scratch / "said").open("w") as said:
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": said}
+            process = subprocess.Popen([*line, str(scratch)], **pipes)
+        ended, number, since, spent, ready = "", begin - 1, time.monotonic(), 0.0, False
+        try:
+            while True:
+                if select.select([process.stdout], [], [], 0.25)[0]:
+                    text = process.stdout.readline()
+                    if not text:
+                        break
+                    ready = True
+                    self._hear(json.loads(text), scratch)
+                    if b'"finding"' in text:
+                        process.stdin.write(b"\n")
+                        process.stdin.flush()
+                if process.poll() is not None:
+                    continue  # until what it said is read
+                if not ready:
+                    if time.monotonic() - since > _START:
+                        raise SystemExit(f"{self.name}: no process starts; {(scratch / 'said').read_text()[-2000:]}")
+                    continue
+                if time.monotonic() > until:
+                    ended = "time"
+                    break
+                if (now := _number(scratch)) != number:
+                    number, since, spent = now, time.monotonic(), _processor(process.pid)
+                elif _processor(process.pid) - spent > SLOW or time.monotonic() - since > _STUCK:
+                    ended = "hang"
+                    break
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+            process.stdin.close()
+        if not ready:
+            raise SystemExit(f"{self.name}: the valid files are not read; {(scratch / 'said').read_text()[-2000:]}")
+        at = _number(scratch)
+        if ended == "time":
+            self.row["inputs"] = max(self.row["inputs"], at)
+        elif ended == "hang" or process.returncode != 0 or self.row["inputs"] < min(at + 1, inputs):
+            crashed = ended != "hang"
+            what = f"crash ({process.returncode})" if crashed else f"hang (> {SLOW:g} s)"
+            self.row["crashes" if crashed else "hangs"] += 1
+            self.row["inputs"] = at + 1
+            self._keep(at, what, (scratch / "crash.txt").read_text() + (scratch / "said").read_text()[-2000:])
+
+    def _hear(self, news: dict[str, Any], scratch: Path) -> None:
+        row = self.row
+        if "done" in news:
+            row["inputs"] = news["done"]
+            for name, count in news["counts"].items():
+                row["ends"][name] = row["ends"].get(name, 0) + count
+            row["slowest"] = round(max(row["slowest"], news["slowest"]), 3)
+            row["grown"] = max(row["grown"], news["grown"])
+        elif "finding" in news:
+            row["findings"] += 1
+            news["data"] = (scratch / "finding").read_bytes()
+            told = f"{news['fault']} {news.get('place')}: {news.get('text', '')}"
+            self._keep(news["finding"], told, news["trace"], news, f"{news['fault']} {news.get('place')}")
+
+    def _keep(self, number: int, what: str, trace: str, news: dict | None = None, cause: str = "") -> None:
+        """Put what was found where it can be looked at; of one cause a few."""
+        self.causes[cause or what] += 1
+        if self.causes[cause or what] > _KEPT:
+            return
+        folder = FINDINGS / re.sub(r"\W+", "-", self.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{number}.txt").write_text(f"{self.name}, input {number}: {what}\n\n{trace}\n", errors="replace")
+        if news is not None:
+            (folder / f"{number}{Path(news['file']).suffix}").write_bytes(news["data"])
+        print(f"{self.name}, input {number}: {what}", flush=True)
+
+
+def _number(scratch: Path) -> int:
+    return struct.unpack("<q", (scratch / "number").read_bytes())[0]
+
+
+def _processor(pid: int) -> float:
+    """Seconds of processor time that a process has taken."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def again(name: str, number: int) -> None:
+    """Read one input in this process, with its traceback; its files are left in runs/fuzz/again."""
+    scratch = ROOT / "runs" / "fuzz" / "again"
+    shutil.rmtree(scratch, ignore_errors=True)
+    bench = Bench(TARGETS[name], scratch)
+    folder, path, data = bench.place(number)
+    print(f"{path}: {len(data)} bytes", flush=True)
+    bench.target.read(folder)
+
+
+def table(result: dict[str, Any]) -> str:
+    """The part of docs/reliability.md."""
+    rows = result["readers"]
+    names = [name for name in TARGETS if name in rows]
+    lines = [
+        f"`python benchmarks/fuzz.py`, {result['machine']}, {result['date']}, commit {result['commit']}.",
+        "",
+        "| reader | inputs | read all the same | refused in one line | slowest | memory | findings |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    total: Counter[str] = Counter()
+    for name in names:
+        row = rows[name]
+        known = sum(row["ends"].values()) or 1
+        read = row["ends"].get("read", 0) / known
+        found = row["findings"] + row["crashes"] + row["hangs"]
+        total.update(inputs=row["inputs"], found=found)
+        lines.append(
+            f"| {name} | {row['inputs']:,} | {read:.0%} | {1 - read:.0%} | {row['slowest']:.2f} s | "
+            f"{row['grown'] / 2**20:.0f} MiB | {found} |"
+        )
+    lines += [f"| all | {total['inputs']:,} | | | | | {total['found']} |", ""]
+    lines.append(
+        f"Slowest: processor time of one input; more than {SLOW:g} s is a finding. Memory: what the process grew by "
+        f"over all inputs; one that asks for more than {GREEDY >> 30} GiB is a finding."
+    )
+    return "\n".join(lines)
+
+
+def save(result: dict[str, Any]) -> None:
+    """Write counts and page."""
+    COUNTS.write_text(json.dumps(result | ran(), indent=1) + "\n")
+    fill_between(PAGE, "fuzz", table(result | ran()))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--readers", nargs="+", choices=TARGETS, default=list(TARGETS))
+    parser.add_argument("--inputs", type=int, default=1 << 40, help="of each reader, in all")
+    parser.add_argument("--seconds", type=float, default=60.0, help="for each reader, this time")
+    parser.add_argument("--again", type=int, help="repeat this input of one reader")
+    parser.add_argument("--fresh", action="store_true", help="count from 0, by the first inputs")
+    parser.add_argument("--atheris", action="store_true", help="choose inputs by what they reach")
+    args = parser.parse_args()
+    if args.again is not None:
+        again(args.readers[0], args.again)
+        return
+    result = json.loads(COUNTS.read_text()) if COUNTS.exists() else {"readers": {}}
+    for name in args.readers:
+        row = {} if args.fresh else result["readers"].get(name, {})
+        result["readers"][name] = row
+        began, before = time.monotonic(), row.get("inputs", 0)
+        reader = Reader(name, row)
+        reader.go_on(args.inputs, args.seconds)
+        print(f"{name}: {row['inputs'] - before} inputs in {time.monotonic() - began:.0f} s, {row}", flush=True)
+        save(result)
+
+
+if __name__ == "__main__":
+    main()

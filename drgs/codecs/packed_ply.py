@@ -1,0 +1,117 @@
+"""The compressed PLY of SuperSplat and the PlayCanvas engine: 16 bytes a Gaussian and 72 a chunk of 256, SH in bytes.
+
+Read by plyfile, once the header has been compared with the file, and unpacked here. The layout is that of
+playcanvas/splat-transform (decompress-ply.ts at d29f7b8): each chunk states the range of its means, log scales and (in
+newer files) colors; a Gaussian has 11, 10 and 11 bits for its mean and for its log scales, 2 + 3 x 10 for its rotation,
+8 for each color and its opacity. Axes are those of the PLY.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
+from drgs.guards.ply_headers import read_ply_header
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+    from drgs.guards.ply_headers import PlyElement
+
+__all__ = ["load_packed_ply"]
+
+_CHUNK = 256
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_ADVICE = "export it again from SuperSplat (superspl.at/editor)"
+
+
+def load_packed_ply(path: Path) -> Gaussians:
+    """Gaussians of a PLY in PlayCanvas' compressed layout.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is damaged or of another layout, or a value is not finite (the first index is named).
+    """
+    import plyfile
+
+    elements = {element.name: element for element in read_ply_header(path)}
+    count, coefficients = _check(path, elements)
+    check_count(path, count, coefficients)
+    try:
+        ply = plyfile.PlyData.read(str(path))
+    except (plyfile.PlyParseError, ValueError, OSError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path}: must be a readable PLY, got {text}; {_ADVICE}") from None
+    chunks, vertex = ply["chunk"].data, ply["vertex"].data
+    chunk = np.arange(count) // _CHUNK
+    position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
+    rgba = np.stack([color >> shift & 255 for shift in (24, 16, 8, 0)], axis=1)
+    colors = rgba[:, :3] / 255.0
+    if "min_r" in elements["chunk"].columns:
+        colors = _between(chunks, ("r", "g", "b"), chunk, colors)
+    others = np.stack([rotation >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023.0
+    sh = dc_of_colors(colors)
+    if coefficients > 1:
+        sh = np.concatenate([sh, _higher(ply["sh"].data, coefficients - 1)], axis=1)
+    return assembled(
+        path,
+        _between(chunks, ("x", "y", "z"), chunk, _unpacked(position)),
+        quats_of_smallest((rotation >> 30).astype(int), (others - 0.5) * 2**0.5),
+        _between(chunks, ("scale_x", "scale_y", "scale_z"), chunk, _unpacked(scale)),
+        logits_of_bytes(rgba[:, 3]),
+        sh,
+    )
+
+
+def _check(path: Path, elements: dict[str, PlyElement]) -> tuple[int, int]:
+    """Numbers of Gaussians and of SH coefficients, if all columns are there and of their kinds."""
+    ranges = ("x", "y", "z", "scale_x", "scale_y", "scale_z")
+    wanted = {"chunk": [f"{end}_{name}" for end in ("min", "max") for name in ranges], "vertex": list(_PACKED)}
+    if "chunk" in elements and "min_r" in elements["chunk"].columns:
+        wanted["chunk"] += [f"{end}_{name}" for end in ("min", "max") for name in "rgb"]
+    for name, columns in wanted.items():
+        kinds = ("float", "float32") if name == "chunk" else ("uint", "uint32")
+        there = dict(zip(elements[name].columns, elements[name].kinds, strict=True)) if name in elements else {}
+        missing = [column for column in columns if there.get(column) not in kinds]
+        if missing:
+            raise ValueError(
+                f"{path}: a compressed PLY must have the {name} columns {', '.join(columns[:3])}, ... of type "
+                f"{kinds[0]}, {missing[0]} is missing; {_ADVICE}"
+            )
+    count, chunks = elements["vertex"].rows, elements["chunk"].rows
+    if chunks * _CHUNK < count:
+        raise ValueError(f"{path}: must have a chunk for every {_CHUNK} Gaussians, got {chunks} for {count}; {_ADVICE}")
+    sh = elements.get("sh")
+    if sh is None:
+        return count, 1
+    names = {f"f_rest_{i}" for i in range(len(sh.columns))}
+    fits = set(sh.columns) == names and len(names) in (9, 24, 45) and {*sh.kinds} <= {"uchar", "uint8"}
+    if sh.rows != count or not fits:
+        raise ValueError(
+            f"{path}: the element sh must have {count} rows of 9, 24 or 45 bytes f_rest_0, ..., got {sh.rows} of "
+            f"{len(sh.columns)}; {_ADVICE}"
+        )
+    return count, len(names) // 3 + 1
+
+
+def _unpacked(packed: np.ndarray) -> np.ndarray:
+    """(N, 3) fractions of 11, 10 and 11 bits."""
+    return np.stack([(packed >> 21) / 2047.0, (packed >> 11 & 1023) / 1023.0, (packed & 2047) / 2047.0], axis=1)
+
+
+def _between(chunks: np.ndarray, names: tuple[str, ...], chunk: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Values at fractions of their chunk's ranges."""
+    low, high = (np.stack([chunks[f"{end}_{name}"] for name in names], axis=1)[chunk] for end in ("min", "max"))
+    with np.errstate(invalid="ignore"):  # of infinite ends; what comes of them is refused
+        return low * (1 - part) + high * part
+
+
+def _higher(rows: np.ndarray, coefficients: int) -> np.ndarray:
+    """(N, coefficients, 3) of bytes channel by channel: steps of 1/32 from -4 to 4, the outer ones at the ends."""
+    stored = np.stack([rows[f"f_rest_{i}"] for i in range(3 * coefficients)], axis=1)
+    table = (np.arange(256, dtype=np.float32) + 0.5) / 256
+    table[[0, 255]] = 0, 1
+    values = (table - 0.5) * 8
+    return values[stored].reshape(-1, 3, coefficients).transpose(0, 2, 1)

@@ -1,0 +1,138 @@
+"""What several formats share: bytes of opacity, colors as SH, axes, and the Gaussians that come of decoded arrays.
+
+A byte stands for all values that round to it. Where its own value has no finite logit or logarithm (an opacity of 0 or
+255, a scale of 0), it becomes the middle of those: the largest error is least there, and writing it again gives the
+same byte.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from drgs.ellipsoids import Y_00, Gaussians
+from drgs.guards.memory import require
+
+__all__ = [
+    "SH_COUNTS",
+    "assembled",
+    "check_count",
+    "dc_of_colors",
+    "flipped",
+    "log_of_scales",
+    "logits_of_bytes",
+    "logits_of_opacities",
+    "quats_of_smallest",
+]
+
+SH_COUNTS = (1, 4, 9, 16)
+"""Coefficients of a color up to degree 0, 1, 2 and 3."""
+_END = 0.25 / 255  # the middle of what rounds to an end: [0, 0.5 / 255] or [254.5 / 255, 1]
+# Powers of x, y and z in each basis function, modulo 2: what turns its sign when an axis turns.
+_ODD = np.array([
+    (0, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0),
+    (1, 1, 0), (0, 1, 1), (0, 0, 0), (1, 0, 1), (0, 0, 0),
+    (0, 1, 0), (1, 1, 1), (0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 0, 1), (1, 0, 0),
+])  # fmt: skip
+
+
+def check_count(path: Path, count: int, coefficients: int) -> None:
+    """Raise ValueError if a file's Gaussians, of so many SH coefficients a color, do not fit into memory."""
+    # Twice: an array as it is decoded, and what it becomes.
+    require(str(path), 8 * count * (11 + 3 * coefficients), f"{count} Gaussians", "take a smaller file")
+
+
+def assembled(
+    path: Path, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
+) -> Gaussians:
+    """Gaussians of decoded arrays, as float32.
+
+    Args:
+        path: The file, for messages.
+        means, quats, log_scales, logits, sh: The fields of `Gaussians`, of any floating type.
+    Raises:
+        ValueError: If a value is not finite or a quaternion is 0 (the first index is named).
+    """
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+        parts = (means, quats, log_scales, logits, sh)
+        mu, q, s, o, c = (torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in parts)
+    made = Gaussians(mu, q, s, o, c)
+    made.validate(str(path))
+    return made
+
+
+def logits_of_bytes(opacity: np.ndarray) -> np.ndarray:
+    """Logits of opacities in 255ths; 0 is taken for 0.25 / 255 and 255 for 254.75 / 255, logits of -6.93 and 6.93."""
+    table = np.arange(256) / 255.0
+    table[[0, 255]] = _END, 1.0 - _END
+    return (np.log(table) - np.log1p(-table))[opacity]
+
+
+def logits_of_opacities(opacity: np.ndarray) -> np.ndarray:
+    """Logits of float32 opacities; 0 and 1 are taken for the middle of what rounds to them, others outside are NaN."""
+    x = opacity.astype(np.float64)
+    least = float(np.finfo(np.float32).smallest_subnormal)
+    x = np.where(x == 0, least / 4, np.where(x == 1, 1 - 2.0**-26, x))
+    with np.errstate(invalid="ignore"):
+        return np.log(x) - np.log1p(-x)
+
+
+def log_of_scales(path: Path, scales: np.ndarray, least: float) -> np.ndarray:
+    """Logarithms of linear standard deviations.
+
+    Args:
+        path: The file, for the message.
+        scales: (N, 3), >= 0.
+        least: What 0 is taken for.
+    Raises:
+        ValueError: If one is negative or not finite (the first index is named).
+    """
+    with np.errstate(invalid="ignore"):  # of half floats that are none
+        scales = scales.astype(np.float64)
+    bad = ~(np.isfinite(scales) & (scales >= 0)).all(1)
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
+        raise ValueError(
+            f"{path}: scales must be finite and >= 0, got {scales[i].tolist()} at index {i} ({int(bad.sum())} of "
+            f"{len(scales)}); export the file again"
+        )
+    return np.log(np.where(scales == 0, least, scales))
+
+
+def dc_of_colors(colors: np.ndarray) -> np.ndarray:
+    """(N, 1, 3) SH coefficients of degree 0 of (N, 3) colors in [0, 1]."""
+    return ((colors - 0.5) / Y_00)[:, None, :]
+
+
+def quats_of_smallest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(N, 4) unit quaternions of their three smaller components.
+
+    Args:
+        largest: (N,) position of the component that is not stored, 0 to 3; it is >= 0.
+        others: (N, 3) the rest, in their order.
+    """
+    n = len(largest)
+    quats = np.empty((n, 4))
+    stored = np.arange(4)[None, :] != largest[:, None]
+    quats[stored] = others.reshape(-1)
+    quats[np.arange(n), largest] = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(1)))
+    return quats
+
+
+def flipped(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
+    """Gaussians in axes of which some point the other way: means, rotations and SH; no digit changes.
+
+    Args:
+        g: Their `origin` must be 0.
+        signs: 1 or -1 for x, y and z, of product 1 (a half turn) or -1 (a mirror).
+    """
+    s = np.asarray(signs)
+    flips = np.prod(np.where(_ODD[: g.sh.shape[1]] == 1, s, 1), axis=1)
+    x, y, z = (int(v) for v in s)
+    return g.replace(
+        means=g.means * torch.tensor(signs, dtype=g.means.dtype),
+        quats=g.quats * torch.tensor([1, y * z, x * z, x * y], dtype=g.quats.dtype),
+        sh=g.sh * torch.from_numpy(flips).to(g.sh.dtype)[None, :, None],
+    )

@@ -1,0 +1,127 @@
+"""`drgs convert`: Gaussians of a file or a run in another format, and in a PLY what is known of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.codecs import check_suffix, load_gaussians, save_gaussians
+from drgs.commands.given import Given
+from drgs.display.progress import Bar
+from drgs.files import load_state
+from drgs.gain import Prior, check, variances
+from drgs.guards.outputs import claim
+from drgs.information.groups import GROUPS
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Convert
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["label_column", "run", "still", "uncertainty_columns"]
+
+
+def run(args: Convert) -> None:
+    """`drgs convert IN OUT`."""
+    suffix = check_suffix("convert", args.out)
+    wanted = [name for name, is_asked in (("--uncertainty", args.uncertainty), ("--labels", args.labels)) if is_asked]
+    if wanted and suffix != ".ply":
+        raise ValueError(
+            f"{wanted[0]} must have a .ply to write to, {suffix} has no room for columns; convert to a .ply"
+        )
+    prior = Prior(args.prior)
+    with claim(args.out.parent, "convert", [args.out.name], [args.scene, args.uncertainty or ""]):
+        with Bar("reading", show=not args.quiet):
+            given = _given(args)
+        g = still(args, given)
+        extra: dict[str, np.ndarray] = {}
+        comments: tuple[str, ...] = ()
+        if args.uncertainty is not None:
+            extra |= uncertainty_columns(args.uncertainty, g, prior)
+        if args.labels:
+            extra["label"], comments = label_column(args.scene, given, g)
+        with Bar("writing", show=not args.quiet):
+            save_gaussians(g, args.out, extra=extra, comments=comments)
+    if not args.quiet:
+        columns = f", with {', '.join(extra)}" if extra else ""
+        size = args.out.stat().st_size
+        print(
+            f"{len(g)} Gaussians, SH degree {g.sh_degree}{columns}: {args.out} ({size / max(len(g), 1):.1f} bytes each)"
+        )
+
+
+def _given(args: Convert) -> Given:
+    """What is converted."""
+    if not args.as_stored:
+        return Given.at(args.scene)
+    if args.scene.suffix.lower() != ".spz":
+        raise ValueError(f"--as-stored must have an .spz, whose axes are others than those of a PLY, got {args.scene}")
+    return Given(load_gaussians(args.scene, as_stored=True))
+
+
+def still(args: Convert, given: Given) -> Gaussians:
+    """The Gaussians; of a scene that moves, as they are at --time.
+
+    Raises:
+        ValueError: If something moves and there is no time, or the other way round.
+    """
+    if given.moving is None:
+        if args.time is not None:
+            raise ValueError("--time must have a scene that moves, this one stands still; drop it")
+        return given.gaussians
+    if args.time is None:
+        raise ValueError(
+            f"{args.scene}: moves, so that --time must say when; `drgs render --format ply` writes a PLY for each time"
+        )
+    return given.moving.at(args.time).detach()  # a file holds values
+
+
+def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.ndarray]:
+    """What information leaves uncertain of each Gaussian: (N,) float32, a column a group.
+
+    The square root of the sum of 1 / (H + lambda) over a group's numbers: with a prior of lambda, the standard
+    deviation of the mean in scene units, of log scales, and so on.
+
+    Args:
+        path: `information.safetensors` of `drgs fisher`.
+        g: The Gaussians that it is about.
+        prior: lambda.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is none, or about other Gaussians.
+    """
+    information, _ = load_state(path)
+    known = {name: information[name] for name in GROUPS if name in information}
+    for name, x in known.items():
+        if x.ndim == 0 or len(x) != len(g):
+            raise ValueError(
+                f"{path}: must be about these {len(g)} Gaussians, its group {name} has shape {tuple(x.shape)}; run "
+                "`drgs fisher` on the scene that is converted"
+            )
+    if not known:
+        raise ValueError(
+            f"{path}: must hold information of Gaussians, holds {', '.join(information)[:80] or 'nothing'}"
+        )
+    check(str(path), known)
+    found = variances(known, Prior(prior.value))
+    return {f"uncertainty_{name}": x.reshape(len(g), -1).sum(1).sqrt().float().numpy() for name, x in found.items()}
+
+
+def label_column(path: Path, given: Given, g: Gaussians) -> tuple[np.ndarray, tuple[str, ...]]:
+    """(N,) class 1..K of each Gaussian, that of the largest cosine, and a line of the header for each name.
+
+    Args:
+        path: What was named, for the message.
+        given: The run.
+        g: Its Gaussians.
+    Raises:
+        ValueError: If it has no classes with embeddings, or no features.
+    """
+    from drgs.features.segmentation import classify  # not for those that have none
+
+    classes = given.classes
+    if g.features is None or classes is None or classes.embeddings is None:
+        raise ValueError(f"{path}: --labels must have a run that was fitted with classes, this has none; drop it")
+    labels = classify(g.features, classes, given.decoder).numpy()
+    return labels, tuple(f"label {k} {name}" for k, name in enumerate(classes.names, 1))

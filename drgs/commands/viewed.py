@@ -1,0 +1,199 @@
+"""What `drgs view` looks at, from what the command line names: scene, pictures, cameras, and where to begin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.commands.fisher import MAP_PRIOR, Told, added
+from drgs.commands.orbits import UP, Wish, capture_orbit, scene_orbit, seen_distance
+from drgs.commands.painters import PAINTINGS, painters
+from drgs.commands.viewpoints import Known, Source, known_views
+from drgs.data import View as DataView
+from drgs.data.capture import Focus, upright
+from drgs.ellipsoids import Gaussians
+from drgs.files import Run, state_header
+from drgs.fitting.records import fitted_views
+from drgs.gain import Prior
+from drgs.guards.foreign import refuse_foreign
+from drgs.viewing.layers import layers_of
+from drgs.viewing.poses import pose_of
+from drgs.viewing.stations import Ranking, Station, read_ranking, stations_of
+from drgs.viewing.subject import FirstView, Subject
+from drgs.viewing.uncertainty import Uncertainty
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.given import Given
+    from drgs.commands.options import View
+    from drgs.commands.painters import Painter
+
+__all__ = ["subject_of", "watched_files"]
+
+_SELECTION = "selection.json"
+_FIRST_SIZE = 640, 480  # pixels of the view that a browser begins with: its shape says how much of the scene is in it
+
+
+def watched_files(args: View) -> list[Path]:
+    """The files that are read again when they change."""
+    named = [] if args.selection is None else [args.selection]
+    if not args.scene.is_dir():
+        return [args.scene, *named]
+    run = Run(args.scene)
+    return [run.state, run.point_cloud, *(named or [run.path / _SELECTION])]
+
+
+def subject_of(args: View, given: Given, before: Subject | None = None) -> Subject:
+    """What is looked at.
+
+    Args:
+        args, given: Of the command line.
+        before: What was looked at, where a file has changed: browsers stay where they are.
+    Raises:
+        FileNotFoundError, ValueError: If a file that was named is not there or damaged.
+    """
+    notes: list[str] = []
+    known = _known(args, given, notes)
+    ranking = _ranking(args, given)
+    stations = _stations(args, given, ranking, notes)
+    uncertainty = _uncertainty(args, given, known)
+    origin = np.array(given.gaussians.origin, np.float64)
+    first = before.first if before else _first(args, given.gaussians, known.cameras if known else [])
+    pixels = known.pixels if known else args.max_pixels
+    if before is not None and _same(before.stations, stations) and before.ranking == ranking:
+        stations = before.stations
+    return Subject(
+        name="/".join(args.scene.resolve().parts[-2:]),
+        state=_state(given),
+        count=len(given.gaussians),
+        scene=given.scene,
+        origin=origin,
+        times=given.record.times if given.record is not None and given.moving is not None else (),
+        settings=given.settings,
+        layers=layers_of(_paint(args, given), uncertainty, pixels),
+        stations=stations,
+        ranking=ranking,
+        uncertainty=uncertainty,
+        first=first,
+        background=given.background,
+        notes=tuple(notes),
+    )
+
+
+def _state(given: Given) -> str:
+    """The step of the checkpoint, where there is one that can be read."""
+    if given.run is None:
+        return ""
+    try:
+        step = state_header(given.run.state).get("step")
+    except (OSError, ValueError):
+        return ""
+    return f"step {step:,} of {given.record.config.max_steps:,}" if isinstance(step, int) else ""
+
+
+def _paint(args: View, given: Given) -> dict[str, Painter]:
+    """What draws features and labels, as far as there are any."""
+    found: dict[str, Painter] = {}
+    if given.gaussians.features is None:
+        return found
+    for kind in PAINTINGS:
+        try:
+            found |= painters([kind], given, args.scene)
+        except ValueError:  # no decoder, no classes: not offered
+            continue
+    return found
+
+
+def _known(args: View, given: Given, notes: list[str]) -> Known | None:
+    """The views that it was fitted to; None where nobody says, or their data set has gone."""
+    if args.train is None and given.run is None:
+        return None
+    try:
+        return known_views(args.train, args, given)
+    except (OSError, ValueError) as error:
+        if args.train is not None:
+            raise
+        notes.append(f"no cameras: {error}")
+        return None
+
+
+def _stations(args: View, given: Given, ranking: Ranking | None, notes: list[str]) -> tuple[Station, ...]:
+    """Where photographs were taken or could be."""
+    if args.train is None and given.run is None:
+        return stations_of([], (), ranking)
+    source = Source("--train", str(given.run.path), "run") if args.train is None else Source.of("--train", args.train)
+    if source.kind == "list":
+        views = [DataView(camera, camera.name) for camera in source.listed()]
+        return stations_of(views, [view.name for view in views], ranking)
+    try:
+        views = source.dataset(args, given).views
+        fitted = fitted_views(Run(Path(source.text))) if source.kind == "run" else [view.name for view in views]
+    except (OSError, ValueError):
+        if args.train is not None:
+            raise
+        return stations_of([], (), ranking)  # `_known` has said why
+    return stations_of(views, fitted, ranking)
+
+
+def _ranking(args: View, given: Given) -> Ranking | None:
+    """Scores of cameras: those of --selection, else of a run that chose its views."""
+    if args.selection is not None:
+        refuse_foreign(args.selection, "a selection")
+        return read_ranking(args.selection)
+    if given.record is None or not given.record.is_active:
+        return None
+    path = given.run.path / _SELECTION
+    return read_ranking(path) if path.is_file() else None
+
+
+def _uncertainty(args: View, given: Given, known: Known | None) -> Uncertainty | None:
+    """What the photographs leave uncertain, by the fast settings, whose maps are those of the exact ones."""
+    if known is None or not known.cameras:
+        return None
+    cameras = known.cameras
+    if given.moving is not None:
+        cameras = [camera for camera in cameras if camera.time is not None]
+    if not cameras:
+        return None
+    told = Told.of(given, args, given.settings("fast"), cameras)
+    prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
+    return Uncertainty(
+        cameras,
+        lambda camera: added(told.said(camera)),
+        lambda camera, weights: sum(told.maps(camera, weights).values()),
+        prior,
+    )
+
+
+def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstView:
+    """Where the photographs were taken, towards what they look at; of a bare PLY, so that all of it is seen."""
+    if not len(gaussians):
+        raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
+    wish, distance_of = Wish.of(args), seen_distance(gaussians)
+    captured = sorted(captured, key=lambda camera: camera.name)  # an active run has them as they were picked
+    width, height = _FIRST_SIZE
+    made, _ = capture_orbit(captured, 1, width=width, height=height, wish=wish, distance_of=distance_of)
+    camera = (made or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, wish=wish))[0]
+    up = np.array(wish.up or (upright(captured) if captured else UP["minus-y"]), np.float64)
+    focus = Focus.of(captured, wish.center, distance_of) if made else None
+    pose, axis = pose_of(camera, gaussians.origin), camera.c2w[:3, 2]
+    if focus is not None:
+        target = focus.center - gaussians.origin
+    else:
+        means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin
+        ahead = (means - camera.center) @ axis
+        ahead = ahead[ahead > 0]
+        target = pose.position + axis * (float(np.median(ahead)) if len(ahead) else 1.0)
+    return FirstView(pose, target, up / np.linalg.norm(up))
+
+
+def _same(before: tuple[Station, ...], after: tuple[Station, ...]) -> bool:
+    """Whether both are the same places with the same names: then a browser need not draw them again."""
+    return [_key(station) for station in before] == [_key(station) for station in after]
+
+
+def _key(station: Station) -> tuple:
+    camera = station.camera
+    return station.kind, camera.name, np.asarray(camera.w2c).tobytes(), len(station.sights)

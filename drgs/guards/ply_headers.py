@@ -1,0 +1,111 @@
+"""Headers of PLY files: parsed, and compared with the size of the file before anybody allocates what they claim."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+
+__all__ = ["EXTRA", "PlyElement", "extra_kind", "read_ply_header"]
+
+EXTRA = ("uncertainty_", "label")
+"""Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
+
+_SIZES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+_MAX_HEADER = 1 << 18  # bytes; some 9,000 columns
+
+
+@dataclasses.dataclass(frozen=True)
+class PlyElement:
+    """An element: what it is called, how many rows it has, and its columns.
+
+    Attributes:
+        kinds: The type of each column, as the file names it; of a list, that of its entries.
+    """
+
+    name: str
+    rows: int
+    columns: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+
+    def with_column(self, kind: str, name: str) -> PlyElement:
+        """The same with one more column."""
+        return dataclasses.replace(self, columns=(*self.columns, name), kinds=(*self.kinds, kind))
+
+    def least_bytes(self, is_text: bool) -> int:
+        """Bytes that its rows take at least: of text, a digit and a separator a value."""
+        each = 2 * len(self.columns) if is_text else sum(_SIZES[kind] for kind in self.kinds)
+        return self.rows * each
+
+
+def read_ply_header(path: Path) -> list[PlyElement]:
+    """The elements of a PLY file, once it is known to be as long as its header claims.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no PLY, its header is damaged, or the file is shorter.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a PLY file, found none; check the path")
+    with path.open("rb") as file:
+        head = file.read(_MAX_HEADER)
+    last = re.search(rb"[\r\n]end_header", head)  # not the word in a comment
+    end = last.start() + 1 if last else -1
+    newline = head.find(b"\n", end)
+    if not head.startswith((b"ply\n", b"ply\r")) or end < 0 or newline < 0:
+        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; convert it to a 3DGS PLY")
+    elements: list[PlyElement] = []
+    text_format = None
+    for line in head[:end].decode("ascii", "replace").splitlines():
+        match line.split():
+            case ["format", kind, _]:
+                text_format = kind
+            case ["element", name, count] if count.isdecimal() and len(count) < 1000:
+                elements.append(PlyElement(name, int(count)))
+            case ["property", kind, name] | ["property", "list", kind, _, name] if elements and kind in _SIZES:
+                elements[-1] = elements[-1].with_column(kind, name)
+            case ["ply"] | ["comment", *_] | ["obj_info", *_] | []:
+                pass
+            case _:
+                raise ValueError(f"{path}: PLY header must be well-formed, got {line[:60]!r}; export it again")
+    if empty := next((element.name for element in elements if element.rows and not element.columns), None):
+        raise ValueError(f"{path}: element {empty!r} of a PLY must have a property, has none; export it again")
+    is_text = text_format == "ascii"
+    claimed = sum(element.least_bytes(is_text) for element in elements)
+    held = path.stat().st_size - newline - 1
+    if claimed > held + is_text:
+        counts = ", ".join(f"{element.rows} {element.name}" for element in elements)
+        raise ValueError(
+            f"{path}: the header claims {counts} ({claimed} bytes), the file holds {held} bytes; "
+            "it is truncated or damaged, copy it again"
+        )
+    return elements
+
+
+def extra_kind(name: str, values: np.ndarray, count: int) -> str:
+    """The type of an extra column of (N,) values.
+
+    Raises:
+        ValueError: If it has another name or length, or a value that the file cannot hold.
+    """
+    if not name.startswith(EXTRA) or not name.isidentifier() or values.shape != (count,):
+        raise ValueError(
+            f"save_ply: extra columns must be named uncertainty_* or label* and have {count} values, got {name!r} of "
+            f"shape {values.shape}; correct it"
+        )
+    if values.dtype.kind in "iu":
+        ends = int(values.min(initial=0)), int(values.max(initial=0))
+        if ends[0] < 0 or ends[1] > 65535:
+            raise ValueError(f"save_ply: {name} must be in 0..65535, got {ends[0]}..{ends[1]}; number them anew")
+        return "u1" if ends[1] < 256 else "<u2"
+    if not np.isfinite(values).all():
+        i = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise ValueError(f"save_ply: {name} must be finite, got {values[i]} at index {i}; leave it out or repair it")
+    return "<f4"

@@ -1,0 +1,79 @@
+"""A picture in steps: a small one first, then one as large as the browser shows, a band of rows at a time.
+
+Between two steps the worker may turn to something else, so that a browser whose camera has moved waits for one band of
+the picture that is no longer wanted, not for all of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.ellipsoids import colors_only
+from drgs.integrator import render
+from drgs.sizes import at_most
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Scene
+    from drgs.integrator import Output
+    from drgs.settings import RenderSettings
+
+__all__ = ["Steps", "bands", "drawn", "stages"]
+
+Steps = Generator[None, None, np.ndarray]
+"""Yields between its steps, and returns what it has made."""
+
+_FIRST = 16_000  # pixels of the first picture
+_BAND = 48_000  # pixels that are drawn in one step
+
+
+def stages(camera: Camera, most: int) -> list[Camera]:
+    """The cameras of one view in the order in which they are drawn: a small picture, then one of `most` pixels.
+
+    Args:
+        camera: As large as the browser's window.
+        most: Pixels; no picture is larger than the window either.
+    """
+    last = at_most(camera, most)
+    first = at_most(camera, _FIRST)
+    return [first, last] if 2 * first.width * first.height < last.width * last.height else [last]
+
+
+def bands(camera: Camera, pixels: int = _BAND) -> list[Camera]:
+    """Cameras that show the rows of a view from top to bottom, each at most so many pixels, but a row at least."""
+    rows = max(1, pixels // camera.width)
+    parts = []
+    for top in range(0, camera.height, rows):
+        K = np.array(camera.K)
+        K[1, 2] -= top
+        parts.append(dataclasses.replace(camera, K=K, height=min(rows, camera.height - top)))
+    return parts
+
+
+def drawn(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    read: Callable[[Output], np.ndarray],
+    features: bool = False,
+) -> Steps:
+    """What `read` takes of the rendering of a view, (H, W, ...).
+
+    Args:
+        scene, camera, settings: As for `drgs.render`.
+        read: Of a band's rendering, with its depth.
+        features: Whether it reads the features, which else cost nothing.
+    """
+    parts = []
+    with torch.no_grad():  # a picture
+        seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
+    for part in bands(camera):
+        with torch.no_grad():
+            parts.append(read(render(seen, part, settings, ("depth",))))
+        yield
+    return np.concatenate(parts)

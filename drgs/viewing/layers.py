@@ -1,0 +1,155 @@
+"""Which pictures there are of what is looked at: what it does not have is not offered."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Generator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.display import pictures
+from drgs.integrator import Output
+from drgs.viewing.drawing import drawn
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Gaussians, Scene
+    from drgs.settings import RenderSettings
+    from drgs.viewing.uncertainty import Uncertainty
+
+__all__ = ["INFORMATION", "Drawing", "Layer", "ColorScale", "layers_of", "tinted"]
+
+INFORMATION = "information"
+_WIDE_PIXELS = 200_000  # of a picture of features: 100 MB of 128 channels
+_ROW = 4096  # Gaussians that are painted at once
+
+
+@dataclasses.dataclass(frozen=True)
+class ColorScale:
+    """What the colors of a picture mean.
+
+    Attributes:
+        dark, bright: The values of its ends.
+        of: What has these values.
+    """
+
+    dark: float
+    bright: float
+    of: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawing:
+    """A picture (H, W, 3) uint8, and its scale, if it has one."""
+
+    picture: np.ndarray
+    scale: ColorScale | None = None
+
+
+Drawings = Generator[None, None, Drawing]
+Draw = Callable[["Scene", "Camera", "RenderSettings"], Drawings]
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A kind of picture.
+
+    Attributes:
+        name: As the browser offers it.
+        hint: What it shows, in a few words.
+        draw: (scene, camera, settings) -> steps that return a `Drawing`.
+        pixels: At most so many, whatever the window.
+        tint: (N, 3) uint8 colors of the Gaussians that the client draws; None: their own.
+    """
+
+    name: str
+    hint: str
+    draw: Draw
+    pixels: int | None = None
+    tint: Callable[[Gaussians], np.ndarray] | None = None
+
+
+def layers_of(
+    paint: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int
+) -> tuple[Layer, ...]:
+    """All that can be shown.
+
+    Args:
+        paint: Kind -> what draws it of a rendering with features.
+        uncertainty: What the photographs leave uncertain, where there are any.
+        pixels: Of its map, at most.
+    """
+    made = [
+        Layer("rgb", "colors", _rgb),
+        Layer("depth", "distance along the ray, near is bright; gray where less than half of the light stops", _depth),
+        Layer("missing", "share of the light that no Gaussian stops: black nothing, bright all of it", _missing),
+    ]
+    hints = {
+        "features": "three principal components of the semantic features",
+        "labels": "the class of each pixel",
+        "overlay": "classes over the colors",
+    }
+    for kind, painter in paint.items():
+        tint = None if kind == "overlay" else _tint_of(painter)
+        made.append(Layer(kind, hints.get(kind, kind), _painted(painter), _WIDE_PIXELS, tint))
+    if uncertainty is not None:
+        hint = "predictive variance of each pixel, given the photographs: bright is uncertain"
+        made.append(Layer(INFORMATION, hint, _mapped(uncertainty), pixels))
+    return tuple(made)
+
+
+def tinted(layer: Layer, gaussians: Gaussians) -> np.ndarray | None:
+    """(N, 3) uint8 colors of the client's Gaussians; None: their own."""
+    return None if layer.tint is None else layer.tint(gaussians)
+
+
+def _rgb(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+    return Drawing((yield from drawn(scene, camera, settings, lambda out: pictures.to_bytes(out.rgb.cpu().numpy()))))
+
+
+def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+    def read(out: Output) -> np.ndarray:
+        assert out.depth is not None  # asked for
+        return np.stack([out.depth.cpu().numpy(), out.alpha.cpu().numpy()], axis=-1)
+
+    found = yield from drawn(scene, camera, settings, read)
+    picture, (near, far) = pictures.depth_colors(found[..., 0], found[..., 1])
+    return Drawing(picture, ColorScale(far, near, "distance"))
+
+
+def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+    found = yield from drawn(scene, camera, settings, lambda out: 1 - out.alpha.cpu().numpy())
+    return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light"))
+
+
+def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
+    def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+        return Drawing((yield from drawn(scene, camera, settings, painter, features=True)))
+
+    return draw
+
+
+def _mapped(uncertainty: Uncertainty) -> Draw:
+    def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
+        found = uncertainty.map(camera)
+        yield
+        picture, (low, high) = pictures.map_colors(found)
+        return Drawing(picture, ColorScale(low, high, "variance, logarithmic"))
+
+    return draw
+
+
+def _tint_of(painter: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], np.ndarray]:
+    """What paints pixels paints Gaussians, too: as rows of pixels that show one each."""
+    import torch
+
+    def tint(g: Gaussians) -> np.ndarray:
+        assert g.features is not None  # else there is no such painter
+        rows = []
+        for features in g.features.detach().split(_ROW):
+            rgb, alpha = torch.zeros(1, len(features), 3), torch.ones(1, len(features))
+            rows.append(painter(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])
+        return np.concatenate(rows) if rows else np.zeros((0, 3), np.uint8)
+
+    return tint

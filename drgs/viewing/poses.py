@@ -1,0 +1,109 @@
+"""The client's cameras and ours: both have OpenCV's axes (+x right, +y down, +z forward); only the lens is said
+otherwise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from drgs.cameras import Camera, intrinsics
+
+__all__ = ["Pose", "camera_of", "looking", "pose_of"]
+
+_WIDEST = math.radians(150.0)  # of a client's view; a wider one is drawn so wide
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pose:
+    """A camera as viser has it, in the client's frame: the world's, moved by the origin of the Gaussians.
+
+    Attributes:
+        wxyz: (4,) quaternion of camera to world.
+        position: (3,) of the camera.
+        fov: Vertical field of view in radians.
+        aspect: Width over height.
+    """
+
+    wxyz: np.ndarray
+    position: np.ndarray
+    fov: float
+    aspect: float
+
+    def is_near(self, other: Pose | None) -> bool:
+        """Whether both show the same picture, to a small part of a pixel."""
+        if other is None:
+            return False
+        reach = 1e-6 * (1.0 + float(np.abs(self.position).max()))
+        turn = abs(float(self.wxyz @ other.wxyz)) / float(np.linalg.norm(self.wxyz) * np.linalg.norm(other.wxyz))
+        return bool(
+            np.abs(self.position - other.position).max() < reach
+            and 1 - turn < 1e-10
+            and abs(self.fov - other.fov) < 1e-6
+            and abs(self.aspect - other.aspect) < 1e-6
+        )
+
+
+def camera_of(pose: Pose, width: int, height: int, origin: np.ndarray, time: float | None = None) -> Camera:
+    """The camera that shows what the client shows.
+
+    Args:
+        pose: The client's.
+        width, height: Pixels of the image; the vertical field of view is exact, whatever they are.
+        origin: (3,) of the Gaussians: world coordinates of the client's 0.
+        time: Of the view.
+    """
+    focal = 0.5 * height / math.tan(0.5 * min(pose.fov, _WIDEST))
+    K = intrinsics(focal * width / (height * pose.aspect), focal, width / 2, height / 2)
+    w2c = np.eye(4)
+    w2c[:3, :3] = _rotation(pose.wxyz).T
+    w2c[:3, 3] = -w2c[:3, :3] @ (np.asarray(pose.position, np.float64) + origin)
+    return Camera(K=K, w2c=w2c, width=width, height=height, name="view", time=time)
+
+
+def pose_of(camera: Camera, origin: np.ndarray) -> Pose:
+    """Where the client stands to see what a camera sees; an optical axis off the middle stays out, and so does a lens.
+
+    Args:
+        camera: In the world.
+        origin: (3,) of the Gaussians.
+    """
+    c2w = camera.c2w
+    fov = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
+    aspect = camera.width * camera.K[1, 1] / (camera.height * camera.K[0, 0])
+    return Pose(_quaternion(c2w[:3, :3]), c2w[:3, 3] - origin, fov, float(aspect))
+
+
+def looking(pose: Pose, aspect: float) -> float:
+    """The vertical field of view in radians in which a window of another shape shows all that a camera sees."""
+    tangent = math.tan(0.5 * pose.fov)
+    return min(2 * math.atan(tangent * max(1.0, pose.aspect / aspect)), _WIDEST)
+
+
+def _rotation(wxyz: np.ndarray) -> np.ndarray:
+    """(3,3) of a quaternion of any length but 0."""
+    w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion(R: np.ndarray) -> np.ndarray:
+    """(4,) wxyz of a rotation: the eigenvector of the matrix whose form is largest at it, which no angle spoils."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = R.reshape(-1)
+    form = np.array(
+        [
+            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, xx - yy - zz, yx + xy, xz + zx],
+            [xz - zx, yx + xy, yy - xx - zz, zy + yz],
+            [yx - xy, xz + zx, zy + yz, zz - xx - yy],
+        ]
+    )
+    found = np.linalg.eigh(form)[1][:, -1]
+    return found if found[0] >= 0 else -found

@@ -1,0 +1,151 @@
+"""Starts viser behind the gate, and gives every browser a session."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+from collections.abc import Hashable, Iterator
+from typing import Any
+
+from drgs.viewing.gate import Gate, bound_socket, guarded
+from drgs.viewing.layers import INFORMATION
+from drgs.viewing.session import Session
+from drgs.viewing.subject import Subject
+from drgs.viewing.worker import Worker
+
+__all__ = ["Viewer"]
+
+_log = logging.getLogger(__name__)
+
+_NEAR, _FAR = 1e-3, 1e3  # of the distance to what is looked at: where the client's pictures begin and end
+_LEARNING = "information"
+
+
+class Viewer:
+    """A viewer that listens from the time it is made.
+
+    Args:
+        subject: What is looked at first.
+        host, port: Where it listens; port 0 is any that is free.
+        token: What a browser must know; None: nothing on this machine, else one that is made up.
+        preset: How our pictures are drawn at first.
+        pixels: Of a picture, at most.
+    Raises:
+        ValueError: If there is no such address, the port is taken, or the token is none.
+    """
+
+    def __init__(
+        self,
+        subject: Subject,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+        preset: str = "exact",
+        pixels: int = 500_000,
+    ) -> None:
+        import viser
+        from viser._messages import ShareUrlDisconnect, ShareUrlRequest
+
+        listening = bound_socket(host, port)
+        try:
+            self.port = listening.getsockname()[1]
+            self.gate = Gate.of(host, self.port, token)
+            self.address = self.gate.address(host, self.port)
+            self.subject, self._preset, self._pixels = subject, preset, pixels
+            self.sessions: dict[int, Session] = {}
+            with guarded(self.gate, listening), contextlib.redirect_stdout(io.StringIO()):  # it says where it listens
+                self._server = viser.ViserServer(host, self.port, verbose=False)
+        except BaseException:
+            listening.close()
+            raise
+        # A tunnel to a server of somebody else's would lead around the gate.
+        self._server._websock_server.unregister_handler(ShareUrlRequest)
+        self._server._websock_server.unregister_handler(ShareUrlDisconnect)
+        self.worker = Worker(self._failed)
+        self._place()
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._disconnected)
+
+    def replace(self, subject: Subject) -> None:
+        """Show another subject in all browsers. From any thread."""
+        self.worker.drop(_LEARNING)
+        self.subject = subject
+        self._each(lambda session: session.show(subject))
+
+    def say(self, text: str) -> None:
+        """Say something in all panels. From any thread."""
+        self._each(lambda session: session.say(text))
+
+    def stop(self, seconds: float = 1.0) -> bool:
+        """Close everything; whether nothing is being computed any more."""
+        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
+            self._server.stop()
+        return self.worker.close(seconds)
+
+    def _place(self) -> None:
+        """Where browsers begin, and what the page looks like."""
+        subject, server = self.subject, self._server
+        first, bright = subject.first, sum(subject.background) > 1.5
+        server.gui.configure_theme(dark_mode=not bright, show_logo=False, show_share_button=False)
+        server.gui.set_panel_label("drgs view")
+        server.scene.set_up_direction(first.up)
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.up = first.pose.position, first.target, first.up
+        camera.fov = first.pose.fov
+        camera.near, camera.far = _NEAR * first.distance, _FAR * first.distance
+
+    async def _connected(self, client: Any) -> None:
+        self.sessions[client.client_id] = Session(
+            client, self.subject, self.worker, self._preset, self._pixels, self._learn
+        )
+
+    async def _disconnected(self, client: Any) -> None:
+        if session := self.sessions.pop(client.client_id, None):
+            session.close()
+
+    def _learn(self) -> None:
+        """Have the information of the photographs added up, if nobody has asked for it yet."""
+        uncertainty = self.subject.uncertainty
+        if uncertainty is not None and not uncertainty.is_known and not self.worker.has(_LEARNING):
+            self.worker.put(_LEARNING, self._learning(), can_wait=True)
+
+    def _learning(self) -> Iterator[None]:
+        """Job: the information of the photographs; whoever waits for it is told how far it is."""
+        uncertainty = self.subject.uncertainty
+        assert uncertainty is not None
+
+        def told() -> None:
+            count = len(uncertainty.cameras)
+            for session in self._waiting():
+                session.say(f"information of the photographs: {uncertainty.done} of {count}")
+
+        told()
+        yield
+        yield from uncertainty.learn(told)
+        self._each(lambda session: session.redraw() if session.layer.name == INFORMATION else None)
+
+    def _waiting(self) -> list[Session]:
+        return [session for session in list(self.sessions.values()) if session.layer.name == INFORMATION]
+
+    def _each(self, call: Any) -> None:
+        """Call a function with each session, on viser's event loop."""
+
+        def run() -> None:
+            for session in list(self.sessions.values()):
+                call(session)
+
+        with contextlib.suppress(RuntimeError):  # the loop has ended: there is nobody left
+            self._server.get_event_loop().call_soon_threadsafe(run)
+
+    def _failed(self, key: Hashable, error: Exception) -> None:
+        """A job has ended by an error: whose job it was is told, and the log."""
+        text = str(error) or type(error).__name__
+        if not isinstance(error, (ValueError, OSError, NotImplementedError)):
+            _log.warning("view: %s", text, exc_info=error)
+        else:
+            _log.warning("view: %s", text)
+        if isinstance(key, tuple) and isinstance(key[0], Session):
+            key[0].say(text)
+        else:
+            self.say(text)

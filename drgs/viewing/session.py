@@ -1,0 +1,396 @@
+"""One browser: what it shows, where its camera rests, and what it is sent.
+
+While the camera moves the client draws Gaussians by itself. Where it rests for a moment our own picture is drawn, a
+small one first, and lies behind everything else in the scene, whose Gaussians are hidden as long. All methods but
+those that say otherwise run on viser's event loop, one after the other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.display.pictures import to_bytes
+from drgs.viewing import panel
+from drgs.viewing.drawing import stages
+from drgs.viewing.layers import INFORMATION, Layer, tinted
+from drgs.viewing.poses import Pose, camera_of, looking, pose_of
+from drgs.viewing.splats import ClientGaussians
+from drgs.viewing.stations import Station, score_colors
+
+if TYPE_CHECKING:
+    import viser
+
+    from drgs.viewing.layers import ColorScale
+    from drgs.viewing.subject import Subject
+    from drgs.viewing.worker import Worker
+
+__all__ = ["REST", "Session"]
+
+REST = 0.3
+"""Seconds that a camera rests before our picture is drawn."""
+
+_PRESETS = ("exact", "fast", "gsplat")
+_PHOTOGRAPH = 360  # pixels of its width in the panel
+_FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
+_MOMENTS = 48  # at most so many times in a round of playing
+_PAUSE = 0.08  # seconds between two of them, at least
+
+
+class Session:
+    """A browser that has connected.
+
+    Args:
+        client: viser's handle.
+        subject: What is looked at.
+        worker: Computes.
+        preset: How it is drawn at first.
+        pixels: Of a picture, at most.
+        wants: Called with the session when its layer needs what is not known yet.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        subject: Subject,
+        worker: Worker,
+        preset: str,
+        pixels: int,
+        wants: Callable[[], None],
+    ) -> None:
+        self.client, self.subject, self._worker, self._pixels, self._wants = client, subject, worker, pixels, wants
+        self._loop = asyncio.get_running_loop()
+        self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
+        self._wanted = 0
+        self._is_closed = False
+        self._is_over = False  # our picture lies there, and the Gaussians are hidden
+        self._gaussians: Any = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._playing: asyncio.Task | None = None
+        self._frusta: list[Any] = []
+        self._near = 0.0  # a camera is in a frustum within this distance
+        self.time = subject.times[0] if subject.times else None
+        self.pose, self.size = self._seen_pose()
+        self._build(preset)
+        self._send_gaussians()
+        self._show_stations()
+        self._ask_later()
+        client.camera.on_update(self._camera_moved)
+
+    # ---------------------------------------------------------------------------------------- panel
+
+    def _build(self, preset: str) -> None:
+        """What stands in the panel."""
+        gui, subject = self.client.gui, self.subject
+        self._header = gui.add_html(panel.header(subject))
+        names = [layer.name for layer in subject.layers]
+        self._layer = gui.add_dropdown("show", names, initial_value=names[0], hint=subject.layers[0].hint)
+        presets = list(dict.fromkeys([preset, *_PRESETS]))
+        self._preset = gui.add_dropdown(
+            "drawn by", presets, initial_value=preset, hint="Render settings of our picture, where the camera rests."
+        )
+        self._ours = gui.add_checkbox(
+            "our picture", True, hint="Where the camera rests; else only what the browser draws by itself."
+        )
+        self._status = gui.add_html(panel.status(""))
+        self._build_times()
+        with gui.add_folder("cameras", visible=bool(subject.stations)) as self._cameras:
+            self._are_shown = gui.add_checkbox("show", True, hint="Click on one to fly there.")
+            self._legend = gui.add_html("")
+        with gui.add_folder("view", visible=False) as self._view:
+            self._about = gui.add_html("")
+            self._photograph = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
+        for handle in (self._layer, self._preset, self._ours):
+            handle.on_update(self._choice_made)
+        self._are_shown.on_update(self._stations_toggled)
+
+    def _build_times(self) -> None:
+        """The slider and the button of what moves; neither where nothing does."""
+        gui, times = self.client.gui, self.subject.times
+        self._slider: Any = None
+        self._button: Any = None
+        if len(times) < 2:
+            return
+        step = (times[-1] - times[0]) / 1000
+        self._slider = gui.add_slider("time", times[0], times[-1], step, times[0])
+        self._button = gui.add_button("play")
+        self._slider.on_update(self._time_chosen)
+        self._button.on_click(self._play_clicked)
+
+    def show(self, subject: Subject) -> None:
+        """Look at another subject, from where the camera is."""
+        before, self.subject = self.subject, subject
+        self._header.content = panel.header(subject)
+        names = tuple(layer.name for layer in subject.layers)
+        if names != tuple(self._layer.options):
+            self._layer.options = names
+        if self.time is None and subject.times:
+            self.time = subject.times[0]
+            self._build_times()
+        elif self.time is not None and not subject.times:
+            self.time = None
+        self._hide()
+        self._send_gaussians()
+        if subject.stations is not before.stations:
+            self._show_stations()
+        self._ask_later()
+
+    def say(self, text: str, scale: ColorScale | None = None) -> None:
+        """Say in the panel what is being done, or shown. From any thread."""
+        if not self._is_closed:
+            self._status.content = panel.status(text, scale)
+
+    def redraw(self) -> None:
+        """Draw what is shown once more: something that it needs has become known."""
+        self._ask_later()
+
+    def close(self) -> None:
+        """The browser has gone."""
+        if self._timer:
+            self._timer.cancel()
+        if self._playing:
+            self._playing.cancel()
+        with self._lock:
+            self._wanted += 1
+            self._is_closed = True
+        for job in ("picture", "gaussians", "photograph"):
+            self._worker.drop((self, job))
+
+    # ------------------------------------------------------------------------------------- callbacks
+
+    async def _choice_made(self, _: Any) -> None:
+        layer = self.layer
+        self._layer.hint = layer.hint
+        self._hide()
+        self._send_gaussians()
+        self._ask_later(0.0)
+
+    async def _camera_moved(self, _: Any) -> None:
+        pose, size = self._seen_pose()
+        if pose.is_near(self.pose) and size == self.size:
+            return
+        self.pose, self.size = pose, size
+        self._show_frusta()
+        self._hide()
+        self._ask_later()
+
+    async def _time_chosen(self, _: Any) -> None:
+        assert self._slider is not None
+        if self._slider.value != self.time:
+            self.time = float(self._slider.value)
+            self._hide()
+            self._send_gaussians()
+            self._ask_later()
+
+    async def _play_clicked(self, _: Any) -> None:
+        assert self._button is not None
+        if self._playing is not None:
+            self._playing.cancel()
+            self._playing, self._button.label = None, "play"
+            self._ask_later()
+            return
+        self._button.label = "pause"
+        self._playing = asyncio.create_task(self._play())
+
+    async def _play(self) -> None:
+        """Goes through all times, again and again, as fast as the Gaussians of each can be sent."""
+        assert self._slider is not None
+        first, last = self.subject.times[0], self.subject.times[-1]
+        count = min(_MOMENTS, len(self.subject.times))
+        moments = np.linspace(first, last, max(count, 2))
+        at = int(np.searchsorted(moments, self.time or first))
+        while True:
+            at = (at + 1) % len(moments)
+            self.time = float(moments[at])
+            self._slider.value = self.time
+            self._hide()
+            self._send_gaussians()
+            await asyncio.sleep(_PAUSE)
+            while self._worker.has((self, "gaussians")):
+                await asyncio.sleep(0.02)
+
+    async def _stations_toggled(self, _: Any) -> None:
+        self._show_frusta()
+
+    # -------------------------------------------------------------------------------------- cameras
+
+    def _show_stations(self) -> None:
+        """A frustum for each place, in the color of its score."""
+        for frustum in self._frusta:
+            frustum.remove()
+        subject, self._frusta = self.subject, []
+        colors, _ = score_colors(subject.stations)
+        self._cameras.visible = bool(subject.stations)
+        self._legend.content = panel.legend(subject.stations, subject.ranking.title if subject.ranking else "")
+        eyes = np.array([station.camera.center - subject.origin for station in subject.stations]).reshape(-1, 3)
+        away = np.linalg.norm(eyes - subject.first.target, axis=1)
+        size = _FRUSTUM * (float(np.median(away)) if len(away) else 1.0) or 1.0
+        for number, (station, color) in enumerate(zip(subject.stations, colors, strict=True)):
+            pose = pose_of(station.camera, subject.origin)
+            frustum = self.client.scene.add_camera_frustum(
+                f"/cameras/{number}",
+                pose.fov,
+                pose.aspect,
+                scale=size,
+                thickness=1.5,
+                thickness_units="screen",
+                color=color,
+                wxyz=pose.wxyz,
+                position=pose.position,
+                variant="filled",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            frustum.on_click(self._clicked(station))
+            self._frusta.append(frustum)
+        self._near = 1.5 * size
+        self._show_frusta()
+
+    def _show_frusta(self) -> None:
+        """All, or none, but for those that the camera stands in: they would lie over all that it sees."""
+        for frustum in self._frusta:
+            away = float(np.linalg.norm(np.asarray(frustum.position) - self.pose.position))
+            shown = self._are_shown.value and away > self._near
+            if frustum.visible != shown:
+                frustum.visible = shown
+
+    def _clicked(self, station: Station) -> Callable[[Any], Any]:
+        """What a click on a frustum does."""
+
+        async def clicked(_: Any) -> None:
+            self.visit(station)
+
+        return clicked
+
+    def visit(self, station: Station) -> None:
+        """Fly to a place, and show what is known of it, with its photograph."""
+        sight, camera = station.at(self.time), self.client.camera
+        pose = pose_of(sight.camera, self.subject.origin)
+        with self.client.atomic():
+            camera.position = pose.position
+            camera.wxyz = pose.wxyz
+            camera.fov = looking(pose, camera.aspect)
+        self.pose, _ = self._seen_pose()  # what the browser sends back is no movement of its own
+        self._show_frusta()
+        if self._slider is not None and sight.camera.time is not None and self._playing is None:
+            self._slider.value = sight.camera.time
+        self._hide()
+        self._ask_later()
+        self._about.content = panel.photograph(station, sight)
+        self._view.visible = True
+        self._photograph.visible = False
+        if sight.photograph is not None:
+            self._worker.put((self, "photograph"), self._read_photograph(sight.photograph))
+
+    def _read_photograph(self, read: Callable[[int], np.ndarray]) -> Iterator[None]:
+        """Job: a photograph into the panel."""
+        try:
+            image = to_bytes(read(_PHOTOGRAPH))
+        except (OSError, ValueError) as error:
+            self.say(str(error))
+            return
+        self._photograph.image = image
+        self._photograph.visible = True
+        yield
+
+    # ------------------------------------------------------------------------------------- pictures
+
+    @property
+    def layer(self) -> Layer:
+        """What is shown."""
+        return self.subject.layer(self._layer.value)
+
+    def _send_gaussians(self) -> None:
+        self._worker.put((self, "gaussians"), self._gaussians_sent(self.subject, self.layer, self.time))
+
+    def _gaussians_sent(self, subject: Subject, layer: Layer, moment: float | None) -> Iterator[None]:
+        """Job: the Gaussians of a time to the client, in the colors of the layer where it has any for them."""
+        seen = subject.scene.at(moment)
+        found = ClientGaussians.of(seen, tinted(layer, seen))
+        arrays = found.centers, found.covariances, found.rgbs, found.opacities
+        with self._lock, self.client.atomic():
+            if self._is_closed:
+                return
+            if self._gaussians is None:
+                self._clear()
+                self._gaussians = self.client.scene.add_gaussian_splats(
+                    "/gaussians", *arrays, scale=found.scale, visible=not self._is_over
+                )
+            else:
+                self._gaussians.scale = found.scale
+                self._gaussians.set_gaussians(*arrays)
+        yield
+
+    def _clear(self) -> None:
+        """Nothing behind the Gaussians but the background. From any thread, with the lock."""
+        plain = np.broadcast_to(to_bytes(np.array(self.subject.background, np.float32)), (2, 2, 3))
+        self.client.scene.set_background_image(np.ascontiguousarray(plain), format="png")
+
+    def _hide(self) -> None:
+        """Take our picture away: it is not what is looked at any more."""
+        if self._timer:
+            self._timer.cancel()
+        self._worker.drop((self, "picture"))
+        with self._lock:
+            self._wanted += 1
+            if self._is_over:
+                self._is_over = False
+                with self.client.atomic():
+                    self._clear()
+                    if self._gaussians is not None:
+                        self._gaussians.visible = True
+
+    def _ask_later(self, seconds: float = REST) -> None:
+        """Have our picture drawn if nothing happens for some time."""
+        if self._timer:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(seconds, self._ask)
+
+    def _ask(self) -> None:
+        """Have our picture drawn."""
+        if self._playing is not None:
+            return
+        if not self._ours.value:
+            self.say("")
+            return
+        uncertainty = self.subject.uncertainty
+        if self.layer.name == INFORMATION and uncertainty is not None and not uncertainty.is_known:
+            self._wants()
+            return
+        with self._lock:
+            self._wanted += 1
+            wanted = self._wanted
+        self._worker.put((self, "picture"), self._picture(wanted, self.subject, self.layer, self._preset.value))
+
+    def _picture(self, wanted: int, subject: Subject, layer: Layer, preset: str) -> Iterator[None]:
+        """Job: pictures of what the camera sees, each larger than the one before."""
+        began, settings = time.perf_counter(), subject.settings(preset)
+        width, height = self.size
+        whole = camera_of(self.pose, width, height, subject.origin, self.time)
+        for camera in stages(whole, min(self._pixels, layer.pixels or self._pixels)):
+            self.say(f"{layer.name}, {preset}: drawing {camera.width}x{camera.height} ...")
+            drawing = yield from layer.draw(subject.scene, camera, settings)
+            with self._lock:
+                if wanted != self._wanted:
+                    return
+                self._is_over = True
+                with self.client.atomic():
+                    self.client.scene.set_background_image(drawing.picture, format="png")
+                    if self._gaussians is not None:
+                        self._gaussians.visible = False
+            took = time.perf_counter() - began
+            self.say(f"{layer.name}, {preset}: {camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
+            yield
+
+    def _seen_pose(self) -> tuple[Pose, tuple[int, int]]:
+        """Where the client's camera is, and the pixels of its window."""
+        camera = self.client.camera
+        width, height = max(1, int(camera.image_width)), max(1, int(camera.image_height))
+        fov = float(camera.fov) if math.isfinite(camera.fov) and camera.fov > 0 else 1.0
+        return Pose(np.array(camera.wxyz), np.array(camera.position), fov, width / height), (width, height)

@@ -1,0 +1,61 @@
+"""Gaussians as the client takes them: centers, covariances in half floats, colors and opacities of 8 bits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from drgs.ellipsoids import Y_00, Gaussians, semi_axes
+
+__all__ = ["ClientGaussians"]
+
+_LARGE = 64.0  # units of the client's lengths that the larger Gaussians have as their standard deviation
+_QUANTILE = 0.999  # which Gaussians those are
+_MOST = 60_000.0  # of a covariance's entry: half floats end at 65,504
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ClientGaussians:
+    """What viser's `add_gaussian_splats` takes.
+
+    The client keeps covariances as half floats, from 6e-5 to 65,504 with all their digits: lengths are therefore
+    multiplied so that a Gaussian of nearly the largest has a standard deviation of 64, and all down to 1/8000 of that
+    are drawn as they are.
+
+    Attributes:
+        centers: (N, 3) float32.
+        covariances: (N, 3, 3) float32.
+        rgbs: (N, 3) uint8.
+        opacities: (N, 1) float32.
+        scale: The client divides by it what lengths were multiplied by: 1 / factor.
+    """
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    rgbs: np.ndarray
+    opacities: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, g: Gaussians, rgbs: np.ndarray | None = None) -> ClientGaussians:
+        """Gaussians relative to their origin.
+
+        Args:
+            g: At one time.
+            rgbs: (N, 3) uint8; None: their color of degree 0, which is the mean over all directions.
+        """
+        with torch.no_grad():  # to be looked at
+            axes = semi_axes(g.quats.float(), g.scales.float())
+            sizes = g.scales.float().amax(1).cpu().numpy()
+            large = float(np.quantile(sizes, _QUANTILE)) if len(sizes) else 1.0
+            factor = _LARGE / large if 0 < large < np.inf else 1.0
+            axes = axes * factor
+            covariances = (axes @ axes.transpose(1, 2)).clamp(-_MOST, _MOST).cpu().numpy()
+            if rgbs is None:
+                color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)
+                rgbs = (255 * color).round().to(torch.uint8).cpu().numpy()
+            centers = (g.means.double() * factor).float().cpu().numpy()
+            opacities = g.opacities.float()[:, None].cpu().numpy()
+        return cls(centers, covariances, rgbs, opacities, 1.0 / factor)

@@ -1,0 +1,228 @@
+"""Where photographs were taken, or could be, and what a selection says of each."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.data.camera_lists import camera_described
+from drgs.guards.json_files import check_json, read_json
+
+if TYPE_CHECKING:
+    from drgs.data import View
+
+__all__ = ["Ranking", "Score", "Sight", "Station", "read_ranking", "scale_colors", "score_colors", "stations_of"]
+
+Kind = Literal["training", "held out", "candidate"]
+
+_ADVICE = "name what drgs select or an active fit has written"
+_SCORED = {"name": str, "score": (None, float), "parts": (None, dict)}
+_TRAINING = (66, 135, 245)
+_PLAIN = (150, 150, 150)
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """What a view was found to be worth.
+
+    Attributes:
+        total: The score.
+        parts: Group of parameters -> its part of it.
+        rank: From 1, of the views that were scored with it.
+        of: How many these were.
+    """
+
+    total: float
+    parts: dict[str, float]
+    rank: int
+    of: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranking:
+    """A selection: views with scores, and which of them were picked.
+
+    Attributes:
+        title: By what they were scored.
+        scores: Name -> score.
+        picked: Names, the first pick first.
+        cameras: Of candidates, where the file has them: they may be of no data set.
+    """
+
+    title: str
+    scores: dict[str, Score]
+    picked: tuple[str, ...]
+    cameras: tuple[Camera, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sight:
+    """What was seen from a place at one time.
+
+    Attributes:
+        camera: With the view's name and time, undistorted.
+        photograph: Reads it, at most so many pixels wide: (H, W, 3) float in [0, 1]; None: there is none.
+        score: None where it has none.
+        pick: Its number among the picks, from 1; None: not picked.
+    """
+
+    camera: Camera
+    photograph: Callable[[int], np.ndarray] | None = None
+    score: Score | None = None
+    pick: int | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Station:
+    """A place where a camera stands, with a lens: of synchronous cameras there is one for all times.
+
+    Attributes:
+        kind: `training` if one of its views was fitted to.
+        sights: In the order of their times; at least one.
+    """
+
+    kind: Kind
+    sights: tuple[Sight, ...]
+
+    @property
+    def camera(self) -> Camera:
+        """Of its first sight."""
+        return self.sights[0].camera
+
+    @property
+    def best(self) -> Sight:
+        """The sight with the highest score; the first one where none has any."""
+        return max(self.sights, key=lambda sight: -np.inf if sight.score is None else sight.score.total)
+
+    def at(self, time: float | None) -> Sight:
+        """The sight nearest to a time; the best one where nothing has a time."""
+        timed = [sight for sight in self.sights if sight.camera.time is not None]
+        if time is None or not timed:
+            return self.best
+        return min(timed, key=lambda sight: abs((sight.camera.time or 0.0) - time))
+
+
+def stations_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranking | None) -> tuple[Station, ...]:
+    """The places of a data set's views, and of the candidates that a ranking states cameras of.
+
+    Args:
+        views: Of the data set, without their images.
+        fitted: Names of those that were fitted to.
+        ranking: Scores of some of them.
+    """
+    known, scores = set(fitted), {} if ranking is None else ranking.scores
+    picks = {} if ranking is None else {name: k for k, name in enumerate(ranking.picked, 1)}
+    found: dict[tuple, list[tuple[Kind, Sight]]] = {}
+
+    def add(kind: Kind, sight: Sight) -> None:
+        camera = sight.camera
+        found.setdefault((camera.K.tobytes(), np.asarray(camera.w2c).tobytes()), []).append((kind, sight))
+
+    for view in views:
+        score, name = scores.get(view.name), view.name
+        kind: Kind = "training" if name in known else "candidate" if score else "held out"
+        camera = dataclasses.replace(view.camera.undistorted(), name=name)
+        add(kind, Sight(camera, _reader(view) if view.has_image else None, score, picks.get(name)))
+    there = {view.name for view in views}
+    for camera in ranking.cameras if ranking else ():
+        if camera.name not in there:
+            add("candidate", Sight(camera.undistorted(), None, scores.get(camera.name), picks.get(camera.name)))
+    made = []
+    for sights in found.values():
+        kinds = {kind for kind, _ in sights}
+        kind = next(kind for kind in ("training", "candidate", "held out") if kind in kinds)
+        ordered = sorted((sight for _, sight in sights), key=lambda sight: sight.camera.time or 0.0)
+        made.append(Station(kind, tuple(ordered)))
+    return tuple(made)
+
+
+def read_ranking(path: Path) -> Ranking:
+    """What `drgs select` has written, or an active fit so far: its last pick and those before.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is damaged, or of something else.
+    """
+    found, where = read_json(path, "a selection", _ADVICE), str(path)
+    check_json(where, found, {"picks": [{"name": str}]}, _ADVICE)
+    if found.get("command") == "select":
+        check_json(where, found, {"policy": str, "criterion": (None, str), "candidates": [_SCORED]}, _ADVICE)
+        rows, criterion, policy = found["candidates"], found["criterion"], found["policy"]
+    else:
+        check_json(
+            where, found, {"picks": [{"policy": str, "criterion": (None, str), "candidates": [_SCORED]}]}, _ADVICE
+        )
+        last = found["picks"][-1] if found["picks"] else {"candidates": [], "criterion": None, "policy": ""}
+        rows, criterion, policy = last["candidates"], last["criterion"], last["policy"]
+    cameras = [
+        dataclasses.replace(camera_described(f"{where}: {row['name']}", row["camera"]), name=row["name"])
+        for row in rows
+        if "camera" in row
+    ]
+    return Ranking(
+        f"{policy}, {criterion}" if criterion else policy,
+        _scores(where, rows),
+        tuple(pick["name"] for pick in found["picks"]),
+        tuple(cameras),
+    )
+
+
+def score_colors(stations: Sequence[Station]) -> tuple[list[tuple[int, int, int]], tuple[float, float] | None]:
+    """A color for each place, and the scores at the ends of their scale; None where no candidate has one.
+
+    Places of photographs that were fitted to are blue, those without a score gray.
+    """
+    totals = [station.best.score.total for station in stations if station.kind == "candidate" and station.best.score]
+    if not totals:
+        return [_TRAINING if station.kind == "training" else _PLAIN for station in stations], None
+    low, high = min(totals), max(totals)
+    colors = []
+    for station in stations:
+        if station.kind == "candidate" and station.best.score:
+            share = (station.best.score.total - low) / (high - low) if high > low else 1.0
+            colors.append(_on_scale(share))
+        else:
+            colors.append(_TRAINING if station.kind == "training" else _PLAIN)
+    return colors, (low, high)
+
+
+def scale_colors(count: int) -> list[tuple[int, int, int]]:
+    """Colors of the scale of scores, evenly from the lowest to the highest; at least two."""
+    return [_on_scale(k / (count - 1)) for k in range(count)]
+
+
+def _on_scale(share: float) -> tuple[int, int, int]:
+    """The color of a place on the scale, 0 to 1."""
+    import cv2
+
+    red, green, blue = cv2.applyColorMap(np.array([[round(255 * share)]], np.uint8), cv2.COLORMAP_PLASMA)[0, 0, ::-1]
+    return int(red), int(green), int(blue)
+
+
+def _scores(where: str, rows: list[dict[str, Any]]) -> dict[str, Score]:
+    """Name -> score, with its rank, of the rows that have one."""
+    scored = [row for row in rows if row["score"] is not None]
+    ordered = sorted(scored, key=lambda row: -row["score"])
+    made: dict[str, Score] = {}
+    for rank, row in enumerate(ordered, 1):
+        parts = row["parts"] or {}
+        check_json(f"{where}: {row['name']}: parts", list(parts.values()), [float], _ADVICE)
+        check_json(f"{where}: {row['name']}: parts", list(parts), [str], _ADVICE)
+        made.setdefault(row["name"], Score(float(row["score"]), parts, rank, len(ordered)))
+    return made
+
+
+def _reader(view: View) -> Callable[[int], np.ndarray]:
+    """Reads a view's photograph, reduced; the file is opened at the first call."""
+
+    def read(width: int) -> np.ndarray:
+        seen = view.checked()
+        scale = min(1.0, width / seen.camera.width)
+        return seen.image(max(1, round(seen.camera.width * scale)), max(1, round(seen.camera.height * scale)))
+
+    return read

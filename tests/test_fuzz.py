@@ -1,0 +1,98 @@
+"""Readers under damaged files: a few hundred of the millions of inputs that benchmarks/fuzz.py reads, every time."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from random import Random
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+
+from fuzz_formats import mutate
+from fuzz_targets import TARGETS, Bench, fault_of
+from test_report import active  # noqa: F401 (a fixture)
+
+EXAMPLES = {"videos": 25, "masks, depths, labels": 60, "COLMAP text": 100, "COLMAP binary": 100}
+"""Of readers that take more than a few milliseconds; of others 200."""
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A reader's files, made once."""
+    made: dict[str, Bench] = {}
+
+    def of(name: str, seeds: list[Path] | None = None) -> Bench:
+        if name not in made:
+            made[name] = Bench(TARGETS[name], tmp_path_factory.mktemp("fuzz"), seeds)
+            made[name].check()
+        return made[name]
+
+    return of
+
+
+def hold(bench: Bench, examples: int) -> None:
+    """Whatever is damaged, a reader returns or raises one line that names the file."""
+
+    @settings(max_examples=examples, derandomize=True, deadline=None, database=None, suppress_health_check=HealthCheck)
+    @given(number=st.integers(0, 2**31))
+    def check(number):
+        folder, path, _ = bench.place(number)
+        _, fault, error = bench.read(folder)
+        assert fault is None, f"input {number}, {path.name}: {fault}: {error!r}"
+
+    check()
+
+
+@pytest.mark.parametrize("name", [name for name in TARGETS if name != "run folders"])
+def test_a_reader_under_damage(bench, name, caplog):
+    """Every reader, on files that are damaged by bytes and by what their format is made of."""
+    hold(bench(name), EXAMPLES.get(name, 200))
+
+
+def test_run_folders_under_damage(bench, active, caplog):  # noqa: F811
+    """The same of a run folder, of a fit in which views were chosen."""
+    hold(bench("run folders", [active]), 150)
+
+
+@given(
+    data=st.binary(max_size=200), number=st.integers(0, 2**31), suffix=st.sampled_from(["", ".json", ".png", ".npz"])
+)
+@settings(max_examples=300, derandomize=True, deadline=None, database=None)
+def test_damage_is_known_by_its_number(data, number, suffix):
+    """The same number damages the same file in the same way, whatever is in it."""
+    first, second = (mutate(data, suffix, Random(number), [data]) for _ in range(2))
+    assert first == second
+
+
+def test_inputs_are_damaged_and_then_restored(bench):
+    """Nearly every input differs from the valid file, and no two files are damaged at once."""
+    it = bench("COLMAP text")
+    differ = 0
+    for number in range(50):
+        folder, path, data = it.place(number)
+        held = {p: d for _, p, d in it._files}
+        differ += data != held[path]
+        assert path.read_bytes() == data
+        assert all(p.read_bytes() == held[p] for p in held if p != path)
+    assert differ >= 45
+
+
+@pytest.mark.parametrize(
+    ("error", "fault"),
+    [
+        (ValueError("/d/a.ply: must be a PLY, got none; copy it"), None),
+        (FileNotFoundError("/d/a.ply: must be there; copy it"), None),
+        (KeyError("/d/a.ply"), "KeyError instead of ValueError"),
+        (UnicodeDecodeError("utf-8", b"/d", 0, 1, "x"), "UnicodeDecodeError instead of ValueError"),
+        (MemoryError(), "MemoryError instead of ValueError"),
+        (ValueError("/d/a.ply: must\nbe"), "a message that is not one line"),
+        (ValueError("must be a PLY"), "a message that does not name the file"),
+    ],
+)
+def test_what_counts_as_a_fault(error, fault):
+    """One line that names the file, of the few kinds that commands answer with exit code 2."""
+    assert fault_of(error, Path("/d")) == fault

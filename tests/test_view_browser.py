@@ -1,0 +1,252 @@
+"""Claims of `drgs view` in a real browser: it draws, its picture and ours agree, and its controls do what they say."""
+
+from __future__ import annotations
+
+import dataclasses
+import http.server
+import shutil
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="no viser: pip install 'drgs[view]'")
+pytest.importorskip("playwright", reason="no playwright: pip install playwright")
+
+from playwright import sync_api
+from test_select_command import place  # noqa: F401 (a data set, and a run that chose its views)
+from test_view import EVIL, blobs, subject
+
+from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.commands import view
+from drgs.commands.given import Given
+from drgs.commands.options import View
+from drgs.commands.viewed import subject_of, watched_files
+from drgs.files import load_state, save_state
+from drgs.viewing.poses import camera_of, pose_of
+from drgs.viewing.server import Viewer
+from drgs.viewing.subject import FirstView
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+WIDTH, HEIGHT = 640, 480
+PATIENCE = 120_000  # ms; the machine may be busy, and draws WebGL by software
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no chromium on this machine")
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    with sync_api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def shown(browser):
+    """Opens viewers in pages, and ends both."""
+    opened = []
+
+    def open_one(looked, **options):
+        viewer = Viewer(looked, **{"preset": "fast", "pixels": 60_000} | options)
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.set_default_timeout(PATIENCE)
+        opened.append((viewer, page))
+        page.errors = []
+        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        page.goto(viewer.address)
+        rests(page)
+        return viewer, page
+
+    yield open_one
+    for viewer, page in opened:
+        page.close()
+        assert viewer.stop(60.0)
+        assert not page.errors
+
+
+def text(page, name: str) -> str:
+    return page.evaluate(f"(document.getElementById('drgs-{name}') || {{}}).innerText || ''")
+
+
+def rests(page, layer: str = "rgb", but: str = "") -> str:
+    """Wait until our picture of a layer is drawn whole, and the status is another one than it was."""
+    end = time.monotonic() + PATIENCE / 1000
+    while time.monotonic() < end:
+        said = text(page, "status")
+        if said.startswith(f"{layer}, ") and " in " in said and said != but:
+            page.wait_for_timeout(400)  # the browser decodes the picture
+            return said
+        page.wait_for_timeout(100)
+    raise AssertionError(f"never drawn: {text(page, 'status')!r}")
+
+
+def picture(page) -> np.ndarray:
+    """(H, W, 3) RGB of the page, with what lies over the scene (panel, a word about WebGL) in black."""
+    image = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+    image[:240] = 0
+    image[:, 320:] = 0
+    return image
+
+
+def bright(page) -> np.ndarray:
+    """(x, y) of the middle of what is green."""
+    image = picture(page)
+    weight = np.clip(image[..., 1] - image[..., 0] - 40, 0, None)
+    assert weight.max() > 60, "nothing green is seen"
+    rows, columns = np.indices(weight.shape) + 0.5
+    return np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+
+
+def choose(page, before: str, after: str) -> None:
+    page.locator(f'input[value="{before}"]').locator("visible=true").first.click()
+    page.get_by_role("option", name=after, exact=True).locator("visible=true").first.click()
+
+
+def test_the_browser_and_we_draw_the_same(shown):
+    """A Gaussian off the middle is where its projection says in the browser's picture and in ours, to a pixel: so both
+    have the same cameras. Another layer is another picture. A scene named like a program is a name."""
+    sh = torch.tensor([[[-1.7, 1.7, -1.7]]])
+    g = blobs(torch.tensor([[-0.55, 0.45, 0.2]]), sh=sh, scales=torch.full((1, 3), 0.06))
+    looked = subject(torch.zeros(1, 3), scene=g, name=EVIL)
+    _, page = shown(looked)
+    where = camera_of(looked.first.pose, WIDTH, HEIGHT, np.zeros(3)).project(g.means.numpy())[0][0]
+    assert 40 < where[0] < 280
+    assert 280 < where[1] < 440
+    np.testing.assert_allclose(bright(page), where, atol=1.0)
+    ours = picture(page)
+    said = rests(page)
+    page.locator('input[type="checkbox"]').locator("visible=true").first.click()  # our picture
+    page.wait_for_function("document.getElementById('drgs-status').innerText.trim() === ''")
+    page.wait_for_timeout(1500)
+    theirs = picture(page)
+    np.testing.assert_allclose(bright(page), where, atol=1.0)
+    assert not np.array_equal(ours, theirs)
+    page.locator('input[type="checkbox"]').locator("visible=true").first.click()
+    rests(page, but=said)
+    choose(page, "rgb", "missing")
+    rests(page, "missing")
+    assert np.abs(picture(page) - ours).mean() > 20
+    assert page.evaluate("document.getElementById('drgs-header').querySelectorAll('script, img').length") == 0
+    assert EVIL in text(page, "header")
+
+
+def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
+    """A click on a frustum flies there and opens what is known of it; a checkpoint that a fit writes meanwhile is
+    noticed and shown, with its step."""
+    args = View(scene=place / "run", preset="fast")
+    looked = subject_of(args, Given.of(args))
+    station = next(station for station in looked.stations if station.kind == "candidate")
+    tip, middle = station.camera.center, looked.first.target
+    body = tip + station.camera.c2w[:3, :3] @ np.array([0.0, 0.0, 0.1])
+    # From behind it, so that it is at the left and below, where neither the panel nor a word about WebGL is.
+    eye = middle + 1.5 * (tip - middle)
+    behind = Camera(K=intrinsics_from_fov(60, 4, 3), w2c=look_at(eye, tip, looked.first.up), width=4, height=3)
+    right, down, forward = behind.c2w[:3, :3].T
+    target = eye + 2 * (forward + 0.25 * right - 0.2 * down)
+    behind = dataclasses.replace(behind, w2c=look_at(eye, target, looked.first.up))
+    looked = dataclasses.replace(looked, first=FirstView(pose_of(behind, looked.origin), target, looked.first.up))
+    viewer, page = shown(looked)
+    first = picture(page)
+    where = camera_of(looked.first.pose, WIDTH, HEIGHT, looked.origin).project(body[None])[0][0]
+    assert 20 < where[0] < 300
+    assert 240 < where[1] < 460
+    said = text(page, "status")
+    page.mouse.click(*where)
+    page.wait_for_function("(document.getElementById('drgs-photograph') || {}).innerText")
+    shown_text = text(page, "photograph")
+    assert shown_text.startswith(station.camera.name)
+    assert f"rank {station.best.score.rank} of {station.best.score.of}" in shown_text
+    np.testing.assert_allclose(next(iter(viewer.sessions.values())).pose.position, tip, atol=1e-3)
+    page.wait_for_function("[...document.images].some(image => image.naturalWidth === 24)")  # the photograph
+    rests(page, but=said)
+    assert np.abs(picture(page) - first).max() > 20
+    # a fit goes on
+    stamps = view._stamps(watched_files(args))
+    stop = threading.Event()
+
+    def watch():
+        while not stop.wait(0.5):
+            if view._stamps(watched_files(args)) != stamps:
+                viewer.worker.put("files", view._reading(args, viewer))
+                return
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    state = place / "run/state.safetensors"
+    tensors, header = load_state(state)
+    save_state(state, tensors, header | {"step": 1234})
+    try:
+        page.wait_for_function("document.getElementById('drgs-header').innerText.includes('step 1,234')")
+    finally:
+        stop.set()
+        thread.join()
+        save_state(state, tensors, header)
+
+
+def test_the_slider_moves_the_scene(shown):
+    """By keys and by playing: what moves is elsewhere in the picture."""
+
+    class Moving:
+        def at(self, moment):
+            sh = torch.tensor([[[-1.7, 1.7, -1.7]]])
+            means = torch.tensor([[-0.75 + 0.4 * float(moment), 0.45, 0.2]])
+            return blobs(means, sh=sh, scales=torch.full((1, 3), 0.06))
+
+        def parameters(self):
+            return {}
+
+    looked = subject(torch.zeros(1, 3), scene=Moving(), times=(0.0, 0.5, 1.0))
+    viewer, page = shown(looked)
+    left = bright(page)[0]
+    slider = page.get_by_role("slider").first
+    slider.focus()
+    said = text(page, "status")
+    page.keyboard.press("End")
+    page.wait_for_timeout(600)
+    rests(page, but=said)
+    session = next(iter(viewer.sessions.values()))
+    assert session.time == pytest.approx(1.0, abs=0.01)
+    assert bright(page)[0] > left + 30
+    page.get_by_role("button", name="play").click()
+    seen = set()
+    end = time.monotonic() + PATIENCE / 1000
+    while len(seen) < 3 and time.monotonic() < end:
+        seen.add(round(session.time, 2))
+        page.wait_for_timeout(50)
+    assert seen == {0.0, 0.5, 1.0}
+    page.get_by_role("button", name="pause").click()
+    rests(page)
+
+
+def test_a_page_of_another_site_cannot_listen(browser, shown, tmp_path):
+    """A page that another port of this machine serves does not get the viewer's socket."""
+    viewer, _ = shown(subject(torch.zeros(1, 3)))
+    (tmp_path / "index.html").write_text("<p>another site</p>")
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def __init__(self, *args, **options):
+            super().__init__(*args, directory=str(tmp_path), **options)
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{other.server_address[1]}/index.html")
+        outcome = page.evaluate(
+            """port => new Promise(done => {
+                const socket = new WebSocket(`ws://127.0.0.1:${port}/`, "viser-v1.1.1");
+                socket.onopen = () => done("open");
+                socket.onerror = () => done("refused");
+            })""",
+            viewer.port,
+        )
+        page.close()
+        other.shutdown()
+    assert outcome == "refused"

@@ -1,0 +1,198 @@
+"""Claims of drgs.viewing.gate: who may talk to the viewer, by requests as they come over the wire."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="no viser: pip install 'drgs[view]'")
+
+from test_view import subject
+from viewing_client import PROTOCOL, Client
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from drgs.viewing.gate import Gate, bound_socket, guarded, is_loopback
+from drgs.viewing.server import Viewer
+
+TOKEN = "a-token-of-the-test"
+
+
+@pytest.fixture(scope="module")
+def open_viewer():
+    viewer = Viewer(subject(torch.zeros(1, 3)))
+    yield viewer
+    assert viewer.stop(20.0)
+
+
+@pytest.fixture(scope="module")
+def closed_viewer():
+    viewer = Viewer(subject(torch.zeros(1, 3)), token=TOKEN)
+    yield viewer
+    assert viewer.stop(20.0)
+
+
+def get(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    response = connection.getresponse()
+    response.body = response.read()
+    connection.close()
+    return response
+
+
+def joined(port: int, path: str = "/", **options) -> int:
+    """The status that a WebSocket handshake ends with."""
+    try:
+        with connect(f"ws://127.0.0.1:{port}{path}", subprotocols=[PROTOCOL], **options):
+            return 101
+    except InvalidStatus as error:
+        return error.response.status_code
+
+
+def test_a_page_of_this_machine_is_served(open_viewer):
+    """By any name of this machine and any port, which a tunnel may have changed; nobody may frame it."""
+    for host in (f"127.0.0.1:{open_viewer.port}", "localhost:9999", "localhost", "[::1]:80", "127.1.2.3"):
+        answer = get(open_viewer.port, Host=host)
+        assert (answer.status, b"<html" in answer.body.lower()) == (200, True), host
+        assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+        assert f"ws://{host} " in answer.headers["Content-Security-Policy"]
+        assert answer.headers["Referrer-Policy"] == "no-referrer"
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "localhost.evil.example", "192.168.0.7:8080", "127.0.0.1.evil.example"]
+)
+def test_another_name_of_this_machine_is_refused(open_viewer, host):
+    """A site whose name resolves to this machine (DNS rebinding) gets neither a page nor a socket."""
+    answer = get(open_viewer.port, Host=host)
+    assert (answer.status, b"<html" in answer.body.lower()) == (403, False)
+    assert b"drgs view: this viewer is for this machine only" in answer.body
+    raw = f"GET / HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    raw += "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+    with socket.create_connection(("127.0.0.1", open_viewer.port), 20) as wire:
+        wire.sendall(f"{raw}Sec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode())
+        assert wire.recv(64).startswith(b"HTTP/1.1 403 ")
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "https://localhost.evil.example", "http://127.0.0.1:1", "file://", "x"]
+)
+def test_pages_of_other_sites_get_no_socket(open_viewer, origin):
+    """A browser says which page opens a socket; only the viewer's own may. Port 1 of this machine is another site."""
+    assert joined(open_viewer.port, origin=origin) == 403
+
+
+def test_the_own_page_and_programs_get_a_socket(open_viewer):
+    """The page's origin is the host that it asks; programs state none."""
+    assert joined(open_viewer.port, origin=f"http://127.0.0.1:{open_viewer.port}") == 101
+    assert joined(open_viewer.port) == 101
+
+
+def test_requests_with_no_or_several_hosts_are_refused(open_viewer):
+    """What a proxy and the viewer could read differently is not answered."""
+    for hosts in (
+        "",
+        "Host: a\r\nHost: localhost\r\n",
+        "Host: localhost/../x\r\n",
+        "Host: localhost\r\nOrigin: a\r\nOrigin: b\r\n",
+    ):
+        with socket.create_connection(("127.0.0.1", open_viewer.port), 20) as wire:
+            wire.sendall(f"GET / HTTP/1.1\r\n{hosts}\r\n".encode())
+            assert wire.recv(64).startswith(b"HTTP/1.1 400 "), hosts
+
+
+@pytest.mark.parametrize(
+    "query", ["?websocket=ws://evil.example", "?a=1&playbackPath=https://evil.example/x", "?websocket"]
+)
+def test_links_that_lead_the_page_away_are_refused(open_viewer, closed_viewer, query):
+    """viser's page would connect to any server that its address names, and show what that says as ours."""
+    assert get(open_viewer.port, f"/{query}").status == 403
+    cookie = f"{closed_viewer.gate.cookie}={TOKEN}"
+    assert get(closed_viewer.port, f"/{query}", Cookie=cookie).status == 403
+
+
+def test_without_the_token_nothing_is_answered(closed_viewer):
+    """Neither the page nor a socket; a wrong token, a prefix of it or another port's cookie is none."""
+    port = closed_viewer.port
+    wrong = [{}, {"Cookie": f"{closed_viewer.gate.cookie}={TOKEN[:-1]}"}, {"Cookie": f"drgs_view_1={TOKEN}"}]
+    for headers in wrong:
+        assert get(port, **headers).status == 403
+        assert joined(port, additional_headers=headers) == 403
+    for query in ("?token=", "?token=wrong", f"?token={TOKEN[:-1]}", f"?Token={TOKEN}"):
+        assert get(port, f"/{query}").status == 403
+        assert joined(port, f"/{query}") == 403
+    assert b"?token=" in get(port).body
+    assert TOKEN.encode() not in get(port).body
+
+
+def test_the_token_becomes_a_cookie(closed_viewer):
+    """The address with the token leads to one without; the cookie that comes with it opens page and socket, of any
+    host name, but for pages of other sites."""
+    port = closed_viewer.port
+    moved = get(port, f"/?token={TOKEN}", Host="some.machine:8080")
+    assert (moved.status, moved.headers["Location"], moved.body) == (303, "/", b"")
+    cookie = moved.headers["Set-Cookie"]
+    assert {"HttpOnly", "SameSite=Lax"} <= {part.strip() for part in cookie.split(";")}
+    known = {"Cookie": f"other=1; {cookie.split(';')[0]}"}
+    assert get(port, Host="some.machine:8080", **known).status == 200
+    assert joined(port, additional_headers=known, origin=f"http://127.0.0.1:{port}") == 101
+    assert joined(port, additional_headers=known, origin="http://evil.example") == 403
+    assert joined(port, f"/?token={TOKEN}") == 101
+
+
+def test_a_viewer_for_others_asks_for_a_token(monkeypatch):
+    """Where it listens to more than this machine, a token of 24 random bytes is made up, and printed in the address."""
+    for host in ("0.0.0.0", "::", "192.168.1.2", "some.machine", ""):
+        gate = Gate.of(host, 8080, None)
+        assert len(gate.token) >= 32, host
+        assert gate.address(host, 8080).endswith(f":8080/?token={gate.token}")
+        assert gate.token not in repr(gate)
+    assert Gate.of("0.0.0.0", 1, None).token != Gate.of("0.0.0.0", 1, None).token
+    for host in ("127.0.0.1", "localhost", "::1", "127.3.4.5"):
+        assert is_loopback(host)
+        assert Gate.of(host, 8080, None).token is None
+    assert Gate.of("127.0.0.1", 8080, TOKEN).address("127.0.0.1", 8080) == f"http://127.0.0.1:8080/?token={TOKEN}"
+    for token in ("short", "a b c d e f g", "&&&&&&&&&&", "x" * 201, "ü" * 10):
+        with pytest.raises(ValueError, match="--token must be 8 to 200"):
+            Gate.of("127.0.0.1", 8080, token)
+
+
+def test_a_socket_that_cannot_be_had():
+    """A port that is taken, and no address of this machine: one line each."""
+    told = r"--host 127.0.0.1 --port \d+ must be .*in use.*; choose another port"
+    with bound_socket("127.0.0.1", 0) as taken, pytest.raises(ValueError, match=told):
+        bound_socket("127.0.0.1", taken.getsockname()[1])
+    with pytest.raises(ValueError, match="--host 198.51.100.1 --port 0 must be an address of this machine"):
+        bound_socket("198.51.100.1", 0)
+    with pytest.raises(ValueError, match=r"--port must be in \[0, 65535\], got 70000"):
+        bound_socket("127.0.0.1", 70000)
+
+
+def test_no_tunnel_is_opened(open_viewer):
+    """viser offers to make a scene public by a tunnel; who asks for that gets none."""
+    with Client(open_viewer.port) as client:
+        client.look((1, 0, 0, 0), (0, 0, -3))
+        client.wait(lambda m: m["type"] == "GuiHtmlMessage")
+        client.send(type="ShareUrlRequest")
+        client.look((1, 0, 0, 0), (0, 0, -4))
+        client.picture()
+    assert open_viewer._server._share_tunnel is None
+    assert not {m["type"] for m in client.heard} & {"ShareUrlUpdated"}
+
+
+def test_a_server_that_goes_another_way_is_noticed():
+    """Were viser to start its server by other means, the gate would say so instead of standing beside it."""
+    gate = Gate.of("127.0.0.1", 1, None)
+    with (
+        bound_socket("127.0.0.1", 0) as listening,
+        pytest.raises(RuntimeError, match="has not"),
+        guarded(gate, listening),
+    ):
+        pass
