@@ -602,7 +602,7 @@ def test_view_ends_by_ctrl_c(place):  # noqa: F811
         assert process.returncode == 130
         assert error.splitlines()[-1] == "drgs view: interrupted"
         assert "Traceback" not in error
-        assert time.monotonic() - began < 15
+        assert time.monotonic() - began < 60  # 1 to 2 s where the machine is free
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from drgs.commands.viewed import subject_of, watched_files
 from drgs.files import load_state, save_state
 from drgs.viewing.poses import camera_of, pose_of
 from drgs.viewing.server import Viewer
+from drgs.viewing.session import REST
 from drgs.viewing.subject import FirstView
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -59,7 +60,7 @@ def shown(browser):
         page.errors = []
         page.on("pageerror", lambda error: page.errors.append(str(error)))
         page.goto(viewer.address)
-        rests(page)
+        rests(page, viewer)
         return viewer, page
 
     yield open_one
@@ -73,15 +74,21 @@ def text(page, name: str) -> str:
     return page.evaluate(f"(document.getElementById('drgs-{name}') || {{}}).innerText || ''")
 
 
-def rests(page, layer: str = "rgb", but: str = "") -> str:
-    """Wait until our picture of a layer is drawn whole, and the status is another one than it was."""
+def session_of(viewer):
+    """Of the only page."""
+    (found,) = viewer.sessions.values()
+    return found
+
+
+def rests(page, viewer, more_than: int = 0) -> int:
+    """Wait until more than so many of our pictures are drawn to the end, and nothing is left to draw; how many are."""
     end = time.monotonic() + PATIENCE / 1000
     while time.monotonic() < end:
-        said = text(page, "status")
-        if said.startswith(f"{layer}, ") and " in " in said and said != but:
-            page.wait_for_timeout(400)  # the browser decodes the picture
-            return said
-        page.wait_for_timeout(100)
+        page.wait_for_timeout(REST * 1000 + 300)  # what was just done begins to be drawn; the browser decodes
+        session = next(iter(viewer.sessions.values()), None)
+        if session and session.drawn > more_than and not viewer.worker.has((session, "picture")):
+            page.wait_for_timeout(400)
+            return session.drawn
     raise AssertionError(f"never drawn: {text(page, 'status')!r}")
 
 
@@ -113,13 +120,13 @@ def test_the_browser_and_we_draw_the_same(shown):
     sh = torch.tensor([[[-1.7, 1.7, -1.7]]])
     g = blobs(torch.tensor([[-0.55, 0.45, 0.2]]), sh=sh, scales=torch.full((1, 3), 0.06))
     looked = subject(torch.zeros(1, 3), scene=g, name=EVIL)
-    _, page = shown(looked)
+    viewer, page = shown(looked)
     where = camera_of(looked.first.pose, WIDTH, HEIGHT, np.zeros(3)).project(g.means.numpy())[0][0]
     assert 40 < where[0] < 280
     assert 280 < where[1] < 440
     np.testing.assert_allclose(bright(page), where, atol=1.0)
     ours = picture(page)
-    said = rests(page)
+    count = session_of(viewer).drawn
     page.locator('input[type="checkbox"]').locator("visible=true").first.click()  # our picture
     page.wait_for_function("document.getElementById('drgs-status').innerText.trim() === ''")
     page.wait_for_timeout(1500)
@@ -127,9 +134,10 @@ def test_the_browser_and_we_draw_the_same(shown):
     np.testing.assert_allclose(bright(page), where, atol=1.0)
     assert not np.array_equal(ours, theirs)
     page.locator('input[type="checkbox"]').locator("visible=true").first.click()
-    rests(page, but=said)
+    count = rests(page, viewer, count)
     choose(page, "rgb", "missing")
-    rests(page, "missing")
+    rests(page, viewer, count)
+    assert text(page, "status").startswith("missing, fast: ")
     assert np.abs(picture(page) - ours).mean() > 20
     assert page.evaluate("document.getElementById('drgs-header').querySelectorAll('script, img').length") == 0
     assert EVIL in text(page, "header")
@@ -155,15 +163,15 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     where = camera_of(looked.first.pose, WIDTH, HEIGHT, looked.origin).project(body[None])[0][0]
     assert 20 < where[0] < 300
     assert 240 < where[1] < 460
-    said = text(page, "status")
+    count = session_of(viewer).drawn
     page.mouse.click(*where)
     page.wait_for_function("(document.getElementById('drgs-photograph') || {}).innerText")
     shown_text = text(page, "photograph")
     assert shown_text.startswith(station.camera.name)
     assert f"rank {station.best.score.rank} of {station.best.score.of}" in shown_text
-    np.testing.assert_allclose(next(iter(viewer.sessions.values())).pose.position, tip, atol=1e-3)
+    np.testing.assert_allclose(session_of(viewer).pose.position, tip, atol=1e-3)
     page.wait_for_function("[...document.images].some(image => image.naturalWidth === 24)")  # the photograph
-    rests(page, but=said)
+    rests(page, viewer, count)
     assert np.abs(picture(page) - first).max() > 20
     # a fit goes on
     stamps = view._stamps(watched_files(args))
@@ -205,11 +213,10 @@ def test_the_slider_moves_the_scene(shown):
     left = bright(page)[0]
     slider = page.get_by_role("slider").first
     slider.focus()
-    said = text(page, "status")
+    session = session_of(viewer)
+    count = session.drawn
     page.keyboard.press("End")
-    page.wait_for_timeout(600)
-    rests(page, but=said)
-    session = next(iter(viewer.sessions.values()))
+    rests(page, viewer, count)
     assert session.time == pytest.approx(1.0, abs=0.01)
     assert bright(page)[0] > left + 30
     page.get_by_role("button", name="play").click()
@@ -219,8 +226,9 @@ def test_the_slider_moves_the_scene(shown):
         seen.add(round(session.time, 2))
         page.wait_for_timeout(50)
     assert seen == {0.0, 0.5, 1.0}
+    count = session.drawn
     page.get_by_role("button", name="pause").click()
-    rests(page)
+    rests(page, viewer, count)
 
 
 def test_a_page_of_another_site_cannot_listen(browser, shown, tmp_path):

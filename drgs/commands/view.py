@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import threading
+import warnings
 import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 _EVERY = 2.0  # seconds between two looks at the files
+_LAST = 0.5  # seconds that what is being computed is given to end
 _LEAST, _MOST = 100, 1 << 24  # pixels of our pictures
 
 
@@ -37,6 +39,8 @@ def run(args: View) -> None:
         raise ValueError(f"view: --max-pixels must be in [{_LEAST}, {_MOST}], got {args.max_pixels}; correct it")
     from drgs.viewing.server import Viewer
 
+    # A browser may be closed while something is on its way to it: that is no news.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with Bar("the scene", show=not args.quiet):
         stamps = _stamps(watched_files(args))
         subject = subject_of(args, Given.of(args))
@@ -48,8 +52,9 @@ def run(args: View) -> None:
         with quietly():
             _watch(args, viewer, stamps)
     finally:
-        if not viewer.stop():
+        if not viewer.worker.close(_LAST):
             interrupts.leave()
+        viewer.stop()
 
 
 def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]]) -> None:

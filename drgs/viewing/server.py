@@ -79,6 +79,7 @@ class Viewer:
 
     def stop(self, seconds: float = 1.0) -> bool:
         """Close everything; whether nothing is being computed any more."""
+        self._each(lambda session: session.close())
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
             self._server.stop()
         return self.worker.close(seconds)

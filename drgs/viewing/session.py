@@ -68,7 +68,7 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
         self._wanted = 0
-        self._is_closed = False
+        self._is_closed, self.drawn = False, 0  # pictures that were drawn to the end
         self._is_over = False  # our picture lies there, and the Gaussians are hidden
         self._gaussians: Any = None
         self._timer: asyncio.TimerHandle | None = None
@@ -249,7 +249,7 @@ class Session:
             )
             frustum.on_click(self._clicked(station))
             self._frusta.append(frustum)
-        self._near = 1.5 * size
+        self._near = 3 * size
         self._show_frusta()
 
     def _show_frusta(self) -> None:
@@ -294,6 +294,8 @@ class Session:
             image = to_bytes(read(_PHOTOGRAPH))
         except (OSError, ValueError) as error:
             self.say(str(error))
+            return
+        if self._is_closed:
             return
         self._photograph.image = image
         self._photograph.visible = True
@@ -387,6 +389,7 @@ class Session:
             took = time.perf_counter() - began
             self.say(f"{layer.name}, {preset}: {camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
             yield
+        self.drawn += 1
 
     def _seen_pose(self) -> tuple[Pose, tuple[int, int]]:
         """Where the client's camera is, and the pixels of its window."""
