@@ -59,7 +59,7 @@ smoke: setup
 
 # Strict: a broken link, or a page that the navigation does not name, fails.
 docs: setup
-	$(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 lint: setup
 	$(BIN)/ruff check .
