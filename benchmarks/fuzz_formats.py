@@ -81,7 +81,7 @@ def _safetensors(data: bytes, draw: Random) -> bytes:
             head = json.dumps(value).encode()
         else:
             head = json_of(head, draw)
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError):
         head = text_of(head, draw)
     return len(head).to_bytes(8, "little") + head + body
 
