@@ -3,7 +3,7 @@
     python benchmarks/active.py [--set report] [--scale small] [--seeds 5] [--shard K/N]     fits, rows as they come
     python benchmarks/active.py --page [--merge ROWS.jsonl ...]                              docs/active-static.md
 
-The paper's static loop (2 views, one more every 200 steps at `paper` scale) as cells of `drgs.lab.study`: rows of
+The paper's static loop (2 views, one more every 200 steps at `paper` scale) as cells of `drgs.studies.cells`: rows of
 benchmarks/active.jsonl and runs that are there are kept, killed ones resumed, and several processes may work side by
 side. A unit is (scene, split, initial views); every seed draws other initial views, and captures are held out from two
 offsets on. Made scenes (`room-N`, `still-N`, N the seed) have test views drawn as the candidates are, 24 or more.
@@ -25,10 +25,10 @@ import numpy as np
 import studies
 from studies import ROOT
 
-from drgs.lab.study import Metric, Study, distinct_seeds, read_study
-from drgs.lab.study_plot import draw_curves
-from drgs.lab.study_report import fill_between, study_report
-from drgs.lab.study_statistics import at_views, values_of
+from drgs.studies.cells import Metric, Study, distinct_seeds, read_study
+from drgs.studies.curves import draw_curves
+from drgs.studies.tables import fill_between, study_report
+from drgs.studies.statistics import at_views, values_of
 from drgs.train import ActiveConfig, FitConfig
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")

@@ -35,7 +35,7 @@ from drgs.files import Run  # noqa: E402
 from drgs.fisher import SemanticMetric  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")

@@ -33,7 +33,7 @@ from drgs.cameras import Camera, orbit  # noqa: E402
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.gain import Information, information_gain  # noqa: E402
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 FAST = drgs.RenderSettings.preset("fast")
 COUNTS = (1, 2, 4, 8, 16)

@@ -30,7 +30,7 @@ import torch  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.tracing import weights  # noqa: E402
 from drgs.tracing.tiles import TileTraversal  # noqa: E402
 

@@ -37,7 +37,7 @@ from fuzz_targets import TARGETS, Bench  # noqa: E402
 from fuzz_worker import GREEDY, SLOW  # noqa: E402
 from where import ran  # noqa: E402
 
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 COUNTS, PAGE = ROOT / "benchmarks" / "fuzz.json", ROOT / "docs" / "reliability.md"
 FINDINGS = ROOT / "runs" / "fuzz" / "findings"

@@ -30,7 +30,7 @@ from where import ran  # noqa: E402
 
 from drgs.files import Run, load_ply, load_state  # noqa: E402
 from drgs.guards import unfinished  # noqa: E402
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 from scenes import kitchen, room, still_life  # noqa: E402
 
 SIZE = {"width": 48, "height": 36, "spp": 2, "seed": 1}

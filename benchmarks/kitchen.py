@@ -31,8 +31,8 @@ os.environ.setdefault("DRGS_THREADS", "1")
 import studies
 from studies import ROOT
 
-from drgs.lab.study import Metric, Study
-from drgs.lab.study_report import study_report
+from drgs.studies.cells import Metric, Study
+from drgs.studies.tables import study_report
 from drgs.train import ActiveConfig, FitConfig
 from scenes import kitchen
 

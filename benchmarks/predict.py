@@ -20,7 +20,7 @@ from studies import ROOT
 
 import drgs
 from drgs.gain import Prior
-from drgs.lab.study_report import fill_between
+from drgs.studies.tables import fill_between
 from drgs.select import Cache, select
 
 VIEWS, STEPS, MORE = 6, 1000, 200

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from drgs.files import Run, load_state  # noqa: E402
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 IMAGE = {"psnr": "PSNR, dB", "psnr_moving": "of moving pixels, dB", "ssim": "SSIM", "flip": "FLIP"}
 LABELS = {

@@ -31,8 +31,8 @@ import labelled
 import studies
 from studies import ROOT
 
-from drgs.lab.study import Metric, Study, distinct_seeds
-from drgs.lab.study_report import study_report
+from drgs.studies.cells import Metric, Study, distinct_seeds
+from drgs.studies.tables import study_report
 from drgs.train import ActiveConfig, FitConfig
 from scenes import room
 

@@ -1,6 +1,6 @@
 """What the studies share: scenes at `--scale small`, base models, and the line that says where and when.
 
-Studies of fits are cells of `drgs.lab.study`, their statistics are in `drgs.lab.study_statistics`.
+Studies of fits are cells of `drgs.studies.cells`, their statistics are in `drgs.studies.statistics`.
 
 `small` is 15,000 Gaussians, at most 12,000 pixels and a fifth of the paper's steps (a pick every 40 of 1,400);
 `paper` is 30,000 Gaussians, 130,000 pixels and its 7,000 steps.
@@ -28,8 +28,8 @@ from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
-from drgs.lab.study import Metric, Study, append_row, read_study, run_cells  # noqa: E402
-from drgs.lab.study_report import fill_between  # noqa: E402
+from drgs.studies.cells import Metric, Study, append_row, read_study, run_cells  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 __all__ = [
     "SCALES",

@@ -30,8 +30,8 @@ from drgs.files import Run
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, variances
-from drgs.lab.study import Cell, Study
-from drgs.lab.study_report import fill_between
+from drgs.studies.cells import Cell, Study
+from drgs.studies.tables import fill_between
 
 POLICY = "random"
 MAPS = {

@@ -42,6 +42,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"train"}, "fits, for users"),
     ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
+    ({"studies"}, "many fits, and what they say together"),
     ({"viewing"}, "a scene in the browser, whatever command says which"),
     ({"crossval", "ladder", "testing"}, "the lab's doors, for users"),
     ({"commands"}, "one module a command: options in, files out"),

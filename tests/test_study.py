@@ -20,11 +20,11 @@ from drgs import train
 from drgs.files import write_json
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.guards.locks import InUse
-from drgs.lab import study as engine
-from drgs.lab.study import Cell, Metric, Study, append_row, cell_of, distinct_seeds, read_study, run_cell, run_cells
-from drgs.lab.study_plot import draw_curves
-from drgs.lab.study_report import fill_between, study_report
-from drgs.lab.study_statistics import at_views, differences, estimate, unit_of, view_counts
+from drgs.studies import cells as engine
+from drgs.studies.cells import Cell, Metric, Study, append_row, cell_of, distinct_seeds, read_study, run_cell, run_cells
+from drgs.studies.curves import draw_curves
+from drgs.studies.tables import fill_between, study_report
+from drgs.studies.statistics import at_views, differences, estimate, unit_of, view_counts
 
 METRICS = (
     Metric("psnr", "PSNR", 2),

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from drgs.guards.outputs import replacing
-from drgs.lab.study import Metric, Study
-from drgs.lab.study_statistics import at_views, values_of, view_counts
+from drgs.studies.cells import Metric, Study
+from drgs.studies.statistics import at_views, values_of, view_counts
 
 __all__ = ["draw_curves"]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from drgs.files import atomic_write
-from drgs.lab.study import Metric, Study
-from drgs.lab.study_statistics import Effect, Unit, at_views, differences, estimate, unit_of, values_of, view_counts
+from drgs.studies.cells import Metric, Study
+from drgs.studies.statistics import Effect, Unit, at_views, differences, estimate, unit_of, values_of, view_counts
 
 __all__ = ["fill_between", "study_report"]
 
@@ -29,7 +29,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
 
     Args:
         study: What was studied.
-        rows: Its rows (`drgs.lab.study.read_study`); others are left out.
+        rows: Its rows (`drgs.studies.cells.read_study`); others are left out.
         level: Of the headings.
     """
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in study.policies]

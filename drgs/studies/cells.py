@@ -2,7 +2,7 @@
 
 A study is its list of cells and the file of their rows. Any number of processes may work through the same list side by
 side: the lock of the run folder says who has a cell, a finished folder is not fitted again, and that of a process that
-was killed is resumed from its checkpoint. `drgs.lab.study_report` makes the tables.
+was killed is resumed from its checkpoint. `drgs.studies.tables` makes the tables.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Studies: many fits as cells that are kept and resumed, their statistics, and what a page says of them."""
