@@ -14,6 +14,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
+from drgs.data.image_headers import stated_size
 from drgs.data.view_checks import check_parallax
 from drgs.data.views import View
 from drgs.display import pictures
@@ -175,8 +176,30 @@ def test_png_whose_header_states_no_size(tmp_path, width, height):
     for lazy in (False, True):
         write_transforms(tmp_path / "set", w=None, h=None)
         (tmp_path / "set" / "images" / "0.png").write_bytes(data)
-        with pytest.raises(ValueError, match=f"1 to 2.31 pixels, its header says {width}x{height}"):
+        with pytest.raises(ValueError, match=f"bytes can hold, its header says {width}x{height}"):
             load(tmp_path / "set", lazy=lazy).views[0].image() if not lazy else drgs.data.checks.read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".bmp", ".webp"])
+def test_sizes_of_headers(tmp_path, suffix):
+    """The header of every format says what its decoder makes; one that says far more than the file can hold is refused
+    before anything of that size is allocated.
+    """
+    path = tmp_path / f"a{suffix}"
+    write_image(path, gradient()[:5, :7])
+    height, width = drgs.data.checks.read_image(path).shape[:2]
+    assert stated_size(path) == (width, height) == (7, 5)
+    if suffix == ".webp":  # 16,383 pixels a side at most, and no bound by bytes
+        return
+    data = bytearray(path.read_bytes())
+    order = "big" if suffix in (".png", ".jpg") else "little"
+    bytes_of = 2 if suffix in (".jpg", ".tiff") else 4
+    size = [(7).to_bytes(bytes_of, order), (5).to_bytes(bytes_of, order)]
+    for old in size:  # wherever the format has them
+        data = data.replace(old, (30_000).to_bytes(bytes_of, order))
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"as many as its \d+ bytes can hold, its header says 30000x30000"):
+        drgs.data.checks.read_image(path)
 
 
 def test_truncated_photograph(tmp_path, capfd, caplog):

@@ -10,7 +10,6 @@ import logging
 import os
 import re
 import shutil
-import struct
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from drgs.data.image_headers import can_hold, stated_size
 from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.foreign import refuse_foreign
@@ -187,27 +187,19 @@ def _reading_archive(path: Path, name: str) -> Iterator[None]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of an image; of PNG and JPEG only the header is read.
+    """(width, height) of an image; only the header is read, where it says so.
 
     Raises:
-        ValueError: not an image, or of no or more than 2^31 pixels.
+        ValueError: not an image, of no or more than 2^31 pixels, or of more than its file can hold.
     """
-    width, height = _stated_size(path) or read_image(path).shape[1::-1]
-    if not 1 <= width * height <= _MAX_PIXELS:
+    stated = stated_size(path)
+    width, height = stated or read_image(path).shape[1::-1]
+    if not 1 <= width * height <= _MAX_PIXELS or (stated and not can_hold(path, width, height)):
         raise ValueError(
-            f"{path}: an image must have 1 to 2^31 pixels, its header says {width}x{height}; "
-            "it is damaged, copy it again"
+            f"{path}: an image must have 1 to 2^31 pixels, as many as its {path.stat().st_size} bytes can hold, its "
+            f"header says {width}x{height}; it is damaged, copy it again"
         )
     return width, height
-
-
-def _stated_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) as the header of a PNG or JPEG says; None for other files."""
-    with path.open("rb") as file:
-        head = file.read(24)
-        if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) == 24:
-            return struct.unpack(">II", head[16:24])
-        return _jpeg_size(file) if head[:2] == b"\xff\xd8" else None
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -224,7 +216,7 @@ def read_image(path: Path) -> np.ndarray:
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
-    if _stated_size(path):
+    if stated_size(path):
         width, height = image_size(path)
         what = f"its {width}x{height} pixels"  # 8 bits and 3 channels, decoded and in the order of RGB
         memory.require(f"{path}", 6 * width * height, what, "reduce the image, and w, h, fl_x, ... with it")
@@ -279,30 +271,6 @@ def native_stderr() -> Iterator[list[str]]:
                     lines.append(raw.decode("utf-8", "replace"))
                 else:
                     os.write(2, raw)
-
-
-def _jpeg_size(file: Any) -> tuple[int, int] | None:
-    """(width, height) from a JPEG's frame header, None if there is none."""
-    file.seek(2)
-    while True:
-        marker = file.read(2)
-        if len(marker) < 2 or marker[0] != 0xFF:
-            return None
-        if marker[1] == 0xFF:  # fill byte: the second byte may start the marker
-            file.seek(-1, 1)
-            continue
-        length = file.read(2)
-        if len(length) < 2:
-            return None
-        # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC
-        # (arithmetic).
-        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
-            body = file.read(5)
-            if len(body) < 5:
-                return None
-            height, width = struct.unpack(">HH", body[1:5])
-            return (width, height) if width and height else None
-        file.seek(struct.unpack(">H", length)[0] - 2, 1)
 
 
 def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:

@@ -1,0 +1,97 @@
+"""How large an image is by its header, before anything of that size is allocated: PNG, JPEG, TIFF, BMP and WebP."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+__all__ = ["can_hold", "stated_size"]
+
+_PIXELS_A_BYTE = 8_256  # deflate makes one byte of at most 1,032, each of at most 8 pixels of one bit
+_DIRECTORY = 4096  # entries of a TIFF that are looked at
+
+
+def stated_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) as the header of an image says; None where it says none, or the format is another one."""
+    with path.open("rb") as file:
+        head = file.read(32)
+        for begins, reader in _READERS:
+            if head.startswith(begins):
+                try:
+                    return reader(head, file)
+                except struct.error:  # it ends in the middle
+                    return None
+    return None
+
+
+def can_hold(path: Path, width: int, height: int) -> bool:
+    """Whether a file is large enough for so many pixels; of WebP, which has no such bound, always."""
+    with path.open("rb") as file:
+        is_webp = file.read(4) == b"RIFF"
+    return is_webp or width * height <= _PIXELS_A_BYTE * path.stat().st_size
+
+
+def _png(head: bytes, file: Any) -> tuple[int, int] | None:
+    return struct.unpack(">II", head[16:24]) if head[12:16] == b"IHDR" else None
+
+
+def _bmp(head: bytes, file: Any) -> tuple[int, int] | None:
+    width, height = struct.unpack("<HH" if head[14] == 12 else "<ii", head[18:22] if head[14] == 12 else head[18:26])
+    return width, abs(height)  # rows from the top have a negative one
+
+
+def _webp(head: bytes, file: Any) -> tuple[int, int] | None:
+    if head[12:16] == b"VP8X":
+        return 1 + int.from_bytes(head[24:27], "little"), 1 + int.from_bytes(head[27:30], "little")
+    if head[12:16] == b"VP8L":
+        (bits,) = struct.unpack("<I", head[21:25])
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if head[12:16] == b"VP8 ":
+        width, height = struct.unpack("<HH", head[26:30])
+        return width & 0x3FFF, height & 0x3FFF
+    return None
+
+
+def _tiff(head: bytes, file: Any) -> tuple[int, int] | None:
+    """Of the first directory of a classic TIFF."""
+    order = "<" if head[:2] == b"II" else ">"
+    (start,) = struct.unpack(f"{order}I", head[4:8])
+    file.seek(start)
+    (count,) = struct.unpack(f"{order}H", file.read(2))
+    found = {}
+    for _ in range(min(count, _DIRECTORY)):
+        entry = file.read(12)
+        tag, kind = struct.unpack(f"{order}HH", entry[:4])
+        if tag in (256, 257):
+            (found[tag],) = struct.unpack(f"{order}{'H' if kind == 3 else 'I'}", entry[8 : 10 if kind == 3 else 12])
+    return (found[256], found[257]) if len(found) == 2 else None
+
+
+def _jpeg(head: bytes, file: Any) -> tuple[int, int] | None:
+    """From the frame header, None if there is none."""
+    file.seek(2)
+    while True:
+        marker = file.read(2)
+        if len(marker) < 2 or marker[0] != 0xFF:
+            return None
+        if marker[1] == 0xFF:  # fill byte: the second byte may start the marker
+            file.seek(-1, 1)
+            continue
+        (length,) = struct.unpack(">H", file.read(2))
+        # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC (arithmetic).
+        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", file.read(5)[1:5])
+            return (width, height) if width and height else None
+        file.seek(length - 2, 1)
+
+
+_READERS: tuple[tuple[bytes, Callable[[bytes, Any], tuple[int, int] | None]], ...] = (
+    (b"\x89PNG\r\n\x1a\n", _png),
+    (b"\xff\xd8", _jpeg),
+    (b"BM", _bmp),
+    (b"RIFF", _webp),
+    (b"II*\0", _tiff),
+    (b"MM\0*", _tiff),
+)
