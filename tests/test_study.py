@@ -21,10 +21,12 @@ from drgs.files import write_json
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.guards.locks import InUse
 from drgs.studies import cells as engine
-from drgs.studies.cells import Cell, Metric, Study, append_row, cell_of, distinct_seeds, read_study, run_cell, run_cells
+from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
 from drgs.studies.curves import draw_curves
-from drgs.studies.tables import fill_between, study_report
+from drgs.studies.experiments import EXPERIMENTS
+from drgs.studies.rows import Cell, append_row, cell_of, read_study
 from drgs.studies.statistics import at_views, differences, estimate, unit_of, view_counts
+from drgs.studies.tables import fill_between, study_report
 
 METRICS = (
     Metric("psnr", "PSNR", 2),
@@ -307,7 +309,7 @@ def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
     study = small(still)
     assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, rows, said.append) == ([], [])
     assert [row["seconds"] for row in read_study(rows)] == [None]
-    assert said[-1].endswith("steps 10.0")
+    assert said[-1].endswith("steps 10")
 
 
 # ---- one real cell
@@ -535,7 +537,7 @@ def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
         cells = study.cells(semantic.units_of(study, 3))
         assert len(cells) == len({cell.name for cell in cells}) == 3 * 5 * 10
         for start in range(0, len(cells), 10):
-            assert [cell.policy for cell in cells[start : start + 10]] == list(semantic.POLICIES)
+            assert [cell.policy for cell in cells[start : start + 10]] == list(study.policies)
             assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 10]}) == 1
         assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
         assert {cell.scene for cell in cells if cell.protocol == "paper"} == {"room-1"}
@@ -553,9 +555,9 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
     for scale in kitchen.SCALES:
         study = kitchen.study_of(scale, tmp_path)
         cells = study.cells(kitchen.units_of(study, 3))
-        count = len(kitchen.POLICIES)
+        count = len(study.policies)
         assert len(cells) == len({cell.name for cell in cells}) == 3 * count
-        assert [cell.policy for cell in cells] == 3 * list(kitchen.POLICIES)
+        assert [cell.policy for cell in cells] == 3 * list(study.policies)
         assert len({repr(study.configs(cell)) for cell in cells[:count]}) == count
         assert {study.configs(cell)[0].test_cameras for cell in cells} == {("cam00",)}
         rows = [
@@ -569,11 +571,12 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
         ]
         text = kitchen.report(study, rows)
         assert [line for line in text.splitlines() if line.startswith("### ")] == [
-            "### Policies",
+            "### Policies where things move",
             "### lambda",
-            "### Blocks",
+            "### What the criterion counts",
         ]
         for reference in ("random", "joint", "geometry"):
             assert f"#### Against `{reference}`" in text
-        assert {name for table in kitchen.TABLES for name in table[2]} == set(kitchen.POLICIES)
+        tables = [table.policies for table in EXPERIMENTS.values() if table.study == "dynamic"]
+        assert {label for policies in tables for label in policies} == set(study.policies)
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
