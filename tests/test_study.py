@@ -97,10 +97,10 @@ def test_units_are_outermost(still, faked, tmp_path):
     assert len(cells) == len(set(cells)) == len({cell.name for cell in cells}) == 8
     assert [cell.policy for cell in cells] == ["farthest", "Random, 1"] * 4
     said = []
-    assert run_cells(study, cells[:4], tmp_path, rows, said.append) == ([], [])
+    assert run_cells(study, cells[:4], tmp_path, rows, said.append) == ([], {})
     assert [cell_of(row) for row in read_study(rows)] == [("tiny", cell) for cell in cells[:4]]
     assert len(faked) == 4
-    assert run_cells(study, cells, tmp_path, rows, said.append) == ([], [])
+    assert run_cells(study, cells, tmp_path, rows, said.append) == ([], {})
     assert len(faked) == 8
     assert [cell_of(row)[1] for row in read_study(rows)] == cells
 
@@ -135,7 +135,7 @@ def test_a_folder_of_another_fit_is_refused(still, faked, tmp_path):
         run_cell(other, cell, tmp_path)
     assert len(faked) == 1
     said = []
-    assert run_cells(other, [cell], tmp_path, tmp_path / "rows.jsonl", said.append) == ([], [cell])
+    assert run_cells(other, [cell], tmp_path, tmp_path / "rows.jsonl", said.append)[1].keys() == {cell}
     assert "failed: " in said[-1]
     assert "every was 3" in said[-1]
 
@@ -203,7 +203,7 @@ def test_units_of_held_out_cameras(filmed, faked, tmp_path):
     with pytest.raises(ValueError, match="cam9"):
         study.dataset(dataclasses.replace(cells[0], camera="cam9"))
     rows = tmp_path / "rows.jsonl"
-    assert run_cells(study, cells, tmp_path, rows, str) == ([], [])
+    assert run_cells(study, cells, tmp_path, rows, str) == ([], {})
     assert [config.test_cameras for config, _ in faked] == [("cam01",), ("cam01",), ("cam02",), ("cam02",)]
     assert [active and active.schedule for _, active in faked] == ["times", None, "times", None]
     found = read_study(rows)
@@ -281,7 +281,7 @@ def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
     finally:
         other.kill()
         other.wait()
-    assert run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None) == ([], [])
+    assert run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None) == ([], {})
     assert len(faked) == len(cells)
 
 
@@ -297,7 +297,7 @@ def test_a_data_set_that_another_process_makes_is_waited_for(still, faked, tmp_p
 
     monkeypatch.setattr(engine, "_PATIENCE", 0.0)
     study = dataclasses.replace(small(still), folder=folder)
-    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, tmp_path / "rows.jsonl", str) == ([], [])
+    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, tmp_path / "rows.jsonl", str) == ([], {})
     assert len(calls) == 3
     assert caplog.text.count("waiting: ") == 1
 
@@ -307,7 +307,7 @@ def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
     real, said, rows = engine._row, [], tmp_path / "rows.jsonl"
     monkeypatch.setattr(engine, "_row", lambda *arguments: {**real(*arguments), "seconds": None})
     study = small(still)
-    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, rows, said.append) == ([], [])
+    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, rows, said.append) == ([], {})
     assert [row["seconds"] for row in read_study(rows)] == [None]
     assert said[-1].endswith("steps 10")
 

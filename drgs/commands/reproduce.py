@@ -34,7 +34,7 @@ _FIGURE = "all views"  # is given what the others choose from: no row of the she
 def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
     out: Path = args.output
-    held = claim(out, "reproduce", [_ROWS, _PAGE, _RESULTS, _GIVEN, _SHEET], args.data)
+    claim(out, "reproduce", [_PAGE, _RESULTS, _GIVEN, _SHEET], args.data)
     _same_data(out, args.data)
     plan = plan_of(
         args.what,
@@ -54,16 +54,17 @@ def run(args: Reproduce) -> None:
     there = sum((plan.study.name, cell) in done for cell in plan.cells)
     say(f"{len(plan.cells)} cells, {there} of them are finished: {out / _ROWS}")
     taken, failed = run_cells(plan.study, plan.cells, out / "runs", out / _ROWS, say, progress=not args.quiet)
-    held.adopt([_ROWS], "reproduce")
     rows = [row for row in read_study(out / _ROWS) if cell_of(row) in {(plan.study.name, cell) for cell in plan.cells}]
     pictures = _figures(plan, out, args) if args.figures else []
     _write(plan, rows, out, args, pictures)
     if not args.quiet:
         _print(plan, rows, out)
     if failed:
+        cell, reason = next(iter(failed.items()))
+        count = f"{len(failed)} of {len(plan.cells)}"
         raise ValueError(
-            f"reproduce: all {len(plan.cells)} cells must end, {len(failed)} failed ({failed[0].name}, ...; reasons "
-            "above); correct that and repeat the command, finished cells are kept"
+            f"reproduce: all cells must end, {count} failed, the first, {cell.name}, with: {reason}; correct that and "
+            "repeat the command, finished cells are kept"
         )
 
 

@@ -25,6 +25,7 @@ from drgs.fitting.config import SAVING, ActiveConfig, FitConfig, Start
 from drgs.fitting.resume import claim_run
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
+from drgs.guards.writing import is_full
 from drgs.metrics import Lpips
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study
@@ -224,10 +225,10 @@ def run_cells(
     rows: Path,
     say: Callable[[str], object] = print,
     progress: bool = False,
-) -> tuple[list[Cell], list[Cell]]:
+) -> tuple[list[Cell], dict[Cell, str]]:
     """Work through cells, in their order; rows are appended as they come.
 
-    A fit that fails is told and left for the next call; the others go on.
+    A fit that fails is told and left for the next call; the others go on, unless there is no room left on the disk.
 
     Args:
         study, cells: What to do.
@@ -236,9 +237,11 @@ def run_cells(
         say: Takes a line whenever a cell begins or ends.
         progress: Show that of every fit.
     Returns:
-        Cells that other processes have, and cells that failed.
+        Cells that other processes have, and those that failed, with the reason.
+    Raises:
+        OSError: If there is no room left.
     """
-    taken, failed = [], []
+    taken, failed = list[Cell](), dict[Cell, str]()
     for number, cell in enumerate(cells, 1):
         if is_done(study.name, cell, read_study(rows), study.measured_later):
             continue
@@ -249,8 +252,10 @@ def run_cells(
             taken.append(cell)
             continue
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            if is_full(error):
+                raise
             say(f"{cell.name}: failed: {error}")
-            failed.append(cell)
+            failed[cell] = str(error)
             continue
         append_row(rows, row)
         numbers = ", ".join(_said(m, row["metrics"][m.key]) for m in study.metrics)

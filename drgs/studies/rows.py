@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from drgs.fitting.config import Start
+from drgs.guards.writing import named
 
 __all__ = ["Cell", "append_row", "cell_of", "is_done", "read_study"]
 
@@ -97,10 +98,16 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
         if is_done(*cell_of(row), read_study(path), row["metrics"]):
             return
         file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)  # a killed process may have left half a line
-        file.write(json.dumps(row).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
+        whole = file.read().rfind(b"\n") + 1
+        file.truncate(whole)  # a killed process may have left half a line
+        try:
+            file.write(json.dumps(row).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError as error:
+            with suppress(OSError):
+                os.truncate(path, whole)
+            raise named(path, error) from None
 
 
 @contextmanager
