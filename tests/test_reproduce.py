@@ -204,17 +204,17 @@ def test_a_study_that_is_killed_goes_on(tmp_path):
     assert [row["policy"] for row in found] == ["random", "farthest"]
     assert all(row["peak_memory"] > 1e8 and row["pool_leak"] for row in found)
     assert all(row["metrics"]["miou"] > 0.05 for row in found)
-    page = (out / "results.md").read_text()
+    page = (out / "static.md").read_text()
     assert all(text in page for text in ("![", "| random |", "| farthest |"))
-    assert [row["policy"] for row in json.loads((out / "results.json").read_text())["rows"]] == ["random", "farthest"]
+    assert [row["policy"] for row in json.loads((out / "static.json").read_text())["rows"]] == ["random", "farthest"]
     import cv2
 
-    sheet = cv2.imread(str(out / "sheet.png"))
+    sheet = cv2.imread(str(out / "static.png"))
     height, width = sheet.shape[:2]
     assert width > 4 * 300, "four columns"
     assert height > 3 * 220, "two policies and the truth"
     assert np.std(sheet) > 20
-    assert list((out / "maps").glob("*.maps.png"))
+    assert list((out / "static-maps").glob("*.maps.png"))
     stamp = rows.stat().st_mtime_ns
     assert cli.main([*line, "--no-figures"]) == 0
     assert rows.stat().st_mtime_ns == stamp, "nothing was left to do"
@@ -233,7 +233,7 @@ def test_data_without_labels(still, tmp_path, capsys):
     row = read_study(out / "rows.jsonl")[0]
     assert row["metrics"]["miou"] is None
     assert row["metrics"]["psnr"] > 5
-    assert "no accuracies and no mIoU" in " ".join((out / "results.md").read_text().split())
+    assert "no accuracies and no mIoU" in " ".join((out / "static.md").read_text().split())
     write_still(tmp_path / "still")
     assert cli.main([*line[:-3], str(tmp_path / "still"), "-o", str(out)]) == 2
     assert "must be of one still, holds rows of" in capsys.readouterr().err

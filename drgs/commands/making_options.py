@@ -93,7 +93,7 @@ class Reproduce(Common):
     what: Positional[ExperimentName]
     """Policies on static scenes, or where things move (dynamic); lambda (prior), or what the score counts (blocks)."""
     output: OutputPath
-    """Folder for scenes, runs, rows.jsonl, results.md and figures; what is finished there is kept."""
+    """Folder for scenes, runs, rows.jsonl, tables and figures, of all four; what is finished there is kept."""
     data: Annotated[tuple[Path, ...], arg(metavar="DATA"), UseAppendAction] = ()
     """A data set to take in place of the made scenes; may be repeated."""
     scale: StudyScale = "small"

@@ -26,15 +26,14 @@ if TYPE_CHECKING:
 
 __all__ = ["run"]
 
-_ROWS, _PAGE, _RESULTS, _GIVEN = "rows.jsonl", "results.md", "results.json", "data.json"
-_SHEET, _MAPS = "sheet.png", "maps"
+_ROWS, _GIVEN = "rows.jsonl", "data.json"  # of all experiments in one folder: they share cells
 _FIGURE = "all views"  # is given what the others choose from: no row of the sheet is the better for it
 
 
 def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
     out: Path = args.output
-    claim(out, "reproduce", [_PAGE, _RESULTS, _GIVEN, _SHEET], args.data)
+    claim(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
     _same_data(out, args.data)
     plan = plan_of(
         args.what,
@@ -58,7 +57,7 @@ def run(args: Reproduce) -> None:
     pictures = _figures(plan, out, args) if args.figures else []
     _write(plan, rows, out, args, pictures)
     if not args.quiet:
-        _print(plan, rows, out)
+        _print(plan, rows, out, args.what)
     if failed:
         cell, reason = next(iter(failed.items()))
         count = f"{len(failed)} of {len(plan.cells)}"
@@ -93,7 +92,9 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
     folders = {label: out / "runs" / plan.study.name / cell.name for label, cell in found.items()}
     cell = next(iter(found.values()))
     with Bar("comparison sheet"):
-        view = comparison_sheet({plan.experiment.policies[x]: path for x, path in folders.items()}, out / _SHEET)
+        view = comparison_sheet(
+            {plan.experiment.policies[x]: path for x, path in folders.items()}, out / f"{args.what}.png"
+        )
     shown = f"{cell.scene}, {view}: what each policy's fit makes of a view that none has seen, the truth last"
     last = list(folders)[-1]
     fisher.run(
@@ -103,26 +104,26 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
             split="test",
             limit=1,
             maps=True,
-            output=out / _MAPS,
+            output=out / f"{args.what}-maps",
             preset="fast",
             quiet=True,
         )
     )
-    maps = sorted((out / _MAPS).glob("*.maps.png"))
+    maps = sorted((out / f"{args.what}-maps").glob("*.maps.png"))
     told = f"What moments, FisherRF and our blocks look at in a view of {cell.scene}, after `{last}`"
-    return [(_SHEET, shown), *((f"{_MAPS}/{path.name}", told) for path in maps)]
+    return [(f"{args.what}.png", shown), *((f"{path.parent.name}/{path.name}", told) for path in maps)]
 
 
 def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictures: list[tuple[str, str]]) -> None:
-    """results.md and results.json."""
+    """The page, and the same for machines."""
     made = f"`drgs reproduce {args.what} --scale {args.scale} --seeds {args.seeds} --protocol {args.protocol}`"
     where = f"Made by {made} on {cpu_model()}, {datetime.date.today()}, commit {(commit() or 'unknown')[:7]}."
     text = ["# arXiv 2512.22771, repeated", where, results_page(plan.study, plan.experiment, rows, told=plan.notes)]
     text += [f"![{told}]({name})\n\n{told}." for name, told in pictures]
-    with atomic_write(out / _PAGE) as file:
+    with atomic_write(out / f"{args.what}.md") as file:
         file.write(("\n\n".join(text) + "\n").encode())
     write_json(
-        out / _RESULTS,
+        out / f"{args.what}.json",
         {
             "schema": SCHEMA,
             "command": "reproduce",
@@ -137,7 +138,7 @@ def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictur
     )
 
 
-def _print(plan: StudyPlan, rows: list[dict], out: Path) -> None:
+def _print(plan: StudyPlan, rows: list[dict], out: Path, what: str) -> None:
     """The means on stdout."""
     found = results_rows(plan.study, plan.experiment, rows)
     metrics = [metric for metric in plan.study.metrics if any(row[metric.key] is not None for row in found)]
@@ -150,4 +151,4 @@ def _print(plan: StudyPlan, rows: list[dict], out: Path) -> None:
         for row in found
     ]
     tables.show(plan.experiment.title, ("policy", *(m.title for m in metrics), "best"), lines)
-    print(f"tables and figures: {out / _PAGE}")
+    print(f"tables and figures: {out / what}.md")
