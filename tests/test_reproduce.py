@@ -157,7 +157,7 @@ def test_the_page(tmp_path):
     cells = [x.strip() for x in line.strip("|").split("|")]
     assert cells == ["FisherRF", "0.500", "22.25", *["0.500"] * 4, "6", "1.50", "2.50", "1.50", "32.17"]
     assert next(x for x in text.splitlines() if x.startswith("| uniform |")).split("|")[10].strip() == "–"
-    for words in ("Something is missing.", "Pool leak", "another data set and other", "best PSNR of 6 units"):
+    for words in ("Something is missing.", "Pool leak", "another data set and other", "best PSNR (of 6)"):
         assert words in text
     assert "+2.00 [+2.00, +2.00] **gain**, 6 of 6" in text
     found = {row["policy"]: row for row in results_rows(study, experiment, rows)}

@@ -302,6 +302,29 @@ def test_a_data_set_that_another_process_makes_is_waited_for(still, faked, tmp_p
     assert caplog.text.count("waiting: ") == 1
 
 
+def test_lpips_comes_later(still, faked, tmp_path, monkeypatch):
+    """Finished cells get it without another fit, once; a row that has it, or says that it cannot be, is left alone."""
+    rows, measured = tmp_path / "rows.jsonl", []
+    study = small(still)
+    cell = study.cells(units((0,)))[0]
+    assert run_cells(study, [cell], tmp_path, rows, str) == ([], {})
+
+    def evaluate(run, claimed, lpips):
+        measured.append(lpips)
+        found = json.loads((run.path / "metrics.json").read_text())
+        write_json(run.path / "metrics.json", {**found, "mean": {**found["mean"], "lpips": 0.25}})
+
+    monkeypatch.setattr(engine, "evaluate_run", evaluate)
+    monkeypatch.setattr(engine, "Lpips", lambda weights: weights)
+    weighed = dataclasses.replace(study, metrics=(*METRICS, Metric("lpips", "LPIPS")), lpips=tmp_path / "w.pth")
+    for _ in range(2):
+        assert run_cells(weighed, [cell], tmp_path, rows, str) == ([], {})
+    assert len(faked) == 1
+    assert measured == [tmp_path / "w.pth"]
+    assert [row["metrics"]["lpips"] for row in read_study(rows)] == [0.25]
+    assert run_cells(study, [cell], tmp_path, rows, str) == ([], {}), "without weights it is done as well"
+
+
 def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
     """`drgs eval` writes metrics.json anew, without the seconds of the fit: the row is taken all the same."""
     real, said, rows = engine._row, [], tmp_path / "rows.jsonl"

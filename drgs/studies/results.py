@@ -121,7 +121,7 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
     heads = [
         "policy",
         *(m.title if m.larger else f"{m.title} (lower is better)" for m in study.metrics),
-        f"best PSNR of {units} units",
+        f"best PSNR (of {units})",
         *_COSTS.values(),
         *(f"{titles[key]} in the paper" for key in papers),
     ]
