@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import drgs
-from drgs import cli
+from drgs import cli, machine
 from drgs.cameras import orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
@@ -102,6 +102,16 @@ def test_frames_take_what_is_said(gaussians):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environ)
     estimate = memory.frame_bytes(1448**2, TILES)
     assert 0.9 < int(done.stdout) / estimate < 1.6
+
+
+def test_peaks_are_a_process_s_own():
+    """What the process that started it holds is no part of a process's peak."""
+    if not os.path.exists("/proc/self/status"):
+        pytest.skip("no /proc to read the peak from")
+    held = bytearray(b"x" * (256 << 20))
+    code = f"import runpy; print(runpy.run_path({machine.__file__!r})['peak_memory']())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert machine.peak_memory() > len(held) > 2 * int(done.stdout) > 2 << 20
 
 
 def test_render_refuses_what_does_not_fit(gaussians, one_gigabyte):
