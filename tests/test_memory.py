@@ -192,3 +192,16 @@ def test_ulimit_is_an_error_and_no_crash(gaussians, tmp_path):
     assert done.returncode == 2, done.stderr
     assert "view 'orbit_0000': there must be memory for its 16384x16384 pixels" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_peak_memory_is_counted_anew():
+    """After a large array is gone and the peak is forgotten, what is told is what is held now."""
+    held = bytearray(b"x") * (300 << 20)
+    most = machine.peak_memory()
+    assert most > len(held)
+    del held
+    assert machine.peak_memory() == most
+    machine.forget_peak_memory()
+    if machine.peak_memory() == most:
+        pytest.skip("this system does not let a process forget")
+    assert machine.peak_memory() < most - (200 << 20)

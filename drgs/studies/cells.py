@@ -26,6 +26,7 @@ from drgs.fitting.resume import claim_run
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
 from drgs.guards.writing import is_full
+from drgs.machine import forget_peak_memory
 from drgs.metrics import Lpips
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study
@@ -212,6 +213,7 @@ def run_cell(study: Study, cell: Cell, runs: Path, progress: bool = False) -> di
         if (run.path / "config.json").is_file():
             _check_same(run, config, active)
         if not (run.path / "metrics.json").is_file():
+            forget_peak_memory()  # of the cell before
             fit(study.dataset(cell), run.path, config, active=active, resume=True, progress=progress)
         if study.lpips is not None and _metrics(run)["mean"].get("lpips") is None:
             evaluate_run(run, claimed, lpips=Lpips(study.lpips))
