@@ -90,6 +90,7 @@ def diagonal(
     seed: int = 0,
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
+    seen_opacity: list[torch.Tensor] | None = None,
     **splats: Unpack[SplatTensors],
 ) -> Information:
     """The diagonal of J^T J, summed over views.
@@ -112,6 +113,8 @@ def diagonal(
             `probes`; only `exact` makes use of its `estimate`).
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared, as a fit
             does, so that squares are multiplied by its square; or None: 1. Outside, a view tells nothing.
+        seen_opacity: A list that gets the (H, W) opacity of each view, which methods `exact` and `fisherrf` come to
+            know, for `backdrop`.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
             `height`, and maybe `sh_degree` and `backgrounds`.
@@ -164,6 +167,8 @@ def diagonal(
         else:
             replay = Replay(seen, camera, settings, semantics=semantics, mask=shown[number])
             part |= replay.diagonal(wanted, weights, method == "fisherrf")
+            if seen_opacity is not None:
+                seen_opacity.append(replay.opacity)
         for name in wanted:
             total[name] += part[name]
     if "sh" in total:
@@ -262,6 +267,7 @@ def backdrop(
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     masks: Masks = None,
     sphere: Sphere | None = None,
+    seen_opacity: Sequence[torch.Tensor] | None = None,
 ) -> torch.Tensor:
     """(1536, 3) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything,
     a row for each cell. See `drgs.information.backdrop`.
@@ -270,12 +276,19 @@ def backdrop(
         gaussians, cameras, settings, channel_weights, masks: As for `diagonal`.
         sphere: What the color is painted on, the same for all views that are compared, as `backdrop_sphere` makes it;
             None: infinitely far away.
+        seen_opacity: (H, W) of each view, as `diagonal` finds them on its way; None: they are rendered.
     """
     cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
+    if seen_opacity is not None and [x.shape for x in seen_opacity] != [(c.height, c.width) for c in cameras]:
+        raise ValueError(
+            f"fisher.backdrop: seen_opacity must be of the {len(cameras)} views and their sizes, got "
+            f"{[tuple(x.shape) for x in seen_opacity]}; pass what diagonal found of the same views"
+        )
     settings, weights = settings or RenderSettings.preset("exact"), _weights(channel_weights)
     total = torch.zeros(CELLS, 3, dtype=torch.float64)
-    for camera, mask in zip(cameras, mask_list("fisher.backdrop", masks, cameras), strict=True):
-        total += backdrop_information(gaussians, camera, settings, weights, mask, sphere)
+    known: Sequence[torch.Tensor | None] = seen_opacity or [None] * len(cameras)
+    for camera, mask, opacity in zip(cameras, mask_list("fisher.backdrop", masks, cameras), known, strict=True):
+        total += backdrop_information(gaussians, camera, settings, weights, mask, sphere, opacity)
     return total
 
 

@@ -213,3 +213,23 @@ def test_wrong_questions_are_refused(blob, ring, options, message):
     """In one line."""
     with pytest.raises(ValueError, match=message):
         select(blob, ring[1:], ring[:1], **options)
+
+
+@pytest.mark.parametrize("preset", ["exact", "fast"])
+def test_opacity_of_the_diagonal(blob, ring, preset):
+    """What the diagonal's traversal finds on its way is what a view is rendered with; other sizes are refused."""
+    settings = RenderSettings.preset(preset)
+    normal = torch.randn(50, 12, generator=torch.Generator().manual_seed(0))
+    g = drgs.Gaussians(normal[:, :3], normal[:, 3:7], normal[:, 7:10] - 2, normal[:, 10], 0.3 * torch.ones(50, 1, 3))
+    for scene in (blob, g):
+        found = []
+        fisher.diagonal(scene, ring[:3], settings, seen_opacity=found)
+        assert [x.shape for x in found] == [(18, 24)] * 3
+        for opacity, camera in zip(found, ring, strict=False):
+            np.testing.assert_allclose(opacity, drgs.render(scene, camera, settings).alpha, atol=6e-6)
+        wanted = fisher.backdrop(scene, ring[:3], settings)
+        given = fisher.backdrop(scene, ring[:3], settings, seen_opacity=found)
+        np.testing.assert_allclose(given, wanted, rtol=1e-4, atol=1e-4)
+        assert wanted.sum() > 100
+    with pytest.raises(ValueError, match="seen_opacity must be of the 2 views and their sizes"):
+        fisher.backdrop(blob, ring[:2], settings, seen_opacity=found)

@@ -96,12 +96,13 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
     return torch.from_numpy(found.reshape(camera.height, camera.width))
 
 
-def _open(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tensor:
+def _open(scene: Scene, camera: Camera, settings: RenderSettings, alpha: torch.Tensor | None = None) -> torch.Tensor:
     """(H, W) float64: (1 - alpha)^2."""
     from drgs.integrator import render
 
-    with torch.no_grad():
-        alpha = render(colors_only(scene, camera.time), camera, settings, outputs=()).alpha
+    if alpha is None:
+        with torch.no_grad():
+            alpha = render(colors_only(scene, camera.time), camera, settings, outputs=()).alpha
     return (1 - alpha.double().cpu()).clamp(min=0).square()
 
 
@@ -112,9 +113,13 @@ def backdrop_information(
     channel_weights: Sequence[float],
     mask: torch.Tensor | None = None,
     sphere: Sphere | None = None,
+    opacity: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """(1536, 3) float64 H_c of a view in each channel, times the channel's weight; with a mask (H, W) of its square."""
-    total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(scene, camera, settings)
+    """(1536, 3) float64 H_c of a view in each channel, times the channel's weight; with a mask (H, W) of its square.
+
+    `opacity` (H, W) is that of the view, where it is known already.
+    """
+    total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(scene, camera, settings, opacity)
     if mask is not None:
         open_ = open_ * mask.detach().double().cpu().square()
     total.index_add_(0, backdrop_cells(camera, sphere).flatten(), open_.flatten())

@@ -83,7 +83,8 @@ class Replay:
         self.compositor, arguments = call.prepare(self.inputs)
         self.compositor.beside = call.width
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
-            self.compositor.forward(*arguments, keep=True)
+            images = self.compositor.forward(*arguments, keep=True)
+        self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
         p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
         self.along_ray = settings.sh_direction == "ray"
