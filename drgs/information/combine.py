@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
-__all__ = ["Asked", "Combination", "asked_of"]
+__all__ = ["Asked", "Combination", "Questions", "asked_of"]
 
 _SAME = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
 
@@ -77,6 +77,29 @@ class Asked:
 
 
 _OF_SCENES = ("columns", "probes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Questions:
+    """All that a view is asked, as data, which other processes can be sent.
+
+    Attributes:
+        settings: Of the renderer.
+        asked: In the order of asking.
+        empty_outside: Whether it is known that nothing is outside of masks, so that the view has shown it.
+    """
+
+    settings: RenderSettings
+    asked: tuple[Asked, ...]
+    empty_outside: bool = False
+
+    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+        """What one view says, in float32, as it is kept."""
+        found: dict[str, torch.Tensor] = {}
+        for one in self.asked:
+            empty = one.function == "backdrop" and self.empty_outside
+            found |= one(scene, camera, self.settings, None if empty else mask)
+        return {name: x.to(torch.float32) for name, x in found.items()}
 
 
 @dataclasses.dataclass(frozen=True)
