@@ -13,7 +13,7 @@ from typing import Any
 
 from drgs import machine, runtime
 
-__all__ = ["Disagreement", "check_agreement", "statement", "worker_statement"]
+__all__ = ["Disagreement", "check_agreement", "statement", "this_worker", "worker_name", "worker_statement"]
 
 _PACKAGES = ("dask", "distributed", "torch", "drjit", "mitsuba", "numpy")
 _ADVICE = {
@@ -62,20 +62,35 @@ def worker_statement() -> Callable[[], dict]:
     """
 
     def state() -> dict:
+        import importlib
+
         try:
-            from drgs.cluster.agreement import statement
+            there = importlib.import_module("drgs.cluster.agreement")
         except ImportError:
             try:
-                import drgs
+                return {"must": {"drgs": importlib.import_module("drgs").__version__}, "may": {}}
             except ImportError:
                 return {"must": {"drgs": "none"}, "may": {}}
-            return {"must": {"drgs": drgs.__version__}, "may": {}}
         try:
-            return statement()
+            return there.statement()
         except (ValueError, OSError) as error:  # no backend
             return {"error": str(error)}
 
     return state
+
+
+def worker_name(address: str, name: object) -> str:
+    """Of a worker, for people: `0 (127.0.0.1:40123)`, or its address if it has no other name."""
+    place = address.removeprefix("tcp://")
+    return place if name in (None, "", address) else f"{name} ({place})"
+
+
+def this_worker() -> dict[str, str]:
+    """Of the worker that runs the task that calls this: `worker`, its name, its `address` and its `host`."""
+    from distributed import get_worker
+
+    this = get_worker()
+    return {"worker": worker_name(this.address, this.name), "address": this.address, "host": platform.node()}
 
 
 def check_agreement(worker: str, theirs: Mapping[str, Any], ours: Mapping[str, str]) -> None:

@@ -13,6 +13,7 @@ import contextlib
 import importlib.util
 import logging
 import os
+import platform
 import re
 import signal
 import threading
@@ -23,7 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
-from drgs.cluster.agreement import Disagreement, check_agreement, statement, worker_statement
+from drgs.cluster.agreement import Disagreement, check_agreement, statement, worker_name, worker_statement
 from drgs.cluster.parcels import Parcel, keep
 from drgs.cluster.views import answers
 from drgs.display.progress import Bar
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from drgs.gain import Information
     from drgs.information.pool import Question
 
-__all__ = ["CONNECT_SECONDS", "WORKER_SECONDS", "Cluster", "check_address", "opened"]
+__all__ = ["CONNECT_SECONDS", "WORKER_SECONDS", "Cluster", "check_address", "check_wanted", "opened"]
 
 CONNECT_SECONDS = 10.0
 """Within which a scheduler must answer."""
@@ -67,6 +68,25 @@ def check_address(scheduler: str) -> str:
     return f"tcp://{found[1]}:{int(found[2])}"
 
 
+def check_wanted(scheduler: str | None, workers: int | None) -> str | None:
+    """Refuse what `opened` would, but for what only a connection shows.
+
+    Returns:
+        The scheduler's address as Dask has it.
+    Raises:
+        ValueError: If an argument is bad, both are given, or Dask is not installed.
+    """
+    if scheduler is not None and workers is not None:
+        raise ValueError("cluster: --scheduler must be without --workers, got both; join a cluster, or start one here")
+    address = None if scheduler is None else check_address(scheduler)
+    if workers is not None and not 1 <= workers <= _MOST:
+        raise ValueError(f"cluster: --workers must be in [1, {_MOST}], got {workers}; one for each core is most useful")
+    for package in ("dask", "distributed"):
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(f"cluster: {package} must be installed, is not; pip install 'drgs[cluster]'")
+    return address
+
+
 @contextlib.contextmanager
 def opened(scheduler: str | None = None, workers: int | None = None) -> Iterator[Cluster | None]:
     """Workers for the length of a block; None where neither argument is given.
@@ -83,14 +103,7 @@ def opened(scheduler: str | None = None, workers: int | None = None) -> Iterator
     if scheduler is None and workers is None:
         yield None
         return
-    if scheduler is not None and workers is not None:
-        raise ValueError("cluster: --scheduler must be without --workers, got both; join a cluster, or start one here")
-    address = None if scheduler is None else check_address(scheduler)
-    if workers is not None and not 1 <= workers <= _MOST:
-        raise ValueError(f"cluster: --workers must be in [1, {_MOST}], got {workers}; one for each core is most useful")
-    for package in ("dask", "distributed"):
-        if importlib.util.find_spec(package) is None:
-            raise ValueError(f"cluster: {package} must be installed, is not; pip install 'drgs[cluster]'")
+    address = check_wanted(scheduler, workers)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silent())
         if address is not None:
@@ -216,7 +229,12 @@ class Cluster:
     def workers(self) -> dict[str, str]:
         """Address -> name of each worker there is now."""
         found = self.client.scheduler_info(n_workers=-1)["workers"]
-        return {address: _name(address, one["name"]) for address, one in found.items()}
+        return {address: worker_name(address, one["name"]) for address, one in found.items()}
+
+    def workers_of(self, host: str | None) -> list[str]:
+        """Addresses of those that run on a machine."""
+        nodes = self.client.run(platform.node, on_error="ignore")
+        return [address for address, node in nodes.items() if node == host]
 
     def check(self) -> None:
         """Ask every worker what it computes with.
@@ -228,7 +246,7 @@ class Cluster:
         found = self.client.run(worker_statement(), on_error="return")
         machines = set()
         for address, said in sorted(found.items()):
-            name = _name(address, info[address]["name"] if address in info else address)
+            name = worker_name(address, info[address]["name"] if address in info else address)
             if isinstance(said, OSError):
                 continue  # it has gone
             if isinstance(said, BaseException):
@@ -333,9 +351,3 @@ class Cluster:
         if self._local is not None:
             with contextlib.suppress(Exception):
                 self._local.close(timeout=5)
-
-
-def _name(address: str, name: object) -> str:
-    """Of a worker, for people."""
-    place = address.removeprefix("tcp://")
-    return place if name in (None, address) else f"{name} ({place})"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from drgs.cluster.agreement import check_agreement, statement
+from drgs.cluster.agreement import check_agreement, statement, this_worker
 from drgs.cluster.parcels import Missing, Parcel, opened_parcel
 
 if TYPE_CHECKING:
@@ -103,12 +103,8 @@ def ask(ours: Mapping[str, str], scene: str, questions: str, number: int, view: 
     Returns:
         `answer`, arrays by name, and `seconds`; or what is `missing`; always `worker` and its `address`.
     """
-    from distributed import get_worker
-
-    address = get_worker().address
-    worker = str(get_worker().name) if get_worker().name != address else address.removeprefix("tcp://")
-    said: dict[str, Any] = {"worker": worker, "address": address}
-    check_agreement(worker, statement(), ours)
+    said: dict[str, Any] = {**this_worker()}
+    check_agreement(said["worker"], statement(), ours)
     began = time.perf_counter()
     try:
         seen, asked = opened_parcel(scene), opened_parcel(questions)

@@ -29,7 +29,18 @@ from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
 from drgs.train import fit
 
-__all__ = ["Cell", "Metric", "Study", "append_row", "cell_of", "distinct_seeds", "read_study", "run_cell", "run_cells"]
+__all__ = [
+    "Cell",
+    "Metric",
+    "Study",
+    "append_row",
+    "cell_of",
+    "distinct_seeds",
+    "read_study",
+    "result_line",
+    "run_cell",
+    "run_cells",
+]
 
 _Unit = tuple[str, tuple[int, int] | str, Start, "Protocol", int]
 Protocol = Literal["blind", "paper"]
@@ -326,9 +337,14 @@ def run_cells(
             failed.append(cell)
             continue
         append_row(rows, row)
-        numbers = ", ".join(f"{m.title} {row['metrics'][m.key]}" for m in study.metrics)
-        say(f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else ""))
+        say(result_line(study, cell, row))
     return taken, failed
+
+
+def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
+    """What a finished cell has found, in a line."""
+    numbers = ", ".join(f"{m.title} {row['metrics'][m.key]}" for m in study.metrics)
+    return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
 
 
 def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> None:
