@@ -208,6 +208,7 @@ class Cluster:
         sent_bytes, sent_seconds: To each worker, and for all of them, so far.
         views: Worker -> how many views it has answered for.
         view_seconds: Of each of these, on its worker.
+        cpu_seconds: Of all of these together.
         received_bytes: Of all answers.
     """
 
@@ -217,6 +218,7 @@ class Cluster:
         self.sent_bytes, self.sent_seconds, self.received_bytes = 0, 0.0, 0
         self.views: Counter[str] = Counter()
         self.view_seconds: list[float] = []
+        self.cpu_seconds = 0.0
         self._parcels: dict[str, Parcel] = {}  # of the call that is being answered
         self._is_there = time.monotonic()  # when a worker was seen last
 

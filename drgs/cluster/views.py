@@ -77,6 +77,7 @@ def answers(
                 )
             cluster.views[said["worker"]] += 1
             cluster.view_seconds.append(said["seconds"])
+            cluster.cpu_seconds += said["cpu_seconds"]
             cluster.received_bytes += sum(getattr(x, "nbytes", 8) for x in said["answer"].values())
             yield _tensors(said["answer"])
     finally:
@@ -101,11 +102,12 @@ def ask(ours: Mapping[str, str], scene: str, questions: str, number: int, view: 
         number: Of the question.
         view: Camera and mask, pickled.
     Returns:
-        `answer`, arrays by name, and `seconds`; or what is `missing`; always `worker` and its `address`.
+        `answer`, arrays by name, `seconds` and the process's `cpu_seconds`; or what is `missing`; always `worker`, its
+        `address` and its `host`.
     """
     said: dict[str, Any] = {**this_worker()}
     check_agreement(said["worker"], statement(), ours)
-    began = time.perf_counter()
+    began, cpu = time.perf_counter(), time.process_time()
     try:
         seen, asked = opened_parcel(scene), opened_parcel(questions)
     except Missing as missing:
@@ -113,4 +115,5 @@ def ask(ours: Mapping[str, str], scene: str, questions: str, number: int, view: 
     camera, mask = pickle.loads(view)
     found = asked[number](seen, camera, mask)
     answer = {name: x.detach().cpu().numpy() for name, x in found.items()}
-    return said | {"answer": answer, "seconds": time.perf_counter() - began}
+    seconds = time.perf_counter() - began
+    return said | {"answer": answer, "seconds": seconds, "cpu_seconds": time.process_time() - cpu}
