@@ -333,7 +333,7 @@ def scheduler():
     """A scheduler without workers: host and port."""
     from distributed import LocalCluster
 
-    made = LocalCluster(n_workers=0, dashboard_address=None, host="127.0.0.1", silence_logs=logging.CRITICAL)
+    made = LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", host="127.0.0.1", silence_logs=logging.CRITICAL)
     yield made.scheduler_address.removeprefix("tcp://")
     made.close(timeout=10)
 
@@ -478,7 +478,7 @@ def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_fol
     on where it was, and ends with the numbers of a cell that nobody disturbed.
     """
     scaled(cluster, 2)
-    study = study_of(still_folder / "data", max_steps=40)
+    study = study_of(still_folder / "data", max_steps=24)
     cells = study.cells([("still", (4, 1), "first", "blind", 0)])
     run = tmp_path / "runs" / study.name / cells[0].name
     said, killed = [], []
@@ -501,7 +501,7 @@ def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_fol
     found = {cell_of(row)[1]: row for row in read_study(rows)}
     assert set(found) == set(cells)
     events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    assert [event["step"] >= 4 for event in events if event["event"] == "resume"] == [True]
+    assert [event["step"] > 0 for event in events if event["event"] == "resume"] == [True]
     alone = run_cell(study, cells[0], tmp_path / "alone")
     assert found[cells[0]]["metrics"] == alone["metrics"]
     assert found[cells[0]]["picks"] == alone["picks"]

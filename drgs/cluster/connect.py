@@ -9,6 +9,7 @@ is refused as well. Dask runs what anyone sends to its scheduler: see docs/many-
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib.util
 import logging
@@ -21,6 +22,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
@@ -126,6 +128,7 @@ def _joined(address: str) -> Client:
 
     name = address.removeprefix("tcp://")
     try:
+        _knock(address)
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False, name="drgs")
     except (OSError, TimeoutError, ImportError, ValueError, RuntimeError):
         raise ConnectionError(
@@ -143,6 +146,20 @@ def _joined(address: str) -> Client:
     return client
 
 
+def _knock(address: str) -> None:
+    """Find out in bounded time whether Dask answers: its client waits forever for who accepts and says nothing."""
+    from distributed.comm import connect
+
+    async def greeted() -> None:
+        (await connect(address, timeout=CONNECT_SECONDS)).abort()
+
+    def knock() -> None:
+        asyncio.run(asyncio.wait_for(greeted(), CONNECT_SECONDS))
+
+    with ThreadPoolExecutor(1) as other:  # the caller's thread may have an event loop
+        other.submit(knock).result()
+
+
 def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
     """A scheduler in a thread of this process, workers in processes of their own, all on the loopback interface."""
     import dask
@@ -152,6 +169,8 @@ def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
     one = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"), "1")
     config = {
         "distributed.worker.multiprocessing-method": "spawn",  # a fork would have Dr.Jit's locks, not its threads
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
         "distributed.nanny.pre-spawn-environ": {},  # it would be written into the environment of this process
     }
     environ = {**one, "DRGS_VARIANT": variant, "OMP_WAIT_POLICY": "PASSIVE"}
@@ -162,7 +181,7 @@ def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
-                dashboard_address=None,
+                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
                 memory_limit=0,  # nothing is spilled, paused or restarted for its memory
                 local_directory=folder,
                 silence_logs=logging.CRITICAL,
