@@ -28,7 +28,7 @@ from drgs.guards.arguments import must_be
 from drgs.guards.doors import Masks, camera_list, check_any_scene, mask_list
 from drgs.guards.imports import imported_function
 from drgs.information.cache import Cache
-from drgs.information.pool import Pick, Pool, Scoring, Selection
+from drgs.information.pool import Pick, Pool, Scoring, Selection, Workers
 from drgs.policies.informed import coverage, fisher, fisherrf, moments
 from drgs.policies.spread import farthest, random, uniform
 
@@ -53,6 +53,7 @@ def select(
     lazy: bool = True,
     progress: Callable[[int, int], object] | None = None,
     information: Callable[[Camera], Information] | None = None,
+    workers: Workers | None = None,
     **fields: Any,
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
@@ -82,6 +83,8 @@ def select(
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
+        workers: Processes that compute what single views tell, here or on other machines
+            (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
         **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
@@ -100,6 +103,8 @@ def select(
         raise ValueError(f"select: rng must be a torch.Generator that is kept between calls, got {rng!r}; make one")
     if masks is not None and information is not None:
         raise ValueError("select: masks must be None with information, got both; it knows by itself what views tell")
+    if workers is not None and information is not None:
+        raise ValueError("select: workers must be None with information, got both; a function is called here")
     pool = Pool(
         scene=gaussians,
         candidates=candidates,
@@ -113,6 +118,7 @@ def select(
         lazy=lazy,
         progress=progress,
         information=information,
+        workers=workers,
     )
     selection = chosen(pool)
     selection.seconds = time.perf_counter() - started

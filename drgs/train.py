@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.parts import Parts
+    from drgs.information.pool import Workers
 
 __all__ = ["ActiveConfig", "FitConfig", "FitResult", "Trainer", "fit"]
 
@@ -80,6 +81,7 @@ def fit(
     parts: Parts | None = None,
     resume: bool = False,
     progress: bool = True,
+    workers: Workers | None = None,
 ) -> FitResult:
     """Fit Gaussians to a data set and write a run folder.
 
@@ -93,6 +95,7 @@ def fit(
             its own: they hold networks and their optimizers.
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
+        workers: Processes that compute what candidates of an active fit tell, as `drgs.select` takes them.
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
             not finite.
@@ -104,7 +107,7 @@ def fit(
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
-            return _fit(dataset, out_dir, config, active, parts, resume)
+            return _fit(dataset, out_dir, config, active, parts, resume, workers)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
@@ -121,6 +124,7 @@ def _fit(
     active: ActiveConfig | None,
     parts: Parts | None,
     resume: bool,
+    workers: Workers | None,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
     train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
@@ -128,7 +132,7 @@ def _fit(
         check_parallax(train)
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
-    plan = ActiveViews(active, train, config, motion is not None) if active else None
+    plan = ActiveViews(active, train, config, motion is not None, workers) if active else None
     if active and active.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
     # Parts of a caller's own say themselves what is fitted to what.

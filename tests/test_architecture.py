@@ -43,6 +43,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
     ({"studies"}, "many fits, and what they say together"),
+    ({"cluster"}, "all of this in other processes, on one machine or many"),
     ({"viewing"}, "a scene in the browser, whatever command says which"),
     ({"crossval", "ladder", "testing"}, "the lab's doors, for users"),
     ({"commands"}, "one module a command: options in, files out"),

@@ -233,3 +233,21 @@ def test_opacity_of_the_diagonal(blob, ring, preset):
         assert wanted.sum() > 100
     with pytest.raises(ValueError, match="seen_opacity must be of the 2 views and their sizes"):
         fisher.backdrop(blob, ring[:2], settings, seen_opacity=found)
+
+
+def test_a_pick_renders_no_view_for_its_opacity(blob, ring, monkeypatch):
+    """The diagonal has it. What is rendered beside are the small pictures that say how far away the sphere is."""
+    sizes, render = [], drgs.integrator.render
+
+    def counted(scene, camera, *arguments, **options):
+        sizes.append(camera.width * camera.height)
+        return render(scene, camera, *arguments, **options)
+
+    large = [camera.resized(96, 72) for camera in ring]
+    wanted = [pick.index for pick in select(blob, large[1:], large[:1], 2, settings=SETTINGS).picks]
+    monkeypatch.setattr(drgs.integrator, "render", counted)
+    found = select(blob, large[1:], large[:1], 2, settings=SETTINGS)
+    assert [pick.index for pick in found.picks] == wanted
+    assert len(sizes) == len(large)
+    assert max(sizes) <= 1200
+    assert "backdrop" in found.blocks

@@ -277,7 +277,7 @@ def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
         with pytest.raises(InUse, match="must not be written by two commands at once"):
             run_cell(study, cells[0], tmp_path)
         left = run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None)
-        assert left == ([cells[0]], [])
+        assert left == ([cells[0]], {})
     finally:
         other.kill()
         other.wait()

@@ -6,6 +6,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from drgs import data
+from drgs.commands.clustered import check_workers, workers_of
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
 from drgs.files import Run
@@ -25,6 +26,7 @@ def run(args: Fit) -> None:
     names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
     config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
     active = args.active()
+    check_workers(args)
     # Before minutes of reading images and triangulating points.
     claim_run(Run(args.output), "fit", args.resume, [args.data])
     dataset = data.load(
@@ -39,7 +41,10 @@ def run(args: Fit) -> None:
         strict=args.strict,
         semantics=config.semantics != "ignore",
     )
-    result = fit(dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet)
+    with workers_of(args) as workers:
+        result = fit(
+            dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet, workers=workers
+        )
     page = result.run.path / FILE
     if args.report:
         report_of(result.run, page, dataset)

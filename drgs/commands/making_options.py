@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from drgs.commands.option_groups import Common, OutputPath, Timed
+from drgs.commands.option_groups import Clustered, Common, OutputPath, Timed
 from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
 
 __all__ = ["Demo", "Reproduce", "Scene", "Sfm", "Teach"]
@@ -87,7 +87,7 @@ class Scene(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Reproduce(Common):
+class Reproduce(Common, Clustered):
     """Repeat a table of arXiv 2512.22771 on made scenes or on your data: fits by every policy, means, intervals."""
 
     what: Positional[ExperimentName]

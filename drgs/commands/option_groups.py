@@ -18,6 +18,7 @@ __all__ = [
     "BLOCKS_TEXT",
     "Around",
     "Choosing",
+    "Clustered",
     "Common",
     "Comparing",
     "Data",
@@ -210,6 +211,16 @@ class Choosing(Informed):
     """Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace."""
     seed: int = 0
     """Seed of everything random."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Clustered:
+    """Options of commands that can let other processes compute."""
+
+    scheduler: str | None = None
+    """HOST:PORT of a Dask cluster whose workers compute what views tell (docs/many-machines.md)."""
+    workers: int | None = None
+    """The same on this machine: so many processes of one thread each."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from drgs.commands.option_groups import (
     Around,
     Choosing,
+    Clustered,
     Common,
     Comparing,
     Data,
@@ -105,7 +106,7 @@ class Render(Settings, Around, Views, Moments):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(Choosing, Data, Taught, Moving):
+class Fit(Choosing, Clustered, Data, Taught, Moving):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
@@ -175,6 +176,11 @@ class Fit(Choosing, Data, Taught, Moving):
             ValueError: If an option is out of range, or belongs to --views active and that is missing.
         """
         fields = dataclasses.fields(ActiveConfig)
+        if self.views != "active" and (self.scheduler, self.workers) != (None, None):
+            raise ValueError(
+                "fit: --scheduler and --workers must have --views active, got --views all; workers compute what "
+                "candidates tell, the fit itself is one process"
+            )
         if self.views == "active":
             return ActiveConfig(**{field.name: getattr(self, field.name) for field in fields})
         for field in fields:
@@ -185,7 +191,7 @@ class Fit(Choosing, Data, Taught, Moving):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Select(Choosing, Comparing):
+class Select(Choosing, Clustered, Comparing):
     """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
     candidates: str

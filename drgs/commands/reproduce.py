@@ -5,9 +5,10 @@ from __future__ import annotations
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drgs.commands import fisher
+from drgs.commands.clustered import check_workers, workers_of
 from drgs.commands.options import Fisher
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -22,6 +23,7 @@ from drgs.studies.rows import Cell, cell_of, read_study
 from drgs.studies.sheets import comparison_sheet
 
 if TYPE_CHECKING:
+    from drgs.cluster.connect import Cluster
     from drgs.commands.making_options import Reproduce
 
 __all__ = ["run"]
@@ -32,6 +34,7 @@ _FIGURE = "all views"  # is given what the others choose from: no row of the she
 
 def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
+    check_workers(args)
     out: Path = args.output
     claim(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
     _same_data(out, args.data)
@@ -52,7 +55,11 @@ def run(args: Reproduce) -> None:
     done = {cell_of(row) for row in read_study(out / _ROWS)}
     there = sum((plan.study.name, cell) in done for cell in plan.cells)
     say(f"{len(plan.cells)} cells, {there} of them are finished: {out / _ROWS}")
-    taken, failed = run_cells(plan.study, plan.cells, out / "runs", out / _ROWS, say, progress=not args.quiet)
+    with workers_of(args) as workers:
+        where = plan.study, plan.cells, out / "runs", out / _ROWS, say
+        taken, failed = run_cells(*where, not args.quiet) if workers is None else _run_on(workers, *where)
+    if taken:
+        say(f"{len(taken)} cells are with other processes: repeat the command when these have ended")
     rows = [row for row in read_study(out / _ROWS) if cell_of(row) in {(plan.study.name, cell) for cell in plan.cells}]
     pictures = _figures(plan, out, args) if args.figures else []
     _write(plan, rows, out, args, pictures)
@@ -65,6 +72,13 @@ def run(args: Reproduce) -> None:
             f"reproduce: all cells must end, {count} failed, the first, {cell.name}, with: {reason}; correct that and "
             "repeat the command, finished cells are kept"
         )
+
+
+def _run_on(workers: Cluster, *where: Any) -> tuple[list[Cell], dict[Cell, str]]:
+    """`run_cells` on workers; loads Dask."""
+    from drgs.cluster.cells import run_cells_on
+
+    return run_cells_on(workers, *where)
 
 
 def _same_data(out: Path, given: Sequence[Path]) -> None:

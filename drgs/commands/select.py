@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from drgs.commands.clustered import check_workers, workers_of
 from drgs.commands.given import Given
 from drgs.commands.viewpoints import check_counts, known_views, other_views, timed
 from drgs.data.camera_lists import described
@@ -34,6 +35,7 @@ _SHORT = {
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
     check_counts(args)
+    check_workers(args)
     args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior.given(args.prior, args.relative_prior)
@@ -54,7 +56,8 @@ def run(args: Select) -> None:
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     candidates, train = timed(candidates, args, given), timed(known.cameras, args, given)
-    with Bar("information", len(known.cameras) + len(candidates), not args.quiet) as bar:
+    views = len(known.cameras) + len(candidates)
+    with workers_of(args) as workers, Bar("information", views, not args.quiet) as bar:
         selection = select(
             given.scene,
             candidates,
@@ -64,6 +67,7 @@ def run(args: Select) -> None:
             scoring=scoring,
             rng=torch.Generator().manual_seed(args.seed),
             progress=bar.update,
+            workers=workers,
         )
     nothing = [None] * len(candidates)
     rows = zip(candidates, selection.scores, selection.parts or nothing, selection.unseen or nothing, strict=True)

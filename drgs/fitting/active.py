@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.fitting.config import ActiveConfig, FitConfig
     from drgs.information.choices import Block
+    from drgs.information.pool import Workers
 
 __all__ = ["SELECTION", "ActiveViews"]
 
@@ -59,18 +60,26 @@ class ActiveViews:
         pool_leak: Whether initial points have seen views that were not picked.
     """
 
-    def __init__(self, active: ActiveConfig, views: list[View], config: FitConfig, moves: bool = False) -> None:
+    def __init__(
+        self,
+        active: ActiveConfig,
+        views: list[View],
+        config: FitConfig,
+        moves: bool = False,
+        workers: Workers | None = None,
+    ) -> None:
         """
         Args:
             active, config: Of the fit.
             views: Its training split.
             moves: Whether a deformation is fitted.
+            workers: Processes that compute what candidates tell, as `drgs.select` takes them.
         Raises:
             ValueError: As `Timetable.of`, and if there are no views.
         """
         if not views:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
-        self.active, self.views, self._config = active, list(views), config
+        self.active, self.views, self._config, self._workers = active, list(views), config, workers
         self.timetable = Timetable.of(active, self.views, config, moves)
         first, last = len(self.timetable.start), len(self.timetable.start) + self.timetable.add - 1
         for count in active.measure:
@@ -255,6 +264,7 @@ class ActiveViews:
                 masks=[_reduced(frame.mask, camera) for frame, camera in zip(frames, seen, strict=True)],
                 empty_outside=all(frame.is_object for frame in frames if frame.mask is not None),
                 progress=bar.update,
+                workers=self._workers,
             )
         best = selection.picks[0]
         index, count = left[best.index], len(left)

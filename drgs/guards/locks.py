@@ -12,7 +12,7 @@ from pathlib import Path
 
 from drgs.guards.json_files import parse_json
 
-__all__ = ["NAME", "InUse", "acquire", "release"]
+__all__ = ["NAME", "InUse", "acquire", "host_of", "release"]
 
 NAME = ".drgs.lock"
 """Name of the lock in the folder that is being written."""
@@ -63,6 +63,12 @@ def release(folder: Path) -> None:
         owner = _owner(path)
         if owner and all(owner.get(key) == value for key, value in _this_process().items()):
             path.unlink()
+
+
+def host_of(folder: Path) -> str | None:
+    """The machine whose process writes into a folder; None if nobody does, or nobody knows."""
+    host = (_owner(folder / NAME) or {}).get("host")
+    return host if isinstance(host, str) else None
 
 
 def _refuse_if_running(folder: Path, path: Path, owner: dict) -> None:

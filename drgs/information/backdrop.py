@@ -15,7 +15,7 @@ Cells are those of a cube around its center whose faces have 16x16 of them, spac
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,29 +52,41 @@ class Sphere:
     radius: float
 
 
-def backdrop_sphere(scene: Scene, cameras: Sequence[Camera]) -> Sphere | None:
+def backdrop_sphere(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    answers: Callable[[Callable, Sequence[Camera]], Iterable[Mapping[str, torch.Tensor]]] | None = None,
+) -> Sphere | None:
     """Around all cameras, as far away as nearly all surfaces that they show, each at its time; None: infinitely far
     away, where they show none.
-    """
-    from drgs.integrator import render
 
+    Args:
+        scene, cameras: What is seen, by whom.
+        answers: Asks the scene's views, in place of one after another here (`Pool.answers`).
+    """
     if not cameras:
         raise ValueError("fisher.backdrop_sphere: there must be at least one camera, got none")
     centers = np.stack([camera.center for camera in cameras])
-    center, depths = centers.mean(0), []
-    for camera in cameras:
-        with torch.no_grad():
-            plain, small = colors_only(scene, camera.time), at_most(camera, _PIXELS)
-            # `fast` measures depth along the ray, `ewa` along the axis of the camera.
-            out = render(plain, small, RenderSettings.preset("fast"), outputs=("median_depth",))
-        assert out.median_depth is not None
-        depths.append(out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu().numpy())
-    solid = np.concatenate(depths)
+    center = centers.mean(0)
+    found = answers(_surfaces, cameras) if answers else (_surfaces(scene, camera) for camera in cameras)
+    solid = np.concatenate([one["depths"].numpy() for one in found])
     if not len(solid):
         return None
     outermost = float(np.linalg.norm(centers - center, axis=1).max())
     radius = max(float(np.quantile(solid, _FARTHEST)), _AROUND * outermost)
     return Sphere((float(center[0]), float(center[1]), float(center[2])), radius)
+
+
+def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """(P,) depths of what is solid in a small picture of a view."""
+    from drgs.integrator import render
+
+    with torch.no_grad():
+        plain, small = colors_only(scene, camera.time), at_most(camera, _PIXELS)
+        # `fast` measures depth along the ray, `ewa` along the axis of the camera.
+        out = render(plain, small, RenderSettings.preset("fast"), outputs=("median_depth",))
+    assert out.median_depth is not None
+    return {"depths": out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu()}
 
 
 def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor:

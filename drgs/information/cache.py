@@ -45,6 +45,10 @@ class Cache:
         self._views.clear()
         self._scene = None
 
+    def has(self, scene: Scene, key: Hashable) -> bool:
+        """Whether `get` would find something stored."""
+        return self._scene is not None and self._scene.is_still(scene) and key in self._views
+
     def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
         """What is stored under a key for this scene, else what `compute` returns.
 

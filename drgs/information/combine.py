@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
-__all__ = ["Asked", "Combination", "asked_of"]
+__all__ = ["Asked", "Combination", "Questions", "asked_of"]
 
 _SAME = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
 
@@ -55,14 +55,26 @@ class Asked:
     known: bool = True
 
     def __call__(
-        self, scene: Scene, camera: Camera, settings: RenderSettings, mask: torch.Tensor | None = None
+        self,
+        scene: Scene,
+        camera: Camera,
+        settings: RenderSettings,
+        mask: torch.Tensor | None = None,
+        opacity: list[torch.Tensor] | None = None,
     ) -> Information:
-        """What one view says."""
+        """What one view says.
+
+        `opacity` gets the view's, where it is found on the way, and is where it is looked for.
+        """
         from drgs import fisher  # loads Dr.Jit, which policies that ask nothing need not have
 
         options: dict[str, Any] = dict(self.options)
         # `diagonal` also knows the parameters that a scene computes its Gaussians from, but no closed form for them.
         own = self.function == "diagonal" and (options.get("groups") is None or options["method"] in _OF_SCENES)
+        if self.function == "diagonal" and options.get("method") == "exact":
+            options["seen_opacity"] = opacity
+        elif self.function == "backdrop" and opacity:
+            options["seen_opacity"] = opacity[:1]
         with torch.no_grad():  # information is a number
             seen = scene if own or self.function == "network" else scene.at(camera.time)
             if mask is not None:
@@ -77,6 +89,30 @@ class Asked:
 
 
 _OF_SCENES = ("columns", "probes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Questions:
+    """All that a view is asked, as data, which other processes can be sent.
+
+    Attributes:
+        settings: Of the renderer.
+        asked: In the order of asking.
+        empty_outside: Whether it is known that nothing is outside of masks, so that the view has shown it.
+    """
+
+    settings: RenderSettings
+    asked: tuple[Asked, ...]
+    empty_outside: bool = False
+
+    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+        """What one view says, in float32, as it is kept."""
+        found: dict[str, torch.Tensor] = {}
+        opacity: list[torch.Tensor] = []
+        for one in self.asked:
+            empty = one.function == "backdrop" and self.empty_outside
+            found |= one(scene, camera, self.settings, None if empty else mask, opacity)
+        return {name: x.to(torch.float32) for name, x in found.items()}
 
 
 @dataclasses.dataclass(frozen=True)

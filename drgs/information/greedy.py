@@ -14,7 +14,7 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator, Sequence
 
 import torch
 
@@ -24,12 +24,12 @@ from drgs.guards.memory import available
 from drgs.information.cache import camera_key, value_key
 from drgs.information.combine import Combination
 from drgs.information.network_groups import NETWORK_GROUPS
-from drgs.information.pool import Pool, Selection
+from drgs.information.pool import Pool, Question, Selection
 
 __all__ = ["InformationSource", "ViewInformation", "greedy"]
 
-InformationSource = tuple[Callable[[Camera, torch.Tensor | None], Information], Hashable]
-"""Camera and mask -> Information, and the key of the cache: what that depends on besides scene, camera and mask."""
+InformationSource = tuple[Question, Hashable]
+"""What views are asked, and the key of the cache: what the answer depends on besides scene, camera and mask."""
 
 _SHARE = 0.25  # of the memory there is, for information that could be computed again
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
@@ -54,17 +54,36 @@ class ViewInformation:
         self.computed = self.done = 0
         self._expected = len(pool.train) + len(pool.candidates)
         self.told: dict[str, bool] = {}
+        self._coming: Iterator[Information] | None = None
+
+    def ahead(self, views: Sequence[tuple[Camera, bool, torch.Tensor | None]]) -> None:
+        """Say which views will be asked for next, in this order: (camera, is known, mask). Workers begin with them."""
+        pool, wanted, seen = self.pool, [], set()
+        if pool.workers is None:
+            return
+        for camera, is_known, mask in views:
+            question, key = self._key(camera, is_known, mask)
+            if pool.cache is None or not (key in seen or pool.cache.has(pool.scene, key)):
+                wanted.append((question, camera, mask))
+            seen.add(key)
+        self._coming = pool.workers.each(pool.scene, wanted)
+
+    def _key(self, camera: Camera, is_known: bool, mask: torch.Tensor | None) -> tuple[Question, Hashable]:
+        """What a view is asked, and the key under which the cache keeps the answer."""
+        question, key = self.known if is_known else self.source
+        if self.pool.cache is None:
+            return question, None
+        return question, (key, camera_key(camera), None if mask is None else value_key(mask))
 
     def __call__(
         self, what: str, camera: Camera, is_known: bool = False, mask: torch.Tensor | None = None
     ) -> Information:
         """Of one view; `what` it is, for messages."""
-        pool, (compute, key) = self.pool, self.known if is_known else self.source
+        pool, (question, key) = self.pool, self._key(camera, is_known, mask)
         if pool.cache is None:
-            found = self._new(what, camera, mask, compute)
+            found = self._new(what, camera, mask, question)
         else:
-            view = (key, camera_key(camera), None if mask is None else value_key(mask))
-            found = pool.cache.get(pool.scene, view, lambda: self._new(what, camera, mask, compute))
+            found = pool.cache.get(pool.scene, key, lambda: self._new(what, camera, mask, question))
         for name, x in found.items():
             if name.rpartition(".")[2] in NETWORK_GROUPS:
                 self.told[name] = self.told.get(name, False) or bool(x.any())
@@ -77,8 +96,9 @@ class ViewInformation:
         """So many views will be asked for once more, for `progress`."""
         self._expected += more
 
-    def _new(self, what: str, camera: Camera, mask: torch.Tensor | None, compute: Callable) -> Information:
-        found = {name: x.to(torch.float32) for name, x in compute(camera, mask).items()}
+    def _new(self, what: str, camera: Camera, mask: torch.Tensor | None, question: Question) -> Information:
+        answer = question(self.pool.scene, camera, mask) if self._coming is None else next(self._coming)
+        found = {name: x.to(torch.float32) for name, x in answer.items()}
         self.computed += 1
         check(f"select: {what}", found, self.pool.scoring.criterion)
         return found
@@ -134,7 +154,9 @@ def _first_round(
     H: dict[str, torch.Tensor] = {}
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
-    for i, (camera, mask) in enumerate(zip(pool.train, pool.masks or [None] * len(pool.train), strict=True)):
+    masks, candidates = pool.masks or [None] * len(pool.train), [(camera, False, None) for camera in pool.candidates]
+    information.ahead([*((x, True, mask) for x, mask in zip(pool.train, masks, strict=True)), *candidates])
+    for i, (camera, mask) in enumerate(zip(pool.train, masks, strict=True)):
         part = information(f"training view {i} ({camera.name})", camera, is_known=True, mask=mask)
         H = H or _nothing(part)
         _add(H, part)
@@ -160,6 +182,7 @@ def _first_round(
         score = combination.scorer(H, everything)
         if not keeps:
             information.expect(len(views))
+            information.ahead(candidates)
         gains = [score(kept[i] if keeps else information(what, camera)) for i, what, camera in views]
     return H, everything, gains, kept
 

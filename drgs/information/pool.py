@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Protocol
 
 import torch
 
@@ -26,7 +27,7 @@ from drgs.information.network_groups import network_groups
 from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
 
-__all__ = ["Pick", "Pool", "Scoring", "Selection"]
+__all__ = ["Pick", "Pool", "Question", "Scoring", "Selection", "Workers"]
 
 _KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
 
@@ -193,6 +194,19 @@ class Selection:
     seconds: float = 0.0
 
 
+Question = Callable[[Scene, Camera, torch.Tensor | None], Information]
+"""What is asked of a view: scene, camera and mask -> tensors by name. Other processes can be sent it."""
+
+
+class Workers(Protocol):
+    """Other processes that views are asked about in; `drgs.cluster.connect.Cluster` is some."""
+
+    def each(
+        self, scene: Scene, views: Sequence[tuple[Question, Camera, torch.Tensor | None]]
+    ) -> Iterator[Information]:
+        """The answers, in the order of the views, with the bits that this process would find with one thread."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pool:
     """Everything that a policy may look at: the scene, the views that are known and those to choose from.
@@ -210,6 +224,7 @@ class Pool:
         lazy: Whether greedy policies leave out scores that cannot win; see `drgs.information.greedy`.
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
+        workers: Where information is computed; None: here.
     """
 
     scene: Scene
@@ -224,6 +239,13 @@ class Pool:
     lazy: bool = True
     progress: Callable[[int, int], object] | None = None
     information: Callable[[Camera], Information] | None = None
+    workers: Workers | None = None
+
+    def answers(self, question: Question, cameras: Iterable[Camera]) -> Iterator[Information]:
+        """What views say, one after another: computed by the workers, if there are any."""
+        if self.workers is not None:
+            return self.workers.each(self.scene, [(question, camera, None) for camera in cameras])
+        return (question(self.scene, camera, None) for camera in cameras)
 
     def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:
         """A `Pick` with plain numbers."""

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.cameras import Camera
 from drgs.gain import Information
 from drgs.information.backdrop import backdrop_sphere
-from drgs.information.combine import Asked, Combination, asked_of
+from drgs.information.combine import Asked, Combination, Questions, asked_of
 from drgs.information.greedy import InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pool, Selection
 from drgs.information.semantics import SemanticMetric
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Scene
+    from drgs.settings import RenderSettings
 
 __all__ = ["coverage", "fisher", "fisherrf", "moments"]
 
@@ -38,7 +42,7 @@ def fisher(pool: Pool) -> Selection:
         metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
     sphere = None
     if "backdrop" in blocks:
-        sphere = backdrop_sphere(pool.scene, [*pool.train, *pool.candidates])
+        sphere = backdrop_sphere(pool.scene, [*pool.train, *pool.candidates], pool.answers)
     asked, combination = asked_of(scoring, blocks, metric, sphere)
     selection = _greedy(pool, asked, combination)
     selection.blocks, selection.semantics = list(blocks), metric.to_json() if metric else None
@@ -81,17 +85,11 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
     settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
 
     def by(asked: Sequence[Asked]) -> InformationSource:
-        def compute(camera: Camera, mask: torch.Tensor | None) -> Information:
-            found: dict[str, torch.Tensor] = {}
-            for one in asked:
-                empty = one.function == "backdrop" and pool.empty_outside  # which the view has shown
-                found |= one(pool.scene, camera, settings, None if empty else mask)
-            return found
-
-        return compute, (settings, *asked)
+        return Questions(settings, tuple(asked), pool.empty_outside), (settings, *asked)
 
     if own := pool.information:
-        return greedy(pool, ViewInformation(pool, (lambda camera, mask: own(camera), (own, settings))), combination)
+        source: InformationSource = (lambda scene, camera, mask: own(camera)), (own, settings)
+        return greedy(pool, ViewInformation(pool, source), combination)
     known = None if all(one.known for one in asked) else by([one for one in asked if one.known])
     return greedy(pool, ViewInformation(pool, by(asked), known), combination)
 
@@ -110,12 +108,9 @@ def moments(pool: Pool) -> Selection:
 
     It needs no training views, and picks do not change it: k picks are the k best, whatever they share.
     """
-    from drgs.information.moments import moments_map  # loads Dr.Jit, which the policies below need not have
-
     scores = []
-    for number, camera in enumerate(pool.candidates, 1):
-        found = moments_map(pool.scene.at(camera.time), camera, pool.scoring.settings)
-        scores.append(float(found.double().mean()))
+    for number, found in enumerate(pool.answers(_Moments(pool.scoring.settings), pool.candidates), 1):
+        scores.append(float(found["moments"]))
         if pool.progress:
             pool.progress(number, len(pool.candidates))
     order = sorted(range(len(scores)), key=lambda i: -scores[i])  # stable: ties by index
@@ -125,3 +120,15 @@ def moments(pool: Pool) -> Selection:
         picks.append(pool.pick(i, scores[i], margin=margin))
     notes = ["moments rank candidates one by one: picks do not take each other into account"] if pool.k > 1 else []
     return Selection(picks, scores, evaluations=len(scores), notes=notes)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Moments:
+    """The mean over a view's pixels of the variance along their rays, as a question."""
+
+    settings: RenderSettings
+
+    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+        from drgs.information.moments import moments_map  # loads Dr.Jit, which other policies need not have
+
+        return {"moments": moments_map(scene.at(camera.time), camera, self.settings).double().mean()}

@@ -32,7 +32,7 @@ from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.train import fit
 
-__all__ = ["Metric", "Study", "distinct_seeds", "run_cell", "run_cells"]
+__all__ = ["Metric", "Study", "distinct_seeds", "result_line", "run_cell", "run_cells"]
 
 _Unit = tuple[str, tuple[int, int] | str, Start, str, int]
 
@@ -260,9 +260,14 @@ def run_cells(
             failed[cell] = str(error)
             continue
         append_row(rows, row)
-        numbers = ", ".join(_said(m, row["metrics"][m.key]) for m in study.metrics)
-        say(f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else ""))
+        say(result_line(study, cell, row))
     return taken, failed
+
+
+def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
+    """What a finished cell has found, in a line."""
+    numbers = ", ".join(_said(m, row["metrics"][m.key]) for m in study.metrics)
+    return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
 
 
 def _said(metric: Metric, value: float | None) -> str:

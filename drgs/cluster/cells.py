@@ -1,0 +1,255 @@
+"""Cells of a study, each on the next worker that is free: fitted in the run folders that all of them share.
+
+A cell whose worker dies is done again by another one, which goes on from the last checkpoint. The lock of a process
+that was killed is taken over on the machine where it ran; another machine cannot know whether it still runs, so there
+such a cell is left to a worker of that machine, or counts as taken.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import time
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drgs.cluster.agreement import check_agreement, statement, this_worker
+from drgs.cluster.parcels import Missing, opened_parcel
+from drgs.files import atomic_write
+from drgs.guards.locks import InUse, host_of
+from drgs.studies.cells import Study, result_line, run_cell
+from drgs.studies.rows import Cell, append_row, is_done, read_study
+
+if TYPE_CHECKING:
+    from distributed import Future
+
+    from drgs.cluster.connect import Cluster
+
+__all__ = ["do_cell", "run_cells_on"]
+
+_TOPIC = "drgs-cells-"
+_LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
+_ENDING = 10.0  # seconds that a process which was killed is given to be gone
+_APPEARING = 10.0  # seconds until a new file must be seen through a shared file system
+_TRIES = 20  # how often a cell is handed out again because its worker had not got the study
+
+
+def run_cells_on(
+    cluster: Cluster,
+    study: Study,
+    cells: Sequence[Cell],
+    runs: Path,
+    rows: Path,
+    say: Callable[[str], object] = print,
+) -> tuple[list[Cell], dict[Cell, str]]:
+    """Work through cells on a cluster, one at a time on each worker; rows are appended here, as they come.
+
+    A fit that fails is told and left for the next call; the others go on. On Ctrl-C, workers of this machine end;
+    those of a cluster that was joined finish the cell that they have, and its row is found by the next call.
+
+    Args:
+        cluster: The workers.
+        study: What to do. Workers call its `folder`: its data sets must lie under the same paths for all of them.
+        cells: In the order in which they are begun.
+        runs: Folder of all runs, which all workers must see under this path.
+        rows: The JSON-lines file, of this machine alone; cells that it has are skipped.
+        say: Takes a line whenever a cell begins or ends.
+    Returns:
+        Cells that other processes have, and those that failed, with the reason.
+    Raises:
+        ValueError: If a worker does not see the folder of the runs, or computes with something else than this process.
+        ConnectionError: If the scheduler, or all workers, have gone.
+    """
+    runs = runs.resolve()
+    runs.mkdir(parents=True, exist_ok=True)
+    there = read_study(rows)
+    numbered = enumerate(cells, 1)
+    left = [(number, cell) for number, cell in numbered if not is_done(study.name, cell, there, study.measured_later)]
+    if not left:
+        return [], {}
+    with _token(runs) as token:
+        _check_shared(cluster, token)
+        return _Round(cluster, study, left, len(cells), runs, rows, token, say).all()
+
+
+@contextlib.contextmanager
+def _token(runs: Path) -> Any:
+    """A small file in the folder of all runs, for the length of a block."""
+    path = runs / f".drgs.cluster.{uuid.uuid4().hex}"
+    with atomic_write(path) as file:
+        file.write(path.name.encode())
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _check_shared(cluster: Cluster, token: Path) -> None:
+    """Refuse workers that do not see a file."""
+    names = cluster.workers()
+    for address, found in cluster.client.run(sees, str(token), on_error="return").items():
+        if found is not True and not isinstance(found, OSError):
+            raise ValueError(_not_shared(names.get(address, address), token.parent))
+
+
+def _not_shared(worker: str, folder: Path) -> str:
+    return (
+        f"cluster: worker {worker} must see the folder of the runs, {folder}, as this machine does, does not; put it "
+        "on a file system that all share"
+    )
+
+
+class _Round:
+    """Cells that are on their way, and what comes back."""
+
+    def __init__(
+        self,
+        cluster: Cluster,
+        study: Study,
+        cells: Sequence[tuple[int, Cell]],
+        count: int,
+        runs: Path,
+        rows: Path,
+        token: Path,
+        say: Callable[[str], object],
+    ) -> None:
+        self.cluster, self.study, self.cells, self.count = cluster, study, cells, count
+        self.runs, self.rows, self.token, self.say = runs, rows, token, say
+        self.parcel = cluster.send(study)
+        self.topic = _TOPIC + uuid.uuid4().hex
+        self.news: queue.Queue = queue.Queue()
+        self.begun: dict[int, str] = {}  # number of the cell -> the worker that has begun it
+        self.pending: dict[int, Future] = {}
+        self.tries: dict[int, int] = {}
+        self.elsewhere: set[int] = set()  # cells that were handed to a machine that has their lock
+        self.taken: list[Cell] = []
+        self.failed: dict[Cell, str] = {}
+
+    def all(self) -> tuple[list[Cell], dict[Cell, str]]:
+        """Until every cell is done, taken or failed."""
+        named, client = dict(self.cells), self.cluster.client
+        client.subscribe_topic(self.topic, lambda event: self.news.put(("begun", event[1])))
+        try:
+            for number, cell in self.cells:
+                self.hand_out(number, cell)
+            while self.pending:
+                try:
+                    kind, what = self.news.get(timeout=_LOOK)
+                except queue.Empty:
+                    self.cluster.check_alive()
+                    continue
+                if kind == "begun":
+                    self.tell(what["number"], named[what["number"]], what["worker"])
+                else:
+                    self.take_in(what, named[what])
+        finally:
+            client.unsubscribe_topic(self.topic)
+            if self.pending:
+                client.cancel(list(self.pending.values()))
+            self.cluster.forget()
+        return self.taken, self.failed
+
+    def hand_out(self, number: int, cell: Cell, workers: list[str] | None = None) -> None:
+        """To the next worker that is free, or to one of some."""
+        where = {"workers": workers} if workers else {}
+        arguments = (self.cluster.ours, self.parcel, cell, str(self.runs), str(self.token), self.topic, number)
+        # An earlier cell first, also where it comes again because its worker has gone.
+        future = self.cluster.client.submit(do_cell, *arguments, pure=False, priority=-number, **where)
+        self.pending[number] = future
+        future.add_done_callback(lambda _: self.news.put(("done", number)))
+
+    def tell(self, number: int, cell: Cell, worker: str) -> None:
+        """That a worker has begun with a cell, and whether it has the cell of one that is gone."""
+        before = self.begun.get(number)
+        self.begun[number] = worker
+        again = "" if before is None else f", again: {before} has gone"
+        self.say(f"{number} of {self.count}: {cell.name} on worker {worker}{again}")
+
+    def take_in(self, number: int, cell: Cell) -> None:
+        """What has become of a cell."""
+        future = self.pending.pop(number)
+        try:
+            found = self.cluster.finished(future, f"cell {cell.name}")
+        except ConnectionError:
+            if self.cluster.client.status != "running":
+                raise
+            self.say(f"{cell.name}: failed: its workers died of it")
+            self.failed[cell] = "its workers died of it"
+            return
+        if "missing" in found:
+            self.tries[number] = self.tries.get(number, 0) + 1
+            if self.tries[number] > _TRIES:
+                raise ConnectionError(f"cluster: worker {found['worker']} must keep what it is sent, but forgets it")
+            self.cluster.send_again([self.parcel], [found["address"]])
+            self.hand_out(number, cell)
+        elif "unseen" in found:
+            raise ValueError(_not_shared(found["worker"], self.runs))
+        elif "taken" in found:
+            near = self.cluster.workers_of(found["taken"]) if number not in self.elsewhere else []
+            if near and found["host"] != found["taken"]:
+                self.elsewhere.add(number)
+                self.hand_out(number, cell, near)
+            else:
+                self.say(f"{cell.name}: taken: {found['why']}")
+                self.taken.append(cell)
+        elif "failed" in found:
+            self.say(f"{cell.name}: failed: {found['failed']}")
+            self.failed[cell] = found["failed"]
+        else:
+            append_row(self.rows, found["row"])
+            self.say(f"{result_line(self.study, cell, found['row'])}, worker {found['worker']}")
+
+
+# --------------------------------------------------------------------------------------------------- on the worker
+
+
+def sees(token: str) -> bool:
+    """Whether this process finds a file; runs on every worker."""
+    try:
+        return Path(token).read_bytes() == Path(token).name.encode()
+    except OSError:
+        return False
+
+
+def do_cell(
+    ours: Mapping[str, str], study: str, cell: Cell, runs: str, token: str, topic: str, number: int
+) -> dict[str, Any]:
+    """Runs on a worker: one cell.
+
+    Args:
+        ours: What the worker must agree with.
+        study: Digest of the parcel.
+        cell, runs: As `run_cell` takes them.
+        token: A file that must be seen.
+        topic, number: That the beginning is told by.
+    Returns:
+        `row`, or why there is none: `failed`, `taken` (the host that has it), `missing`, `unseen`; always `worker`,
+        its `address` and its `host`.
+    """
+    from distributed import get_worker
+
+    said: dict[str, Any] = {**this_worker()}
+    check_agreement(said["worker"], statement(), ours)
+    try:
+        whole = opened_parcel(study)
+    except Missing as missing:
+        return said | {"missing": str(missing)}
+    until = time.monotonic() + _APPEARING
+    while not sees(token):
+        if time.monotonic() > until:
+            return said | {"unseen": token}
+        time.sleep(0.5)
+    get_worker().log_event(topic, {"number": number, "worker": said["worker"]})
+    until = time.monotonic() + _ENDING
+    while True:
+        try:
+            return said | {"row": run_cell(whole, cell, Path(runs))}
+        except InUse as busy:
+            # Of a process that was killed just now, or of one that works.
+            if time.monotonic() > until:
+                return said | {"taken": host_of(Path(runs) / whole.name / cell.name), "why": str(busy)}
+            time.sleep(1.0)
+        except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            return said | {"failed": str(error)}

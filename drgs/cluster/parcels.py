@@ -1,0 +1,121 @@
+"""What is sent to workers, as bytes: pickled once, sent once to each worker in pieces, opened there when first used.
+
+Tensors travel as NumPy arrays. A worker keeps the last few parcels, so that a scene is there for all of its views.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import pickle
+from typing import Any
+
+import numpy as np
+import torch
+
+__all__ = ["Missing", "Parcel", "keep", "opened_parcel"]
+
+_KEPT = 4  # parcels of a worker: one scene, what its views were asked, and a few of the call before
+_UNFINISHED = 8  # parcels that pieces are missing of
+_PIECE = 64 << 20  # bytes of a message
+
+
+class Missing(LookupError):
+    """A worker that has not got a parcel: it has started since, or has dropped it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parcel:
+    """Something that was pickled.
+
+    Attributes:
+        digest: SHA-256 of the bytes, by which workers know it.
+        data: The bytes.
+    """
+
+    digest: str
+    data: bytes
+
+    @classmethod
+    def of(cls, thing: object) -> Parcel:
+        """Of anything that can be pickled, closures included.
+
+        Raises:
+            ValueError: If it cannot.
+        """
+        file = io.BytesIO()
+        try:
+            _pickler()(file, protocol=5).dump(thing)
+        except (pickle.PicklingError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"cluster: what is sent to workers must be picklable, {type(thing).__name__} is not ({error}); "
+                "make it of plain data and functions"
+            ) from None
+        data = file.getvalue()
+        return cls(hashlib.sha256(data).hexdigest(), data)
+
+    def pieces(self) -> list[tuple[str, int, int, bytes]]:
+        """(digest, number, count, bytes) of each message: the arguments of `keep`."""
+        starts = range(0, max(len(self.data), 1), _PIECE)
+        return [(self.digest, i, len(starts), self.data[x : x + _PIECE]) for i, x in enumerate(starts)]
+
+
+def _pickler() -> type[pickle.Pickler]:
+    """A pickler of functions without a name, and of tensors as arrays."""
+    import cloudpickle
+
+    class Pickler(cloudpickle.Pickler):
+        def reducer_override(self, x: Any) -> Any:
+            if isinstance(x, torch.Tensor) and x.dtype != torch.bfloat16:  # which NumPy does not have
+                array = np.ascontiguousarray(x.detach().cpu().numpy())
+                return _tensor, (array, tuple(x.shape), x.requires_grad, isinstance(x, torch.nn.Parameter))
+            return super().reducer_override(x)
+
+    return Pickler
+
+
+def _tensor(array: np.ndarray, shape: tuple[int, ...], has_gradient: bool, is_parameter: bool) -> torch.Tensor:
+    found = torch.from_numpy(array if array.flags.writeable else array.copy()).reshape(shape)
+    if is_parameter:
+        return torch.nn.Parameter(found, requires_grad=has_gradient)
+    return found.requires_grad_(has_gradient)
+
+
+# --------------------------------------------------------------------------------------------------- on the worker
+
+_pieces: dict[str, dict[int, bytes]] = {}
+_parcels: dict[str, bytes] = {}  # whole, not opened yet
+_things: dict[str, Any] = {}  # opened; the one that was used last comes last
+
+
+def keep(digest: str, number: int, count: int, data: bytes) -> None:
+    """Take a piece of a parcel; only the worker's event loop calls it."""
+    if digest in _parcels or digest in _things:
+        return
+    found = _pieces.setdefault(digest, {})
+    found[number] = data
+    if len(found) == count:
+        _parcels[digest] = b"".join(found[i] for i in range(count))
+        del _pieces[digest]
+    for old in list(_pieces)[:-_UNFINISHED]:  # of a client that has gone
+        del _pieces[old]
+
+
+def opened_parcel(digest: str) -> Any:
+    """What a parcel holds, the same object each time.
+
+    Raises:
+        Missing: If the worker has not got it.
+    """
+    if digest in _things:
+        _things[digest] = _things.pop(digest)
+        return _things[digest]
+    data = _parcels.pop(digest, None)
+    if data is None:
+        raise Missing(digest)
+    for old in (*_things, *_parcels)[: max(len(_things) + len(_parcels) + 1 - _KEPT, 0)]:
+        _things.pop(old, None)
+        _parcels.pop(old, None)
+    _things[digest] = pickle.loads(data)
+    return _things[digest]

@@ -1,0 +1,34 @@
+"""The workers that a command line names: `--scheduler` joins some, `--workers` starts them."""
+
+from __future__ import annotations
+
+import contextlib
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drgs.cluster.connect import Cluster
+    from drgs.commands.option_groups import Clustered
+
+__all__ = ["check_workers", "workers_of"]
+
+
+def check_workers(args: Clustered) -> None:
+    """Refuse what cannot be, before anything is read.
+
+    Raises:
+        ValueError: If an option is bad, both are given, or Dask is not installed.
+    """
+    if args.scheduler is not None or args.workers is not None:
+        from drgs.cluster.connect import check_wanted
+
+        check_wanted(args.scheduler, args.workers)
+
+
+def workers_of(args: Clustered) -> AbstractContextManager[Cluster | None]:
+    """The workers for the length of a block; None where no option asks for some, and nothing of Dask is loaded then."""
+    if args.scheduler is None and args.workers is None:
+        return contextlib.nullcontext()
+    from drgs.cluster.connect import opened
+
+    return opened(args.scheduler, args.workers)
