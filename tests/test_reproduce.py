@@ -263,3 +263,13 @@ def test_sizes_are_those_of_the_paper():
     """7,000 steps and a view every 200 of them; 17,000 where things move."""
     assert (SIZES["static", "paper"].fit.max_steps, SIZES["static", "paper"].every) == (7000, 200)
     assert SIZES["dynamic", "paper"].fit.max_steps == 17_000
+
+
+def test_a_scheduler_that_is_not_there(tmp_path, capsys):
+    """One line, before anything is made."""
+    pytest.importorskip("distributed")
+    line = ["reproduce", "static", "--scale", "tiny", "--scheduler", "127.0.0.1:9", "-o", str(tmp_path / "out")]
+    assert cli.main(line) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert "127.0.0.1:9" in said[-1]
+    assert not list((tmp_path / "out").glob("scenes/*/*/images")), "nothing was made"

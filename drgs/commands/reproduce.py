@@ -38,24 +38,24 @@ def run(args: Reproduce) -> None:
     out: Path = args.output
     claim(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
     _same_data(out, args.data)
-    plan = plan_of(
-        args.what,
-        args.scale,
-        out / "scenes",
-        args.data,
-        args.seeds,
-        args.protocol,
-        args.policies,
-        (args.test_every, args.test_offset),
-        args.lpips_weights,
-    )
     say = (lambda line: None) if args.quiet else print
-    for note in plan.notes:
-        say(f"note: {note}")
-    done = {cell_of(row) for row in read_study(out / _ROWS)}
-    there = sum((plan.study.name, cell) in done for cell in plan.cells)
-    say(f"{len(plan.cells)} cells, {there} of them are finished: {out / _ROWS}")
-    with workers_of(args) as workers:
+    with workers_of(args) as workers:  # before scenes are made: whether there are any
+        plan = plan_of(
+            args.what,
+            args.scale,
+            out / "scenes",
+            args.data,
+            args.seeds,
+            args.protocol,
+            args.policies,
+            (args.test_every, args.test_offset),
+            args.lpips_weights,
+        )
+        for note in plan.notes:
+            say(f"note: {note}")
+        done = {cell_of(row) for row in read_study(out / _ROWS)}
+        there = sum((plan.study.name, cell) in done for cell in plan.cells)
+        say(f"{len(plan.cells)} cells, {there} of them are finished: {out / _ROWS}")
         where = plan.study, plan.cells, out / "runs", out / _ROWS, say
         taken, failed = run_cells(*where, not args.quiet) if workers is None else _run_on(workers, *where)
     if taken:
