@@ -16,6 +16,7 @@ counted apart.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import os
 import re
@@ -40,7 +41,7 @@ from where import ran  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 COUNTS, PAGE = ROOT / "benchmarks" / "fuzz.json", ROOT / "docs" / "reliability.md"
-FINDINGS = ROOT / "runs" / "fuzz" / "findings"
+FINDINGS, LOCK = ROOT / "runs" / "fuzz" / "findings", ROOT / "runs" / "fuzz" / "lock"
 _MEMORY = Path("/dev/shm")  # noqa: S108 (millions of files are not for disks)
 _KEPT = 3  # inputs of one cause
 _STUCK = 60.0  # seconds by the clock without an answer, where no processor time is taken
@@ -200,10 +201,19 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def save(result: dict[str, Any]) -> None:
-    """Write counts and page."""
-    COUNTS.write_text(json.dumps(result | ran(), indent=1) + "\n")
-    fill_between(PAGE, "fuzz", table(result | ran()))
+def counted() -> dict[str, Any]:
+    """All counts so far."""
+    return json.loads(COUNTS.read_text()) if COUNTS.exists() else {"readers": {}}
+
+
+def save(name: str, row: dict[str, Any]) -> None:
+    """Write a reader's counts beside those of others, which another process may have written meanwhile, and the page."""
+    with LOCK.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        result = counted() | ran()
+        result["readers"][name] = row
+        COUNTS.write_text(json.dumps(result, indent=1) + "\n")
+        fill_between(PAGE, "fuzz", table(result))
 
 
 def main() -> None:
@@ -218,15 +228,14 @@ def main() -> None:
     if args.again is not None:
         again(args.readers[0], args.again)
         return
-    result = json.loads(COUNTS.read_text()) if COUNTS.exists() else {"readers": {}}
+    LOCK.parent.mkdir(parents=True, exist_ok=True)
     for name in args.readers:
-        row = {} if args.fresh else result["readers"].get(name, {})
-        result["readers"][name] = row
+        row = {} if args.fresh else counted()["readers"].get(name, {})
         began, before = time.monotonic(), row.get("inputs", 0)
         reader = Reader(name, row)
         reader.go_on(args.inputs, args.seconds)
         print(f"{name}: {row['inputs'] - before} inputs in {time.monotonic() - began:.0f} s, {row}", flush=True)
-        save(result)
+        save(name, row)
 
 
 if __name__ == "__main__":

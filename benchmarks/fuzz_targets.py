@@ -12,6 +12,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import fuzz_codecs as codecs
 import fuzz_seeds as seeds
 from fuzz_formats import mutate
 
@@ -134,6 +135,19 @@ def _ply(folder: Path) -> None:
     load_ply(folder / "point_cloud.ply")
 
 
+def _gaussians(folder: Path) -> None:
+    from drgs.codecs import load_gaussians
+
+    (path,) = folder.iterdir()
+    load_gaussians(path)
+
+
+def _scene(folder: Path) -> None:
+    from drgs.codecs import load_gaussians
+
+    load_gaussians(folder)
+
+
 def _points(folder: Path) -> None:
     from drgs.data.points import read_point_ply
 
@@ -234,6 +248,14 @@ TARGETS: dict[str, Target] = {
     target.name: target
     for target in (
         Target("3DGS PLY", seeds.PLY, ("*.ply",), _ply),
+        Target("SPZ", codecs.SPZ, ("*.spz",), _gaussians),
+        Target(".splat", codecs.SPLAT, ("*.splat",), _gaussians),
+        Target(".ksplat", codecs.KSPLAT, ("*.ksplat",), _gaussians),
+        Target("compressed PLY", codecs.PACKED_PLY, ("*.ply",), _gaussians),
+        Target("SOG", codecs.SOG, ("*.sog",), _gaussians),
+        Target("SOG folder", codecs.SOG_FOLDER, ("meta.json", "*.webp"), _scene),
+        Target("GLB", codecs.GLB, ("*.glb",), _gaussians),
+        Target("3DGS model folder", codecs.MODEL, ("*.ply",), _scene),
         Target("PLY point cloud", seeds.POINTS, ("*.ply",), _points),
         Target("COLMAP binary", seeds.COLMAP_BINARY, ("*.bin",), _lazy),
         Target("COLMAP text", seeds.COLMAP_TEXT, ("*.txt",), _lazy),

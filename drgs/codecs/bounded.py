@@ -10,9 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.guards.foreign import is_file
+
 __all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd"]
 
 _DAMAGED = "it is truncated or damaged, copy it again"
+_PIECE = 1 << 20  # bytes of a stream that are unpacked at once
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, OSError, OverflowError,
     RuntimeError, ValueError,
@@ -74,11 +77,14 @@ def unzstd(path: Path, frame: bytes, size: int) -> bytes:
     if size == 0:
         return b""
     try:
-        # Of the stream, and not of one call: that would allocate what the frame claims.
+        # Of the stream, and not of one call: that would allocate what the frame claims, or what is asked for.
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(io.BytesIO(frame)) as stream:
-            out = stream.read(size + 1)
+            parts = []
+            while (left := size + 1 - sum(map(len, parts))) > 0 and (part := stream.read(min(left, _PIECE))):
+                parts.append(part)
     except zstandard.ZstdError as error:
         raise ValueError(f"{path}: must be a Zstandard frame, got {error}; {_DAMAGED}") from None
+    out = b"".join(parts)
     if len(out) != size:
         got = f"{len(out)}" if len(out) < size else "more"
         raise ValueError(f"{path}: a stream must unpack to {size} bytes, got {got}; {_DAMAGED}")
@@ -132,7 +138,7 @@ class Archive:
         file = self.path / name
         if file.is_symlink() and file.resolve().parent != self.path.resolve():
             raise ValueError(f"{file}: must not lead out of its folder; copy the file there")
-        if not file.is_file():
+        if not is_file(file):
             raise FileNotFoundError(f"{file}: must be beside meta.json, found none; copy the whole folder")
         with file.open("rb") as stream:
             return stream.read(limit + 1)

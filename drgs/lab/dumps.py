@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.data.checks import check_npz
 from drgs.ellipsoids import Gaussians
 from drgs.files import atomic_write
 from drgs.guards.foreign import refuse_foreign
@@ -85,6 +86,7 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
 def is_export(path: Path) -> bool:
     """Whether `export` wrote a file; a dump that was made of one holds more arrays."""
     try:
+        check_npz(path)
         with np.load(path, allow_pickle=False) as arrays:
             return np.array_equal(arrays[_EXPORT], _signature({*arrays.files} - {_EXPORT}))
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile):
@@ -166,6 +168,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             from safetensors.numpy import load_file
 
             return load_file(path)
+        check_npz(path)
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:
