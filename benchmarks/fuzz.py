@@ -207,7 +207,7 @@ def counted() -> dict[str, Any]:
 
 
 def save(name: str, row: dict[str, Any]) -> None:
-    """Write a reader's counts beside those of others, which another process may have written meanwhile, and the page."""
+    """Write a reader's counts beside those of others, which another process may write as well, and the page."""
     with LOCK.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         result = counted() | ran()

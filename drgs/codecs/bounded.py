@@ -83,7 +83,8 @@ def unzstd(path: Path, frame: bytes, size: int) -> bytes:
             while (left := size + 1 - sum(map(len, parts))) > 0 and (part := stream.read(min(left, _PIECE))):
                 parts.append(part)
     except zstandard.ZstdError as error:
-        raise ValueError(f"{path}: must be a Zstandard frame, got {error}; {_DAMAGED}") from None
+        text = "a window above 128 MiB" if "too much memory" in str(error) else error
+        raise ValueError(f"{path}: must be a Zstandard frame, got {text}; {_DAMAGED}") from None
     out = b"".join(parts)
     if len(out) != size:
         got = f"{len(out)}" if len(out) < size else "more"

@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import tempfile
+import unicodedata
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -41,6 +42,7 @@ __all__ = [
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
 _DEFLATE = 1032  # bytes that one byte of deflate can become
+_MAX_NAME = 1000  # characters, folders included
 _SHOWN = 120  # characters of a reader's own message
 _MAX_PIXELS = 2**31
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
@@ -70,9 +72,11 @@ def file_inside(folder: Path, name: str, where: str) -> Path:
         name: What the file says.
         where: Place of the name, for the message.
     Raises:
-        ValueError: If it leaves the folder.
+        ValueError: If it leaves the folder, or no file can have that name.
     """
-    if not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder)):
+    # Names of 1,000 letters and of several lines are none; messages would repeat them.
+    is_name = len(name) <= _MAX_NAME and not any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
+    if not is_name or not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder)):
         raise ValueError(
             f"{where} must name a file in {folder}, got {name[:80]!r}; move or link the file there and name it so"
         )
