@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
+from drgs.data.checks import file_inside
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
 from drgs.data.views import Dataset, View
 from drgs.guards.foreign import is_file, refuse_foreign
@@ -72,10 +73,9 @@ def load_colmap(
         raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
+        file = file_inside(folder, image.name, f"{model}: image {index}")
         where = f"{model}: image {index} ({image.name})"
-        if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
-            raise ValueError(f"{where}: the name must stay inside {folder}, got {image.name!r}; rename it")
-        view = View(None, str(Path(image.name).with_suffix("")), image_path=folder / image.name)
+        view = View(None, str(Path(image.name).with_suffix("")), image_path=file)
         listed.append(view)
         if not is_file(view.image_path):
             absent.append(view)
