@@ -10,6 +10,7 @@ from typing import Any
 __all__ = ["can_hold", "is_whole", "stated_size"]
 
 _PIXELS_A_BYTE = 8_256  # deflate makes one byte of at most 1,032, each of at most 8 pixels of one bit
+_WEBP_SIDE = 1 << 14  # pixels: 14 bits
 _PNG = b"\x89PNG\r\n\x1a\n"
 _DIRECTORY = 4096  # entries of a TIFF that are looked at
 
@@ -28,10 +29,11 @@ def stated_size(path: Path) -> tuple[int, int] | None:
 
 
 def can_hold(path: Path, width: int, height: int) -> bool:
-    """Whether a file is large enough for so many pixels; of WebP, which has no such bound, always."""
+    """Whether a file is large enough for so many pixels; a WebP has no such bound, but one of its sides."""
     with path.open("rb") as file:
-        is_webp = file.read(4) == b"RIFF"
-    return is_webp or width * height <= _PIXELS_A_BYTE * path.stat().st_size
+        if file.read(4) == b"RIFF":
+            return max(width, height) <= _WEBP_SIDE
+    return width * height <= _PIXELS_A_BYTE * path.stat().st_size
 
 
 def is_whole(path: Path) -> bool:
@@ -60,7 +62,7 @@ def _bmp(head: bytes, file: Any) -> tuple[int, int] | None:
 
 
 def _webp(head: bytes, file: Any) -> tuple[int, int] | None:
-    if head[12:16] == b"VP8X":
+    if head[12:16] == b"VP8X":  # a canvas
         return 1 + int.from_bytes(head[24:27], "little"), 1 + int.from_bytes(head[27:30], "little")
     if head[12:16] == b"VP8L":
         (bits,) = struct.unpack("<I", head[21:25])

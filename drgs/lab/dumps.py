@@ -138,10 +138,11 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
             raise ValueError(f"{path}: grad_{name} must have shape {wanted}, got {got}")
     if pose and found[_POSE].reshape(-1).shape != scene["viewmat"].reshape(-1).shape:
         raise ValueError(f"{path}: {_POSE} must have shape {scene['viewmat'].shape}, got {found[_POSE].shape}")
-    as_tensor = {name: torch.tensor(found[name], dtype=torch.float64) for name in names if name not in scene}
+    # Through float64 of this machine: files may have another byte order, which torch refuses.
+    as_tensor = {name: torch.from_numpy(found[name].astype(np.float64)) for name in names if name not in scene}
     gradients = {name: as_tensor[f"grad_{name}"] for name in PARAMETERS}
     if pose:
-        slopes = torch.tensor(found[_POSE], dtype=torch.float64).reshape(count, 4, 4)
+        slopes = torch.from_numpy(found[_POSE].astype(np.float64)).reshape(count, 4, 4)
         gradients[POSE] = along_motions(g, cameras, slopes)
     return Dump(str(path), as_tensor["image"], as_tensor["alpha"], as_tensor["cotangent"], gradients)
 
