@@ -81,13 +81,13 @@ def unzstd(path: Path, frame: bytes, size: int) -> bytes:
     try:
         # Of the stream, and not of one call: that would allocate what the frame claims, or what is asked for.
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(io.BytesIO(frame)) as stream:
-            parts = []
-            while (left := size + 1 - sum(map(len, parts))) > 0 and (part := stream.read(min(left, _PIECE))):
-                parts.append(part)
+            found = bytearray()
+            while len(found) <= size and (part := stream.read(min(size + 1 - len(found), _PIECE))):
+                found += part
     except zstandard.ZstdError as error:
         text = "a window above 128 MiB" if "too much memory" in str(error) else error
         raise ValueError(f"{path}: must be a Zstandard frame, got {text}; {_DAMAGED}") from None
-    out = b"".join(parts)
+    out = bytes(found)
     if len(out) != size:
         got = f"{len(out)}" if len(out) < size else "more"
         raise ValueError(f"{path}: a stream must unpack to {size} bytes, got {got}; {_DAMAGED}")

@@ -42,7 +42,7 @@ __all__ = [
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
 _DEFLATE = 1032  # bytes that one byte of deflate can become
-_MAX_NAME = 1000  # characters, folders included
+_MAX_NAME = 1024  # characters, folders included
 _SHOWN = 120  # characters of a reader's own message
 _MAX_PIXELS = 2**31
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.

@@ -1,8 +1,8 @@
 """A process beside this one for a library in C++ that reads files from elsewhere: where a file makes it crash, that
 process ends, and this one says so in a line.
 
-Questions and answers are lines of JSON on a socket, arrays follow as bytes. There is one process for all files; it
-starts with the first question (0.3 s) and ends with this process.
+Questions and answers are lines of JSON on a socket, arrays lie in memory that both map. There is one process for all
+files; it starts with the first question (0.3 s) and ends with this process.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ import atexit
 import contextlib
 import json
 import logging
+import math
+import mmap
 import os
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +49,7 @@ class Child:
         self._lock, self._process, self._owner = threading.Lock(), None, 0
         self._socket: Any = None
         self._file: Any = None
+        self._shared: Any = None
 
     @property
     def pid(self) -> int | None:
@@ -78,9 +82,7 @@ class Child:
                     if "told" not in answer:
                         break
                     told(answer["told"])
-                array = np.empty(answer["shape"], np.uint8) if "shape" in answer else None
-                if array is not None and self._file.readinto(array.reshape(-1).data) != array.nbytes:
-                    raise BrokenPipeError
+                array = self._shared.array(answer["shape"]).copy() if "shape" in answer else None
             except (BrokenPipeError, ConnectionResetError):
                 code = self._process.wait()
                 self.end()
@@ -100,10 +102,11 @@ class Child:
     def _start(self) -> None:
         """Start the process with the modules of this one, out of reach of Ctrl-C."""
         self._socket, other = socket.socketpair()
+        self._shared = _Shared(_memory())
         paths = os.pathsep.join(path for path in sys.path if path)
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", self._module, str(other.fileno())],
-            pass_fds=[other.fileno()],
+            [sys.executable, "-P", "-m", self._module, str(other.fileno()), str(self._shared.fd)],
+            pass_fds=[other.fileno(), self._shared.fd],
             stdin=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": paths},
             process_group=0,
@@ -120,6 +123,7 @@ class Child:
             with contextlib.suppress(OSError):
                 self._file.close()
             self._socket.close()
+            os.close(self._shared.fd)
             atexit.unregister(self.end)
         self._process = None
 
@@ -134,7 +138,7 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
         signal.signal(name, signal.SIG_IGN)
     warnings = _Kept()
     logging.getLogger().addHandler(warnings)
-    file = socket.socket(fileno=int(sys.argv[1])).makefile("rwb")
+    file, shared = socket.socket(fileno=int(sys.argv[1])).makefile("rwb"), _Shared(int(sys.argv[2]))
 
     def tell(number: int) -> None:
         file.write(json.dumps({"told": number}).encode() + b"\n")
@@ -143,11 +147,12 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
     for line in file:
         folder, what, path, *rest = json.loads(line)
         os.chdir(folder)  # that paths are relative to
-        array, answer = None, {}  # type: tuple[np.ndarray | None, dict[str, Any]]
+        answer: dict[str, Any] = {}
         try:
             value = functions[what](Path(path), *rest, tell=tell)
             if isinstance(value, np.ndarray):
-                array, answer["shape"] = np.ascontiguousarray(value), value.shape
+                answer["shape"] = value.shape
+                shared.array(value.shape)[...] = value
             else:
                 answer["value"] = value
         except tuple(_ERRORS.values()) as error:
@@ -156,9 +161,35 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
             text = " ".join(f"{type(error).__name__}: {error}".split())[:_SHOWN]
             answer = {"error": "ValueError", "text": f"{path}: must be readable, got {text}; copy it again"}
         file.write(json.dumps({**answer, "warnings": warnings.taken()}).encode() + b"\n")
-        if array is not None:
-            file.write(array.reshape(-1).data)
         file.flush()
+
+
+class _Shared:
+    """Memory that both processes map; it only grows.
+
+    Args:
+        fd: Of the file that it is.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self.fd, self._map = fd, None
+
+    def array(self, shape: Sequence[int]) -> np.ndarray:
+        """The first bytes of it as an array of uint8."""
+        size = math.prod(shape)
+        if self._map is None or len(self._map) < size:
+            if os.fstat(self.fd).st_size < size:
+                os.ftruncate(self.fd, size)
+            self._map = mmap.mmap(self.fd, max(size, 1)) if size else None
+        return np.frombuffer(self._map or b"", np.uint8, size).reshape(shape)
+
+
+def _memory() -> int:
+    """A file without a name, in memory where there are such files."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("drgs")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
 
 
 class _Kept(logging.Handler):

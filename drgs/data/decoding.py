@@ -172,7 +172,7 @@ class _Reader:
             self._told = True
             text = complaints[0].strip()
             _log.warning("%s: is damaged, frames may be wrong (%s); copy it again", self._path, text)
-        return np.ascontiguousarray(data[..., ::-1])
+        return cv2.cvtColor(data, cv2.COLOR_BGR2RGB)
 
     def _at(self, index: int) -> np.ndarray | None:
         """The pixels of a frame (BGR), or None: going on from where the video is, by seeking, or from the start."""

@@ -42,9 +42,7 @@ class VideoFrame:
             raise ValueError(
                 f"{self.path}: frame {self.index} must be there, the video has {video.count}; load the data set again"
             )
-        is_mp4 = _check_kind(self.path)
-        with Bar(f"frames of {self.path.name}") as bar:  # where all have to be decoded
-            return _decoder.ask("frame", self.path, video.version, is_mp4, self.index, told=bar.update)
+        return _decoder.ask("frame", self.path, video.version, video.is_mp4, self.index)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +55,7 @@ class VideoFile:
         stamps: Milliseconds at which each frame is shown, ascending; empty where the file does not say.
         count: Frames that are shown.
         version: Size and time of change of the file.
+        is_mp4: It lists its frames.
     """
 
     path: Path
@@ -65,6 +64,7 @@ class VideoFile:
     stamps: tuple[float, ...] = dataclasses.field(repr=False)
     count: int
     version: tuple[int, int]
+    is_mp4: bool
 
 
 def list_videos(folder: Path) -> list[Path]:
@@ -91,7 +91,7 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
     is_mp4 = _check_kind(path)
     with Bar(f"frames of {path.name}") as bar:
         found = _decoder.ask("walk", path, version, is_mp4, told=bar.update)
-    return VideoFile(path, found["width"], found["height"], tuple(found["stamps"]), found["count"], version)
+    return VideoFile(path, found["width"], found["height"], tuple(found["stamps"]), found["count"], version, is_mp4)
 
 
 def _check_kind(path: Path) -> bool:
