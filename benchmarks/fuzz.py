@@ -10,12 +10,13 @@ them in a process of its own, one after the other. An input is known by its numb
 to benchmarks/fuzz.json, the table to docs/reliability.md.
 
 With `--atheris`, inputs are chosen by what they reach in the Python code of a reader (pip install atheris); these are
-counted apart.
+counted apart, and what reached new lines is kept in runs/fuzz/reached.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import os
 import re
@@ -40,7 +41,7 @@ from where import ran  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 COUNTS, PAGE = ROOT / "benchmarks" / "fuzz.json", ROOT / "docs" / "reliability.md"
-FINDINGS = ROOT / "runs" / "fuzz" / "findings"
+FINDINGS, LOCK = ROOT / "runs" / "fuzz" / "findings", ROOT / "runs" / "fuzz" / "lock"
 _MEMORY = Path("/dev/shm")  # noqa: S108 (millions of files are not for disks)
 _KEPT = 3  # inputs of one cause
 _STUCK = 60.0  # seconds by the clock without an answer, where no processor time is taken
@@ -53,10 +54,11 @@ class Reader:
     Args:
         name: Of `TARGETS`.
         row: What earlier runs counted; is added to.
+        corpus: Folder of what reached new lines, where atheris chooses.
     """
 
-    def __init__(self, name: str, row: dict[str, Any]) -> None:
-        self.name, self.row = name, row
+    def __init__(self, name: str, row: dict[str, Any], corpus: Path | None = None) -> None:
+        self.name, self.row, self.corpus = name, row, corpus
         for key in ("inputs", "findings", "crashes", "hangs"):
             row.setdefault(key, 0)
         row.setdefault("ends", {})
@@ -77,7 +79,7 @@ class Reader:
         line = [sys.executable, str(ROOT / "benchmarks" / "fuzz_worker.py"), self.name, str(begin), str(inputs)]
         with (scratch / "said").open("w") as said:
             pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": said}
-            process = subprocess.Popen([*line, str(scratch)], **pipes)
+            process = subprocess.Popen([*line, str(scratch), *([str(self.corpus)] if self.corpus else [])], **pipes)
         ended, number, since, spent, ready = "", begin - 1, time.monotonic(), 0.0, False
         try:
             while True:
@@ -119,7 +121,9 @@ class Reader:
             what = f"crash ({process.returncode})" if crashed else f"hang (> {SLOW:g} s)"
             self.row["crashes" if crashed else "hangs"] += 1
             self.row["inputs"] = at + 1
-            self._keep(at, what, (scratch / "crash.txt").read_text() + (scratch / "said").read_text()[-2000:])
+            damaged = _damaged(scratch)
+            news = {"file": damaged.name, "data": damaged.read_bytes()} if damaged.is_file() else None
+            self._keep(at, what, (scratch / "crash.txt").read_text() + (scratch / "said").read_text()[-2000:], news)
 
     def _hear(self, news: dict[str, Any], scratch: Path) -> None:
         row = self.row
@@ -149,7 +153,13 @@ class Reader:
 
 
 def _number(scratch: Path) -> int:
-    return struct.unpack("<q", (scratch / "number").read_bytes())[0]
+    return struct.unpack_from("<q", (scratch / "number").read_bytes())[0]
+
+
+def _damaged(scratch: Path) -> Path:
+    """The file that was read last."""
+    data = (scratch / "number").read_bytes()
+    return Path(os.fsdecode(data[10 : 10 + int.from_bytes(data[8:10], "little")]))
 
 
 def _processor(pid: int) -> float:
@@ -186,24 +196,47 @@ def table(result: dict[str, Any]) -> str:
         row = rows[name]
         known = sum(row["ends"].values()) or 1
         read = row["ends"].get("read", 0) / known
-        found = row["findings"] + row["crashes"] + row["hangs"]
-        total.update(inputs=row["inputs"], found=found)
+        total.update(inputs=row["inputs"], found=_found(row))
         lines.append(
             f"| {name} | {row['inputs']:,} | {read:.0%} | {1 - read:.0%} | {row['slowest']:.2f} s | "
-            f"{row['grown'] / 2**20:.0f} MiB | {found} |"
+            f"{row['grown'] / 2**20:.0f} MiB | {_found(row)} |"
         )
     lines += [f"| all | {total['inputs']:,} | | | | | {total['found']} |", ""]
     lines.append(
-        f"Slowest: processor time of one input; more than {SLOW:g} s is a finding. Memory: what the process grew by "
+        f"Slowest: processor time of one input; more than {SLOW:g} s is a finding. Memory: what the processes grew by "
         f"over all inputs; one that asks for more than {GREEDY >> 30} GiB is a finding."
     )
+    if ended := rows.get("videos", {}).get("ends", {}).get("ended", 0):
+        lines[-1] += f" {ended:,} of the videos ended the process that decodes, in one line."
+    if reached := result.get("reached"):
+        lines += ["", "Chosen by what they reach in drgs (atheris), beside these:", ""]
+        lines += ["| reader | inputs | kept, since they reached new lines | findings |", "|---|---|---|---|"]
+        for name in TARGETS:
+            if name in reached:
+                row = reached[name]
+                lines.append(f"| {name} | {row['inputs']:,} | {row['kept']:,} | {_found(row)} |")
+                total.update(reached=row["inputs"], found_so=_found(row))
+        lines.append(f"| all | {total['reached']:,} | | {total['found_so']} |")
     return "\n".join(lines)
 
 
-def save(result: dict[str, Any]) -> None:
-    """Write counts and page."""
-    COUNTS.write_text(json.dumps(result | ran(), indent=1) + "\n")
-    fill_between(PAGE, "fuzz", table(result | ran()))
+def _found(row: dict[str, Any]) -> int:
+    return row["findings"] + row["crashes"] + row["hangs"]
+
+
+def counted() -> dict[str, Any]:
+    """All counts so far."""
+    return json.loads(COUNTS.read_text()) if COUNTS.exists() else {"readers": {}}
+
+
+def save(kind: str, name: str, row: dict[str, Any]) -> None:
+    """Write a reader's counts beside those of others, which another process may write as well, and the page."""
+    with LOCK.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        result = counted() | ran()
+        result.setdefault(kind, {})[name] = row
+        COUNTS.write_text(json.dumps(result, indent=1) + "\n")
+        fill_between(PAGE, "fuzz", table(result))
 
 
 def main() -> None:
@@ -218,15 +251,18 @@ def main() -> None:
     if args.again is not None:
         again(args.readers[0], args.again)
         return
-    result = json.loads(COUNTS.read_text()) if COUNTS.exists() else {"readers": {}}
+    LOCK.parent.mkdir(parents=True, exist_ok=True)
+    kind = "reached" if args.atheris else "readers"
     for name in args.readers:
-        row = {} if args.fresh else result["readers"].get(name, {})
-        result["readers"][name] = row
+        corpus = ROOT / "runs" / "fuzz" / "reached" / re.sub(r"\W+", "-", name) if args.atheris else None
+        row = {} if args.fresh else counted().get(kind, {}).get(name, {})
         began, before = time.monotonic(), row.get("inputs", 0)
-        reader = Reader(name, row)
+        reader = Reader(name, row, corpus)
         reader.go_on(args.inputs, args.seconds)
+        if corpus is not None:
+            row["kept"] = sum(not path.name.startswith("seed") for path in corpus.iterdir())
         print(f"{name}: {row['inputs'] - before} inputs in {time.monotonic() - began:.0f} s, {row}", flush=True)
-        save(result)
+        save(kind, name, row)
 
 
 if __name__ == "__main__":

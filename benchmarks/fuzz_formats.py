@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 
 from fuzz_mutators import WORDS, damaged, json_lines, json_of, lines_of, text_of
+from fuzz_packed import glb_of, spz_of, webp_of
 
 __all__ = ["mutate"]
 
@@ -41,9 +42,9 @@ def mutate(data: bytes, suffix: str, draw: Random, others: Sequence[bytes] = ())
 def _ply(data: bytes, draw: Random) -> bytes:
     """Another header before the same rows, or other rows behind the same header."""
     head, end, body = data.partition(b"end_header\n")
-    if not end or draw.random() < 0.3:
-        return head + end + damaged(body, draw)
     lines = head.split(b"\n")[:-1]
+    if not end or len(lines) < 2 or draw.random() < 0.3:
+        return head + end + damaged(body, draw)
     i = draw.randrange(len(lines))
     words = lines[i].split()
     what = draw.randrange(5)
@@ -165,4 +166,7 @@ _STRUCTURED: dict[str, Callable[[bytes, Random], bytes]] = {
     ".npy": _npy,
     **dict.fromkeys((".npz", ".pt", ".pth", ".sog"), _zip),
     ".png": _png,
+    ".webp": webp_of,
+    ".spz": spz_of,
+    ".glb": glb_of,
 }

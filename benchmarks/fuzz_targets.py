@@ -7,11 +7,12 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Any
 
+import fuzz_codecs as codecs
 import fuzz_seeds as seeds
 from fuzz_formats import mutate
 
@@ -61,6 +62,9 @@ class Bench:
         target: The reader.
         scratch: Empty folder, best in memory.
         made: Folders that hold valid files already, in place of those that the target's functions write.
+
+    Attributes:
+        files: (folder, path, bytes) of the valid files that are damaged.
     """
 
     def __init__(self, target: Target, scratch: Path, made: list[Path] | None = None) -> None:
@@ -71,16 +75,16 @@ class Bench:
                 folder.mkdir(parents=True)
                 write(folder)
         self._folders = made
-        self._files = [
+        self.files = [
             (folder, path, path.read_bytes())
             for folder in made
             for path in sorted(folder.rglob("*"))
             if path.is_file() and any(fnmatch.fnmatch(str(path.relative_to(folder)), x) for x in target.files)
         ]
-        if not self._files:
+        if not self.files:
             raise ValueError(f"{target.name}: must have files to be damaged, has none; correct its patterns")
         # Large files are slow to write and hold mostly numbers.
-        self._weights = [1 / (1 + len(data) / 20_000) for _, _, data in self._files]
+        self._weights = [1 / (1 + len(data) / 20_000) for _, _, data in self.files]
         self._changed: tuple[Path, bytes] | None = None
         self._clock = 0
 
@@ -92,8 +96,8 @@ class Bench:
     def place(self, number: int) -> tuple[Path, Path, bytes]:
         """Put a numbered input into its place; returns its folder, its file and its bytes."""
         draw = Random(f"{self.target.name} {number}")
-        folder, path, data = draw.choices(self._files, self._weights)[0]
-        others = [other for _, p, other in self._files if p.suffix == path.suffix]
+        folder, path, data = draw.choices(self.files, self._weights)[0]
+        others = [other for _, p, other in self.files if p.suffix == path.suffix]
         data = mutate(data, path.suffix, draw, others)
         self.put(path, data)
         return folder, path, data
@@ -102,7 +106,7 @@ class Bench:
         """Write a file in the place of a valid one; the one before is restored."""
         if self._changed is not None and self._changed[0] != path:
             self._write(*self._changed)
-        self._changed = path, next(held for _, p, held in self._files if p == path)
+        self._changed = path, next(held for _, p, held in self.files if p == path)
         self._write(path, data)
 
     def _write(self, path: Path, data: bytes) -> None:
@@ -118,12 +122,6 @@ class Bench:
             return type(error).__name__, fault_of(error, folder), error
         return "read", None, None
 
-    def run(self, numbers: range) -> Iterator[tuple[int, str, str | None, BaseException | None]]:
-        """The inputs of these numbers, one after the other."""
-        for number in numbers:
-            folder, _, _ = self.place(number)
-            yield number, *self.read(folder)
-
 
 # ------------------------------------------------------------------------------------ readers
 
@@ -132,6 +130,19 @@ def _ply(folder: Path) -> None:
     from drgs.files import load_ply
 
     load_ply(folder / "point_cloud.ply")
+
+
+def _gaussians(folder: Path) -> None:
+    from drgs.codecs import load_gaussians
+
+    (path,) = folder.iterdir()
+    load_gaussians(path)
+
+
+def _scene(folder: Path) -> None:
+    from drgs.codecs import load_gaussians
+
+    load_gaussians(folder)
 
 
 def _points(folder: Path) -> None:
@@ -234,6 +245,14 @@ TARGETS: dict[str, Target] = {
     target.name: target
     for target in (
         Target("3DGS PLY", seeds.PLY, ("*.ply",), _ply),
+        Target("SPZ", codecs.SPZ, ("*.spz",), _gaussians),
+        Target(".splat", codecs.SPLAT, ("*.splat",), _gaussians),
+        Target(".ksplat", codecs.KSPLAT, ("*.ksplat",), _gaussians),
+        Target("compressed PLY", codecs.PACKED_PLY, ("*.ply",), _gaussians),
+        Target("SOG", codecs.SOG, ("*.sog",), _gaussians),
+        Target("SOG folder", codecs.SOG_FOLDER, ("meta.json", "*.webp"), _scene),
+        Target("GLB", codecs.GLB, ("*.glb",), _gaussians),
+        Target("3DGS model folder", codecs.MODEL, ("*.ply",), _scene),
         Target("PLY point cloud", seeds.POINTS, ("*.ply",), _points),
         Target("COLMAP binary", seeds.COLMAP_BINARY, ("*.bin",), _lazy),
         Target("COLMAP text", seeds.COLMAP_TEXT, ("*.txt",), _lazy),

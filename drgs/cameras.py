@@ -60,6 +60,7 @@ __all__ = [
 _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded in a file or an optimizer
 # An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
 _INVERSE_TOLERANCE = 1e-3
+_SHOWN = 80  # characters of a name in messages
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         must_be("Camera", "name", self.name, str, "it becomes a file name")
-        where = f"Camera {self.name!r}" if self.name else "Camera"
+        where = f"Camera {self.name[:_SHOWN]!r}" if self.name else "Camera"
         put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 (the dataclass is frozen)
         put("K", checked_intrinsics(where, self.K))
         pose = checked_pose(where, as_numpy(self.w2c))
@@ -231,8 +232,8 @@ class Camera:
             bad = int(np.count_nonzero(~(error < _INVERSE_TOLERANCE)))
             if bad:
                 warnings.warn(
-                    f"Camera {self.name!r}: the {self.model} lens cannot be inverted at {bad} of {len(pixels)} pixels; "
-                    "their rays are approximate, mask them or check the coefficients",
+                    f"Camera {self.name[:_SHOWN]!r}: the {self.model} lens cannot be inverted at {bad} of "
+                    f"{len(pixels)} pixels; their rays are approximate, mask them or check the coefficients",
                     stacklevel=3,
                 )
         return directions

@@ -14,7 +14,7 @@ import torch
 
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
-from drgs.data import initial_points, load, transforms, videos
+from drgs.data import decoding, initial_points, load, transforms
 from drgs.data.videos import VideoFrame, read_video
 from drgs.fitting.config import FitConfig
 
@@ -202,13 +202,11 @@ def test_packets_that_do_not_say_what_is_shown(neu3d, monkeypatch):
             return getattr(self.real, name)
 
     monkeypatch.setattr(cv2, "VideoCapture", Shifted)
-    monkeypatch.setattr(videos, "_readers", type(videos._readers)())
-    videos._walked.cache_clear()
-    video = read_video(neu3d / "cam02.mp4")
-    assert (video.count, video.stamps) == (FRAMES, ())
+    file, told = (neu3d / "cam02.mp4", (0, 0), True), []
+    video = decoding.walk(*file, tell=told.append)
+    assert (video["count"], video["stamps"]) == (FRAMES, [])
     for index in (4, 2, 5, 0, 3):
-        assert decoded(VideoFrame(video.path, index).read()) == (2, index)
-    videos._walked.cache_clear()
+        assert decoded(decoding.frame(*file, index, tell=told.append)) == (2, index)
 
 
 def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
@@ -226,10 +224,10 @@ def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
             return getattr(self.real, name)
 
     monkeypatch.setattr(cv2, "VideoCapture", Careless)
-    monkeypatch.setattr(videos, "_readers", type(videos._readers)())
-    monkeypatch.setattr(videos, "_NEAR", 0)
+    monkeypatch.setattr(decoding, "_NEAR", 0)
     for index in (4, 2, 5, 0, 3):
-        assert decoded(VideoFrame(neu3d / "cam02.mp4", index).read()) == (2, index)
+        found = decoding.frame(neu3d / "cam02.mp4", (0, 1), True, index, tell=lambda _: None)
+        assert decoded(found) == (2, index)
 
 
 def test_points_come_from_the_first_frame_of_training_cameras(neu3d, monkeypatch):

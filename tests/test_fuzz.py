@@ -74,7 +74,7 @@ def test_inputs_are_damaged_and_then_restored(bench):
     differ = 0
     for number in range(50):
         folder, path, data = it.place(number)
-        held = {p: d for _, p, d in it._files}
+        held = {p: d for _, p, d in it.files}
         differ += data != held[path]
         assert path.read_bytes() == data
         assert all(p.read_bytes() == held[p] for p in held if p != path)

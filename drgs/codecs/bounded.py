@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import lzma
 import struct
 import zipfile
 import zlib
@@ -10,11 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.guards.foreign import is_file
+
 __all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd"]
 
 _DAMAGED = "it is truncated or damaged, copy it again"
+_NAME, _SHOWN = 200, 120  # characters of names, and of what libraries say
+_PIECE = 1 << 20  # bytes of a stream that are unpacked at once
 _ZIP_ERRORS = (
-    zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, OSError, OverflowError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, OSError, OverflowError,
     RuntimeError, ValueError,
 )  # fmt: skip
 
@@ -74,11 +79,15 @@ def unzstd(path: Path, frame: bytes, size: int) -> bytes:
     if size == 0:
         return b""
     try:
-        # Of the stream, and not of one call: that would allocate what the frame claims.
+        # Of the stream, and not of one call: that would allocate what the frame claims, or what is asked for.
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(io.BytesIO(frame)) as stream:
-            out = stream.read(size + 1)
+            found = bytearray()
+            while len(found) <= size and (part := stream.read(min(size + 1 - len(found), _PIECE))):
+                found += part
     except zstandard.ZstdError as error:
-        raise ValueError(f"{path}: must be a Zstandard frame, got {error}; {_DAMAGED}") from None
+        text = "a window above 128 MiB" if "too much memory" in str(error) else error
+        raise ValueError(f"{path}: must be a Zstandard frame, got {text}; {_DAMAGED}") from None
+    out = bytes(found)
     if len(out) != size:
         got = f"{len(out)}" if len(out) < size else "more"
         raise ValueError(f"{path}: a stream must unpack to {size} bytes, got {got}; {_DAMAGED}")
@@ -102,7 +111,7 @@ class Archive:
             self._zip = zipfile.ZipFile(path)
             found = [name for name in self._zip.namelist() if name.rpartition("/")[2] == "meta.json"]
         except _ZIP_ERRORS as error:
-            raise ValueError(f"{path}: must be a zip archive, got {' '.join(str(error).split())}; {_DAMAGED}") from None
+            raise ValueError(f"{path}: must be a zip archive, got {_said(error)}; {_DAMAGED}") from None
         if found:
             self._prefix = min(found, key=len).removesuffix("meta.json")
 
@@ -119,8 +128,9 @@ class Archive:
         Raises:
             ValueError: If the name leads elsewhere, or the file is missing, damaged or longer.
         """
-        if not name or name in (".", "..") or "/" in name or "\\" in name or "\0" in name:
-            raise ValueError(f"{self.path}: files must be named without a folder, got {name!r}; export it again")
+        is_name = name.isprintable() and len(name) < _NAME and name not in ("", ".", "..")
+        if not is_name or "/" in name or "\\" in name:
+            raise ValueError(f"{self.path}: files must be named without a folder, got {name[:80]!r}; export it again")
         data = self._from_folder(name, limit) if self._zip is None else self._from_zip(name, limit)
         if len(data) > limit:
             raise ValueError(
@@ -130,10 +140,10 @@ class Archive:
 
     def _from_folder(self, name: str, limit: int) -> bytes:
         file = self.path / name
+        if not is_file(file):
+            raise FileNotFoundError(f"{file}: must be beside meta.json, found none; copy the whole folder")
         if file.is_symlink() and file.resolve().parent != self.path.resolve():
             raise ValueError(f"{file}: must not lead out of its folder; copy the file there")
-        if not file.is_file():
-            raise FileNotFoundError(f"{file}: must be beside meta.json, found none; copy the whole folder")
         with file.open("rb") as stream:
             return stream.read(limit + 1)
 
@@ -145,8 +155,12 @@ class Archive:
         except KeyError:
             raise ValueError(f"{self.path}: must hold {name}, holds none; export it again") from None
         except _ZIP_ERRORS as error:
-            text = " ".join(str(error).split())
-            raise ValueError(f"{self.path}: {name} must be readable, got {text}; {_DAMAGED}") from None
+            raise ValueError(f"{self.path}: {name} must be readable, got {_said(error)}; {_DAMAGED}") from None
+
+
+def _said(error: Exception) -> str:
+    """What a library says, in one line."""
+    return " ".join(str(error).split())[:_SHOWN]
 
 
 def pixels_of_webp(where: str, data: bytes, least: int, most: int) -> np.ndarray:

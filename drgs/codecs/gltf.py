@@ -203,7 +203,7 @@ class _Accessors:
     def _accessor(self, index: Any) -> dict[str, Any]:
         accessors = self._document["accessors"]
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(accessors):
-            raise ValueError(f"{self._path}: an attribute must be an accessor, got {index!r}; {_ADVICE}")
+            raise ValueError(f"{self._path}: an attribute must be an accessor, got {repr(index)[:40]}; {_ADVICE}")
         shape = {"count": int, "type": str, "componentType": int, "bufferView": int}
         check_json(f"{self._path}: accessor {index}", accessors[index], shape, _ADVICE)
         return accessors[index]
@@ -225,7 +225,9 @@ class _Accessors:
         check_json(f"{self._path}: bufferView {number}", view, {"byteLength": int}, _ADVICE)
         stride = view.get("byteStride", dtype.itemsize * width)
         start, offset = view.get("byteOffset", 0), accessor.get("byteOffset", 0)
-        if view.get("buffer", 0) != 0 or not all(isinstance(x, int) and x >= 0 for x in (start, offset, stride, count)):
+        if view.get("buffer", 0) != 0 or not all(
+            isinstance(x, int) and 0 <= x < 1 << 63 for x in (start, offset, stride, count)
+        ):
             raise ValueError(f"{where}: must lie in the file's own buffer, does not; {_ADVICE}")
         end = start + offset + stride * max(count - 1, 0) + dtype.itemsize * width * min(count, 1)
         if stride < dtype.itemsize * width or end > len(self._buffer):

@@ -15,6 +15,7 @@ import numpy as np
 
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
 from drgs.guards.ply_headers import read_ply_header
+from drgs.guards.ply_lists import ply_source
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -40,7 +41,7 @@ def load_packed_ply(path: Path) -> Gaussians:
     count, coefficients = _check(path, elements)
     check_count(path, count, coefficients)
     try:
-        ply = plyfile.PlyData.read(str(path))
+        ply = plyfile.PlyData.read(ply_source(path))
     except (plyfile.PlyParseError, ValueError, OSError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: must be a readable PLY, got {text}; {_ADVICE}") from None

@@ -56,7 +56,7 @@ def load_sog(path: Path) -> Gaussians:
         meta = parse_json(files.read("meta.json", _META), f"{path}: meta.json", _ADVICE)
         version = meta.get("version", 1) if isinstance(meta, dict) else 1
         if version not in (1, 2):
-            raise ValueError(f"{path}: SOG must be of version 1 or 2, got {version!r}; {_ADVICE}")
+            raise ValueError(f"{path}: SOG must be of version 1 or 2, got {repr(version)[:40]}; {_ADVICE}")
         return _Reader(path, files, meta, version).gaussians()
 
 

@@ -11,23 +11,25 @@ import os
 import re
 import shutil
 import tempfile
+import unicodedata
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
-from drgs.data.image_headers import can_hold, stated_size
+from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.foreign import refuse_foreign
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "check_npz",
     "image_size",
     "file_inside",
     "inverse_pose",
-    "is_file",
     "list_images",
     "native_stderr",
     "read_image",
@@ -39,6 +41,8 @@ __all__ = [
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MAX_NPY_HEADER = 65536
+_DEFLATE = 1032  # bytes that one byte of deflate can become
+_MAX_NAME = 1024  # characters, folders included
 _SHOWN = 120  # characters of a reader's own message
 _MAX_PIXELS = 2**31
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
@@ -68,21 +72,15 @@ def file_inside(folder: Path, name: str, where: str) -> Path:
         name: What the file says.
         where: Place of the name, for the message.
     Raises:
-        ValueError: If it leaves the folder.
+        ValueError: If it leaves the folder, or no file can have that name.
     """
-    if not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder)):
+    # Names of 1,000 letters and of several lines are none; messages would repeat them.
+    is_name = len(name) <= _MAX_NAME and not any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
+    if not is_name or not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder)):
         raise ValueError(
             f"{where} must name a file in {folder}, got {name[:80]!r}; move or link the file there and name it so"
         )
     return folder / name
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is a file; there is none of a name that no file can have, as one of 1,000 letters."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
 
 
 def read_text(path: Path, what: str, largest: int) -> str:
@@ -118,34 +116,60 @@ def read_npy(path: Path) -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a .npy file, found none; check the path")
     refuse_foreign(path, "a .npy file")
-    try:
-        with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0
-            if version >= (2, 0):
-                read = np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file, max_header_size=_MAX_NPY_HEADER)
-            start = file.tell()
-    except Exception as error:  # NumPy's parser of headers raises whatever Python's tokenizer does
-        text = " ".join(str(error).split())[:_SHOWN]
-        raise ValueError(f"{path}: must be a .npy file, got {text}; save it with numpy.save") from None
-    if dtype.hasobject or dtype.kind not in "fiub":
-        raise ValueError(f"{path}: must hold plain numbers, got dtype {dtype}; save a float array")
-    # Python integers: a claimed shape of 10^12 x 10^12 must not wrap around.
-    claimed = dtype.itemsize
-    for side in shape:
-        claimed *= int(side)
-    actual = path.stat().st_size - start
-    if any(side < 0 for side in shape) or claimed > actual:
-        raise ValueError(
-            f"{path}: the header claims shape {shape} ({claimed} bytes), the file holds {actual} "
-            "bytes; "
-            "it is truncated or damaged, copy it again"
-        )
+    with path.open("rb") as file:
+        _check_npy(f"{path}", file, path.stat().st_size)
     try:
         return np.load(path, allow_pickle=False)
     except ValueError as error:
         raise ValueError(f"{path}: must be a .npy file, got {error}; save it with numpy.save") from None
+
+
+def _check_npy(where: str, file: IO[bytes], size: int) -> None:
+    """Raise ValueError unless a header claims plain numbers, as many as its `size` bytes hold: NumPy allocates them."""
+    try:
+        version = np.lib.format.read_magic(file)
+        stated = file.read(2 if version == (1, 0) else 4)
+        if int.from_bytes(stated, "little") > _MAX_NPY_HEADER:  # which NumPy would allocate as well
+            raise ValueError(f"a header of {int.from_bytes(stated, 'little')} bytes")
+        file.seek(-len(stated), os.SEEK_CUR)
+        read = np.lib.format.read_array_header_1_0
+        if version >= (2, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file, max_header_size=_MAX_NPY_HEADER)
+        start = file.tell()
+    except Exception as error:  # NumPy's parser of headers raises whatever Python's tokenizer does
+        text = " ".join(str(error).split())[:_SHOWN]
+        raise ValueError(f"{where}: must be a .npy file, got {text}; save it with numpy.save") from None
+    if dtype.hasobject or dtype.kind not in "fiub":
+        raise ValueError(f"{where}: must hold plain numbers, got dtype {dtype}; save a float array")
+    # Python integers: a claimed shape of 10^12 x 10^12 must not wrap around.
+    claimed = dtype.itemsize
+    for side in shape:
+        claimed *= int(side)
+    if any(side < 0 for side in shape) or claimed > size - start:
+        raise ValueError(
+            f"{where}: the header claims shape {shape} ({claimed} bytes), the file holds {size - start} bytes; it is "
+            "truncated or damaged, copy it again"
+        )
+
+
+def check_npz(path: Path) -> list[str]:
+    """The names of the arrays of an ``.npz`` archive, none of which claims more bytes than the file can hold.
+
+    Raises:
+        ValueError: another archive, or one that lies.
+    """
+    names = []
+    with _reading_archive(path, "arrays of numbers"), zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{info.filename} in a compression that NumPy does not write")
+            if info.file_size > _DEFLATE * min(info.compress_size, path.stat().st_size) or info.filename in names:
+                raise ValueError(f"{info.file_size} bytes of {info.filename}")
+            with archive.open(info) as member:
+                _check_npy(info.filename, member, info.file_size)
+            names.append(info.filename)
+    return [name.removesuffix(".npy") for name in names]
 
 
 def read_npz(path: Path, name: str) -> np.ndarray:
@@ -160,10 +184,14 @@ def read_npz(path: Path, name: str) -> np.ndarray:
     refuse_foreign(path, "an .npz file")
     with tempfile.TemporaryDirectory() as folder:
         unpacked = Path(folder) / f"{name}.npy"
-        with _reading_archive(path, name), zipfile.ZipFile(path) as archive:
+        with _reading_archive(path, f"an array {name!r}"), zipfile.ZipFile(path) as archive:
             size = archive.getinfo(unpacked.name).file_size
         memory.require(f"{path}", size, f"{size} bytes of {name}", "make it smaller")
-        with _reading_archive(path, name), zipfile.ZipFile(path) as archive, unpacked.open("wb") as file:
+        with (
+            _reading_archive(path, f"an array {name!r}"),
+            zipfile.ZipFile(path) as archive,
+            unpacked.open("wb") as file,
+        ):
             shutil.copyfileobj(archive.open(unpacked.name), file)
         try:
             return read_npy(unpacked)
@@ -172,7 +200,7 @@ def read_npz(path: Path, name: str) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _reading_archive(path: Path, name: str) -> Iterator[None]:
+def _reading_archive(path: Path, what: str) -> Iterator[None]:
     """Make one ValueError of whatever zipfile and the decoders of its parts raise of a damaged archive."""
     try:
         yield
@@ -182,7 +210,7 @@ def _reading_archive(path: Path, name: str) -> Iterator[None]:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in (None, errno.EINVAL)):
             raise
         text = " ".join(str(error).split())[:_SHOWN]
-        raise ValueError(f"{path}: must hold an array {name!r}, got {text}; save it with numpy.savez") from None
+        raise ValueError(f"{path}: must hold {what}, got {text}; save it with numpy.savez") from None
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -215,6 +243,8 @@ def read_image(path: Path) -> np.ndarray:
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
+    if not is_whole(path):
+        raise _ends_early(path)
     if stated_size(path):
         width, height = image_size(path)
         what = f"its {width}x{height} pixels"  # 8 bits and 3 channels, decoded and in the order of RGB
@@ -230,9 +260,7 @@ def read_image(path: Path) -> np.ndarray:
     # The decoder fills with gray what is missing, and goes on.
     for line in complaints:
         if "premature end" in line.lower():
-            raise ValueError(
-                f"{path}: must be a whole image, its data end early; it is truncated or damaged, copy it again"
-            )
+            raise _ends_early(path)
         if "corrupt" in line.lower():
             _log.warning("%s: is damaged, part of it may be wrong (%s); copy it again", path, line.strip())
             break
@@ -243,6 +271,10 @@ def read_image(path: Path) -> np.ndarray:
         else:
             data = np.ascontiguousarray(data[..., order])
     return data
+
+
+def _ends_early(path: Path) -> ValueError:
+    return ValueError(f"{path}: must be a whole image, its data end early; it is truncated or damaged, copy it again")
 
 
 @contextlib.contextmanager

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
+from drgs.data.checks import file_inside
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
 from drgs.data.views import Dataset, View
-from drgs.guards.foreign import refuse_foreign
+from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 
 __all__ = ["MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
@@ -72,12 +73,11 @@ def load_colmap(
         raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
+        file = file_inside(folder, image.name, f"{model}: image {index}")
         where = f"{model}: image {index} ({image.name})"
-        if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
-            raise ValueError(f"{where}: the name must stay inside {folder}, got {image.name!r}; rename it")
-        view = View(None, str(Path(image.name).with_suffix("")), image_path=folder / image.name)
+        view = View(None, str(Path(image.name).with_suffix("")), image_path=file)
         listed.append(view)
-        if not view.image_path.is_file():
+        if not is_file(view.image_path):
             absent.append(view)
             continue
         camera = model_camera(reconstruction, image, where)
@@ -118,7 +118,7 @@ def _mask(folder: Path, name: str) -> Path | None:
     """COLMAP's own ``masks/NAME.EXT.png``, or ``masks/NAME.png``."""
     masks = folder.parent / "masks"
     for candidate in (masks / f"{name}.png", (masks / name).with_suffix(".png")):
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
     return None
 

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["can_hold", "stated_size"]
+__all__ = ["can_hold", "is_whole", "stated_size"]
 
 _PIXELS_A_BYTE = 8_256  # deflate makes one byte of at most 1,032, each of at most 8 pixels of one bit
+_WEBP_SIDE = 1 << 14  # pixels: 14 bits
+_PNG = b"\x89PNG\r\n\x1a\n"
 _DIRECTORY = 4096  # entries of a TIFF that are looked at
 
 
@@ -27,10 +29,26 @@ def stated_size(path: Path) -> tuple[int, int] | None:
 
 
 def can_hold(path: Path, width: int, height: int) -> bool:
-    """Whether a file is large enough for so many pixels; of WebP, which has no such bound, always."""
+    """Whether a file is large enough for so many pixels; a WebP has no such bound, but one of its sides."""
     with path.open("rb") as file:
-        is_webp = file.read(4) == b"RIFF"
-    return is_webp or width * height <= _PIXELS_A_BYTE * path.stat().st_size
+        if file.read(4) == b"RIFF":
+            return max(width, height) <= _WEBP_SIDE
+    return width * height <= _PIXELS_A_BYTE * path.stat().st_size
+
+
+def is_whole(path: Path) -> bool:
+    """Whether the chunks of a PNG lie within its file, since OpenCV allocates what they claim; of others, yes."""
+    with path.open("rb") as file:
+        if file.read(8) != _PNG:
+            return True
+        size, at = path.stat().st_size, 8
+        while at + 12 <= size:
+            file.seek(at)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            at += 12 + length
+            if kind == b"IEND":
+                break
+    return at <= size
 
 
 def _png(head: bytes, file: Any) -> tuple[int, int] | None:
@@ -38,12 +56,13 @@ def _png(head: bytes, file: Any) -> tuple[int, int] | None:
 
 
 def _bmp(head: bytes, file: Any) -> tuple[int, int] | None:
-    width, height = struct.unpack("<HH" if head[14] == 12 else "<ii", head[18:22] if head[14] == 12 else head[18:26])
+    is_old = head[14:15] == b"\x0c"
+    width, height = struct.unpack("<HH" if is_old else "<ii", head[18:22] if is_old else head[18:26])
     return width, abs(height)  # rows from the top have a negative one
 
 
 def _webp(head: bytes, file: Any) -> tuple[int, int] | None:
-    if head[12:16] == b"VP8X":
+    if head[12:16] == b"VP8X":  # a canvas
         return 1 + int.from_bytes(head[24:27], "little"), 1 + int.from_bytes(head[27:30], "little")
     if head[12:16] == b"VP8L":
         (bits,) = struct.unpack("<I", head[21:25])
@@ -55,17 +74,22 @@ def _webp(head: bytes, file: Any) -> tuple[int, int] | None:
 
 
 def _tiff(head: bytes, file: Any) -> tuple[int, int] | None:
-    """Of the first directory of a classic TIFF."""
+    """Of the first directory, of a BigTIFF too."""
     order = "<" if head[:2] == b"II" else ">"
-    (start,) = struct.unpack(f"{order}I", head[4:8])
+    is_big = 43 in head[2:4]
+    place, number, length = ("Q", "Q", 20) if is_big else ("I", "H", 12)
+    (start,) = struct.unpack_from(f"{order}{place}", head, 8 if is_big else 4)
+    if start >= 1 << 63:  # no place in a file
+        return None
     file.seek(start)
-    (count,) = struct.unpack(f"{order}H", file.read(2))
-    found = {}
+    (count,) = struct.unpack(f"{order}{number}", file.read(struct.calcsize(number)))
+    found: dict[int, int] = {}
     for _ in range(min(count, _DIRECTORY)):
-        entry = file.read(12)
+        entry = file.read(length)
         tag, kind = struct.unpack(f"{order}HH", entry[:4])
         if tag in (256, 257):
-            (found[tag],) = struct.unpack(f"{order}{'H' if kind == 3 else 'I'}", entry[8 : 10 if kind == 3 else 12])
+            layout = {3: "H", 16: "Q"}.get(kind, "I")
+            found.setdefault(tag, *struct.unpack_from(f"{order}{layout}", entry, 12 if is_big else 8))  # as libtiff
     return (found[256], found[257]) if len(found) == 2 else None
 
 
@@ -88,10 +112,12 @@ def _jpeg(head: bytes, file: Any) -> tuple[int, int] | None:
 
 
 _READERS: tuple[tuple[bytes, Callable[[bytes, Any], tuple[int, int] | None]], ...] = (
-    (b"\x89PNG\r\n\x1a\n", _png),
+    (_PNG, _png),
     (b"\xff\xd8", _jpeg),
     (b"BM", _bmp),
     (b"RIFF", _webp),
     (b"II*\0", _tiff),
     (b"MM\0*", _tiff),
+    (b"II+\0", _tiff),
+    (b"MM\0+", _tiff),
 )

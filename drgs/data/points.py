@@ -20,7 +20,7 @@ from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import Dataset, View
 from drgs.display.progress import Bar
-from drgs.guards.foreign import refuse_foreign
+from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.ply_lists import ply_source
 
 __all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_points"]
@@ -175,7 +175,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         FileNotFoundError: no such file.
         ValueError: no PLY with x, y, z, shorter than it claims, or not finite.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise FileNotFoundError(f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path")
     import plyfile
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.capture import Focus
-from drgs.data.checks import read_npz, repaired_pose
+from drgs.data.checks import file_inside, read_npz, repaired_pose
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.views import Dataset
 from drgs.guards.camera_checks import check_distance
@@ -102,7 +102,8 @@ def _cameras(file: Path) -> tuple[dict[int, dict[int, _Shot]], int]:
                 raise ValueError(f"{where}: must be there once, is there twice; remove one")
             parts = PurePosixPath(name).parts
             if name.startswith("/") or ".." in parts or not parts:
-                raise ValueError(f"{where}: fn must name an image inside {_IMAGES}, got {name!r}; rename it")
+                raise ValueError(f"{where}: fn must name an image inside {_IMAGES}, got {name[:80]!r}; rename it")
+            file_inside(file.parent / _IMAGES, name, f"{where}: fn")
             found[camera][time] = _Shot(_camera(where, data, k, w2c), name)
     if not found:
         raise ValueError(f"{file}: must list at least one camera, lists none; {_ADVICE}")

@@ -29,6 +29,7 @@ __all__ = [
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
 _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
+_LONGEST = 400  # characters of a path in messages
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +48,7 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
     """
     if not missing:
         return
-    names, count = [str(path) for path in missing], len(missing) + left
+    names, count = [str(path)[:_LONGEST] for path in missing], len(missing) + left
     shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
     told = f"{where}: {len(names)} of the {count} images that it lists are not there ({shown})"
     if strict or left < _FEWEST:

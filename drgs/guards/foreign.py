@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from pathlib import Path
 
-__all__ = ["refuse_foreign"]
+__all__ = ["is_file", "refuse_foreign"]
 
 _HEAD = 4096
 _SPLATS = {
@@ -19,6 +19,14 @@ _SPLATS = {
     ".ksplat": "a .ksplat file (compressed Gaussians of mkkellogg's viewer)",
     ".lcc": "an LCC file (XGRIDS' compressed Gaussians)",
 }
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; there is none of a name that no file can have, as one of 1,000 letters."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def refuse_foreign(path: Path, wanted: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.data.checks import check_npz
 from drgs.ellipsoids import Gaussians
 from drgs.files import atomic_write
 from drgs.guards.foreign import refuse_foreign
@@ -85,6 +86,7 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
 def is_export(path: Path) -> bool:
     """Whether `export` wrote a file; a dump that was made of one holds more arrays."""
     try:
+        check_npz(path)
         with np.load(path, allow_pickle=False) as arrays:
             return np.array_equal(arrays[_EXPORT], _signature({*arrays.files} - {_EXPORT}))
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile):
@@ -136,10 +138,11 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
             raise ValueError(f"{path}: grad_{name} must have shape {wanted}, got {got}")
     if pose and found[_POSE].reshape(-1).shape != scene["viewmat"].reshape(-1).shape:
         raise ValueError(f"{path}: {_POSE} must have shape {scene['viewmat'].shape}, got {found[_POSE].shape}")
-    as_tensor = {name: torch.tensor(found[name], dtype=torch.float64) for name in names if name not in scene}
+    # Through float64 of this machine: files may have another byte order, which torch refuses.
+    as_tensor = {name: torch.from_numpy(found[name].astype(np.float64)) for name in names if name not in scene}
     gradients = {name: as_tensor[f"grad_{name}"] for name in PARAMETERS}
     if pose:
-        slopes = torch.tensor(found[_POSE], dtype=torch.float64).reshape(count, 4, 4)
+        slopes = torch.from_numpy(found[_POSE].astype(np.float64)).reshape(count, 4, 4)
         gradients[POSE] = along_motions(g, cameras, slopes)
     return Dump(str(path), as_tensor["image"], as_tensor["alpha"], as_tensor["cotangent"], gradients)
 
@@ -166,6 +169,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             from safetensors.numpy import load_file
 
             return load_file(path)
+        check_npz(path)
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:
