@@ -44,6 +44,7 @@ smoke: setup
 	$(BIN)/drgs fisher out/smoke/run --limit 2 --pose -o out/smoke/fisher
 	$(BIN)/drgs crossval out/smoke/run --limit 1 --max-pixels 768 --no-ladder -o out/smoke/crossval
 	$(BIN)/drgs tradeoff out/smoke/run --limit 1 --max-pixels 768 --repeats 1 -o out/smoke/tradeoff
+	$(BIN)/drgs reproduce static --scale tiny --seeds 1 --policy random --policy fisherrf -o out/smoke/reproduce
 	$(BIN)/drgs stress --match "1 Gaussian"
 	$(BIN)/drgs scene room -o out/smoke/room --size 64x48 --views 3 --spp 2
 	rm -rf out/smoke/semantic

@@ -25,10 +25,11 @@ import numpy as np
 import studies
 from studies import ROOT
 
-from drgs.studies.cells import Metric, Study, distinct_seeds, read_study
+from drgs.studies.cells import Metric, Study, distinct_seeds
 from drgs.studies.curves import draw_curves
-from drgs.studies.tables import fill_between, study_report
+from drgs.studies.rows import read_study
 from drgs.studies.statistics import at_views, values_of
+from drgs.studies.tables import fill_between, study_report
 from drgs.train import ActiveConfig, FitConfig
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")

@@ -42,8 +42,8 @@ from drgs.fitting.frames import Frame  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.select import Scoring, select  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 TIMES = 40
 CAMERAS = 15

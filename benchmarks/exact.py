@@ -16,7 +16,6 @@ import argparse
 import dataclasses
 import json
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +31,7 @@ from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import data, fisher  # noqa: E402
+from drgs.machine import peak_memory  # noqa: E402
 from drgs.sizes import at_most  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
 
@@ -102,7 +102,7 @@ def task_scene(name: str, folder: Path, turns: int) -> dict | None:
         "size": [cam.width, cam.height],
         "hits": float(hits),
         "seconds": {f"{preset}, {kind}": t for (preset, kind), t in seconds.items()},
-        "peak GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "peak GB": (peak_memory() or 0) / 1e9,
     }
 
 
@@ -127,9 +127,9 @@ def task_memory(name: str, folder: Path, turns: int) -> dict:
     """Peak memory of a frame forward and backward, and of a Fisher diagonal: 1,000,000 Gaussians at 1024 x 1024."""
     g, cam = cubes.cube(1_000_000), cubes.camera(1024)
     backward(g, cam, Preset("exact"))()
-    frame = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    frame = (peak_memory() or 0) / 1e9
     fisher.diagonal(g, cam, Preset("exact"))
-    return {"frame": frame, "with the diagonal": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}
+    return {"frame": frame, "with the diagonal": (peak_memory() or 0) / 1e9}
 
 
 def task_peers(name: str, folder: Path, turns: int) -> dict:

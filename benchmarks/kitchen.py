@@ -1,4 +1,4 @@
-"""One camera at each later time of a kitchen where things move, by every policy: color and labels of a held-out camera.
+"""The experiments `dynamic`, `prior` and `blocks` of `drgs reproduce`, blind, as the tables of docs/dynamic.md.
 
     python benchmarks/kitchen.py [--scale small] [--seeds 6] [--shard K/N]     fits, rows as they come
     python benchmarks/kitchen.py --page [--merge ROWS.jsonl ...]               the tables of docs/dynamic.md
@@ -7,7 +7,7 @@ The paper's dynamic loop (arXiv 2512.22771): a static stage on the first time of
 out, then, at each later time, one camera that a policy picks. A unit is a kitchen (seeds 1, 2, 3; constants are fixed
 on seed 0) with the camera that is held out; the test views are all its times. `all views` is fitted to all cameras at
 all times, an upper reference. One thread a process; any number of processes may run side by side, with or without
---shard: the lock of a run folder says who has a cell. Finished rows (benchmarks/kitchen.jsonl) and runs are kept,
+--shard: the lock of a run folder says who has a cell. Finished rows (benchmarks/dynamic.jsonl) and runs are kept,
 killed ones resumed.
 
 Sizes at `small` are so that three units, 39 cells, take about two hours of two processes (a unit is whole before the
@@ -31,117 +31,27 @@ os.environ.setdefault("DRGS_THREADS", "1")
 import studies
 from studies import ROOT
 
-from drgs.studies.cells import Metric, Study
+from drgs.studies import experiments
+from drgs.studies.cells import Study
+from drgs.studies.experiments import EXPERIMENTS
 from drgs.studies.tables import study_report
-from drgs.train import ActiveConfig, FitConfig
-from scenes import kitchen
 
-BASELINES = {name: {"policy": name} for name in ("random", "uniform", "farthest", "moments", "fisherrf")}
-BLOCKS = {
-    "geometry": ("geometry",),
-    "geometry+semantic": ("geometry", "semantic"),
-    "geometry+deformation": ("geometry", "deformation"),
-    "joint": ("geometry", "semantic", "deformation"),
-}
-CRITERIA = {name: {"policy": "fisher", "criterion": "eig", "blocks": blocks} for name, blocks in BLOCKS.items()}
-LAMBDAS = {f"joint, lambda {text}": {**CRITERIA["joint"], "prior": float(text)} for text in ("0", "1e-7", "1e-5")}
+BASELINES = ("random", "uniform", "farthest", "moments", "fisherrf")
 DEFAULT = "joint+backdrop, v_opt"  # the program's own choice where something moves
-POLICIES = {**BASELINES, **CRITERIA, "all views": None, **LAMBDAS, DEFAULT: {"policy": "fisher"}}
-TABLES = (
-    (
-        "Policies",
-        "What one camera a time is worth, by who picks it (the paper's second table).",
-        (*BASELINES, "joint", DEFAULT, "all views"),
-        "random",
-        tuple((name, other) for name in ("joint", DEFAULT) for other in BASELINES if other != "random"),
-    ),
-    (
-        "lambda",
-        "The joint criterion by its prior precision; `joint` has 1e-6 (the paper's third table).",
-        ("joint", *LAMBDAS),
-        "joint",
-        (),
-    ),
-    (
-        "Blocks",
-        "What the criterion counts (the paper's fourth table).",
-        tuple(CRITERIA),
-        "geometry",
-        (("joint", "geometry+semantic"), ("joint", "geometry+deformation")),
-    ),
-)
-METRICS = (
-    Metric("psnr", "PSNR", 2),
-    Metric("psnr_moving", "PSNR, moving pixels", 2),
-    Metric("ssim", "SSIM"),
-    Metric("flip", "FLIP", larger=False),
-    studies.segmentation("pixel_accuracy", "pixel accuracy"),
-    studies.segmentation("miou", "mIoU"),
-)
+COMPARISONS = {
+    "dynamic": tuple((name, other) for name in ("joint", DEFAULT) for other in BASELINES if other != "random"),
+    "prior": (),
+    "blocks": (("joint", "geometry+semantic"), ("joint", "geometry+deformation")),
+}
 UNITS = tuple((f"kitchen-{seed}", camera) for camera in ("cam00", "cam03") for seed in (1, 2, 3))
 """In the order in which --seeds takes them: cam00 is in the middle of the arc, cam01, ... go from left to right."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Scale:
-    """Sizes: of the fit, and of the kitchens as they are filmed."""
-
-    fit: FitConfig
-    cameras: int
-    times: int
-    size: tuple[int, int]
-    teacher: tuple[int, int]
-    info_pixels: int | None = None
-
-
-SCALES = {
-    "small": Scale(
-        FitConfig(
-            times=14,
-            max_pixels=10_800,
-            max_gaussians=8_000,
-            max_steps=900,
-            feature_width=32,
-            feature_rate=5e-3,
-            decoder_rate=5e-4,
-            grid_rate=(8e-3, 8e-4),
-            field_rate=(8e-4, 8e-5),
-        ),
-        cameras=10,
-        times=14,
-        size=(120, 90),
-        teacher=(40, 30),
-        info_pixels=2_700,
-    ),
-    "paper": Scale(FitConfig(max_steps=17_000), cameras=15, times=40, size=(240, 180), teacher=(60, 45)),
-}
+SCALES = ("small", "paper")
 
 
 def study_of(scale: str, runs: Path) -> Study:
-    """The study at a scale; kitchens are filmed where they are not there yet."""
-    size = SCALES[scale]
-
-    def folder(scene: str, split: tuple[int, int]) -> Path:
-        return kitchen.generate(
-            runs / f"{scale}-{scene}",
-            cameras=size.cameras,
-            times=size.times,
-            width=size.size[0],
-            height=size.size[1],
-            seed=int(scene.partition("-")[2]),
-            teacher_width=size.teacher[0],
-            teacher_height=size.teacher[1],
-        )
-
-    return Study(
-        name=f"kitchen-{scale}",
-        folder=folder,
-        policies=POLICIES,
-        fit=size.fit,
-        active=ActiveConfig(schedule="times", info_pixels=size.info_pixels),
-        metrics=METRICS,
-        reference="random",
-    )
+    """The study at a scale; kitchens are filmed where they are not there yet. Its first rows have no class means."""
+    study = experiments.study_of("dynamic", scale, runs / "scenes")
+    return dataclasses.replace(study, metrics=tuple(x for x in study.metrics if x.key != "class_accuracy"))
 
 
 def units_of(study: Study, seeds: int) -> list:
@@ -152,14 +62,15 @@ def units_of(study: Study, seeds: int) -> list:
 def report(study: Study, rows: list[dict]) -> str:
     """The three tables, each a study of its own policies."""
     parts = []
-    for title, told, labels, reference, comparisons in TABLES:
+    for name, comparisons in COMPARISONS.items():
+        table = EXPERIMENTS[name]
         part = dataclasses.replace(
             study,
-            policies={label: study.policies[label] for label in labels},
-            reference=reference,
+            policies={label: study.policies[label] for label in table.policies},
+            reference=table.reference,
             comparisons=comparisons,
         )
-        parts += [f"### {title}", told, study_report(part, rows, level=4)]
+        parts += [f"### {table.title}", table.told, study_report(part, rows, level=4)]
     return "\n\n".join(parts)
 
 
@@ -170,9 +81,10 @@ def main() -> int:
         SCALES,
         study_of,
         units_of,
-        planned=lambda seeds: min(seeds, len(UNITS)) * len(POLICIES),
+        planned=lambda seeds: min(seeds, len(UNITS)) * len(study_of("small", Path()).policies),
         report=report,
         seeds=len(UNITS),
+        rows="dynamic",
     )
 
 

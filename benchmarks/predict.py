@@ -20,8 +20,8 @@ from studies import ROOT
 
 import drgs
 from drgs.gain import Prior
-from drgs.studies.tables import fill_between
 from drgs.select import Cache, select
+from drgs.studies.tables import fill_between
 
 VIEWS, STEPS, MORE = 6, 1000, 200
 ALONE = {"policy": "fisher", "blocks": ("geometry",)}

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
 from drgs.ellipsoids import semi_axes  # noqa: E402
+from drgs.machine import peak_memory  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 
@@ -265,7 +265,7 @@ def task_memory() -> dict:
     start = time.perf_counter()
     backward(g, cam, Preset("fast"))()
     return {
-        "peak GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "peak GB": (peak_memory() or 0) / 1e9,
         "seconds with compilation": time.perf_counter() - start,
     }
 

@@ -28,7 +28,8 @@ from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
-from drgs.studies.cells import Metric, Study, append_row, read_study, run_cells  # noqa: E402
+from drgs.studies.cells import Study, run_cells  # noqa: E402
+from drgs.studies.rows import append_row, read_study  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 __all__ = [
@@ -40,7 +41,6 @@ __all__ = [
     "folder",
     "rank_correlation",
     "read_rows",
-    "segmentation",
     "stamp",
     "write_rows",
 ]
@@ -119,11 +119,6 @@ def rank_correlation(a, b, kind: str = "spearman") -> float:
     return float((stats.spearmanr if kind == "spearman" else stats.kendalltau)(a, b).statistic)
 
 
-def segmentation(key: str, title: str) -> Metric:
-    """A number of the segmentation of all test views, against the data set's labels."""
-    return Metric(key, title, path=("segmentation", "run", key))
-
-
 def stamp(script: str) -> str:
     """Where and when a study ran."""
     at = ran()
@@ -152,8 +147,9 @@ def command(
     seeds: int = 3,
     sets: Mapping[str, Sequence[str]] | None = None,
     only: Mapping[str, Sequence[str]] | None = None,
+    rows: str | None = None,
 ) -> int:
-    """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl.
+    """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl, or ROWS.jsonl.
 
     Args:
         script: Its name, and that of its part of the page.
@@ -166,6 +162,7 @@ def command(
         seeds: The default of --seeds.
         sets: --set -> its scenes, the first the default; None: all scenes, and no such option.
         only: Policy -> scenes, of policies that are not run on all of them.
+        rows: Name of the file of rows.
     Returns:
         The exit code.
     """
@@ -181,17 +178,17 @@ def command(
         parser.add_argument("--set", choices=list(sets), default=next(iter(sets)), help="of scenes")
     args = parser.parse_args()
     scenes = sets[args.set] if sets else None
-    results = ROOT / "benchmarks" / f"{script}.jsonl"
+    results = ROOT / "benchmarks" / f"{rows or script}.jsonl"
     for path in args.merge:
         for row in read_study(path):
             append_row(results, row)
     study = study_of(args.scale, args.runs)
     if args.page:
-        rows = [row for row in read_study(results) if row["study"] == study.name]
-        rows = [row for row in rows if scenes is None or row["scene"] in scenes]
-        done = f"{len(rows)} of {planned(args.seeds)} cells are finished."
+        found = [row for row in read_study(results) if row["study"] == study.name]
+        found = [row for row in found if scenes is None or row["scene"] in scenes]
+        done = f"{len(found)} of {planned(args.seeds)} cells are finished."
         text = f"`python benchmarks/{script}.py --scale {args.scale}`: {done}\n\n"
-        fill_between(page, script, text + report(study, rows))
+        fill_between(page, script, text + report(study, found))
         return 0
     shard, shards = map(int, args.shard.split("/"))
     units = units_of(study, args.seeds, scenes) if scenes else units_of(study, args.seeds)

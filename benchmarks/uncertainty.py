@@ -30,7 +30,8 @@ from drgs.files import Run
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, variances
-from drgs.studies.cells import Cell, Study
+from drgs.studies.cells import Study
+from drgs.studies.rows import Cell
 from drgs.studies.tables import fill_between
 
 POLICY = "random"

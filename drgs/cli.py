@@ -23,7 +23,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
-from drgs.commands.making_options import Demo, Scene, Sfm, Teach
+from drgs.commands.making_options import Demo, Reproduce, Scene, Sfm, Teach
 from drgs.commands.options import (
     Cite,
     Convert,
@@ -64,6 +64,7 @@ _OPTIONS = {
     "sfm": Sfm,
     "teach": Teach,
     "scene": Scene,
+    "reproduce": Reproduce,
     "demo": Demo,
     "cite": Cite,
 }

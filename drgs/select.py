@@ -26,12 +26,13 @@ from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information
 from drgs.guards.arguments import must_be
 from drgs.guards.doors import Masks, camera_list, check_any_scene, mask_list
+from drgs.guards.imports import imported_function
 from drgs.information.cache import Cache
 from drgs.information.pool import Pick, Pool, Scoring, Selection, Workers
 from drgs.policies.informed import coverage, fisher, fisherrf, moments
 from drgs.policies.spread import farthest, random, uniform
 
-__all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "select"]
+__all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "policy_named", "select"]
 
 # One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
@@ -69,7 +70,7 @@ def select(
         candidates: Cameras to choose from, at least k.
         train: Cameras whose views are known; may be empty if lambda is absolute and > 0.
         k: How many.
-        policy: A name in `POLICIES`.
+        policy: A name in `POLICIES`, or `package.module:function` of a function like those.
         scoring: How views are scored; default `Scoring()`.
         rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
         masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside was not learned from.
@@ -97,8 +98,7 @@ def select(
         raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
     if not (isinstance(k, int) and 1 <= k <= len(candidates)):
         raise ValueError(f"select: k must be a whole number in 1..{len(candidates)} candidates, got {k!r}; correct it")
-    if policy not in POLICIES:
-        raise ValueError(f"select: policy must be one of {', '.join(POLICIES)}, got {policy!r}; choose one")
+    chosen = policy_named(policy)
     if rng is not None and not isinstance(rng, torch.Generator):
         raise ValueError(f"select: rng must be a torch.Generator that is kept between calls, got {rng!r}; make one")
     if masks is not None and information is not None:
@@ -120,9 +120,22 @@ def select(
         information=information,
         workers=workers,
     )
-    selection = POLICIES[policy](pool)
+    selection = chosen(pool)
     selection.seconds = time.perf_counter() - started
     return selection
+
+
+def policy_named(name: str) -> Callable[[Pool], Selection]:
+    """The policy of a name, or the function that `package.module:function` names.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if isinstance(name, str) and ":" in name:
+        return imported_function("--policy", name)
+    if name not in POLICIES:
+        raise ValueError(f"select: policy must be one of {', '.join(POLICIES)}, got {name!r}; choose one")
+    return POLICIES[name]
 
 
 def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:

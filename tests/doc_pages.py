@@ -49,6 +49,7 @@ _COMMANDS_ELSEWHERE = {
     "demo": "takes half a minute: tests/test_demo.py",
     "scene": "path tracing takes ten seconds: tests/test_room.py, tests/test_kitchen.py",
     "teach": "needs a model: tests/test_teach.py",
+    "reproduce": "takes minutes: tests/test_reproduce.py, and `make smoke`",
     "view": "ends by Ctrl-C alone: tests/test_view.py",
 }
 _ARGUMENTS_ELSEWHERE = {
@@ -56,7 +57,7 @@ _ARGUMENTS_ELSEWHERE = {
     r"\$DRGS_DATA/.*": "is of real data: `benchmarks/real.py`, and the tests marked real_data",
     r"runs/td/.*": "is of a run of the demo: tests/test_tradeoff.py",
     r"scene\.sog": "is written by other programs: tests/test_codecs.py",
-    r"examples\..*": "needs a rasterizer that is compiled: tests/test_examples.py",
+    r"examples\..*": "is an example: tests/test_examples.py",
 }
 
 

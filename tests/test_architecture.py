@@ -39,7 +39,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"data"}, "photographs and their cameras, from disk"),
     ({"fitting"}, "the parts of a fit"),
     ({"metrics"}, "pictures against photographs"),
-    ({"train"}, "fits, for users"),
+    ({"train", "evaluation"}, "fits, for users, and what they are worth"),
     ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
     ({"studies"}, "many fits, and what they say together"),

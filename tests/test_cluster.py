@@ -42,7 +42,8 @@ from drgs.information.pool import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings
-from drgs.studies.cells import Cell, Metric, Study, cell_of, read_study, run_cell
+from drgs.studies.cells import Metric, Study, run_cell
+from drgs.studies.rows import Cell, cell_of, read_study
 
 ROOT = Path(__file__).resolve().parents[1]
 FAST = RenderSettings.preset("fast")
@@ -494,7 +495,7 @@ def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_fol
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     rows = tmp_path / "rows.jsonl"
-    assert run_cells_on(cluster, study, cells, tmp_path / "runs", rows, said.append) == ([], [])
+    assert run_cells_on(cluster, study, cells, tmp_path / "runs", rows, said.append) == ([], {})
     killer.join(1)
     assert killed
     assert killed[0] != os.getpid()
@@ -510,7 +511,7 @@ def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_fol
     assert ", again: " in begun[1]
     assert sum(", worker " in line and "PSNR" in line for line in said) == 3
     again: list[str] = []
-    assert run_cells_on(cluster, study, cells, tmp_path / "runs", rows, again.append) == ([], [])
+    assert run_cells_on(cluster, study, cells, tmp_path / "runs", rows, again.append) == ([], {})
     assert again == []
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == [study.name], "nothing is left over"
 
@@ -527,7 +528,8 @@ def test_cells_that_fail_or_are_taken(cluster, still_folder, tmp_path, monkeypat
     said: list[str] = []
     with claim_run(Run(tmp_path / study.name / cells[1].name), "fit", resume=True):
         taken, failed = run_cells_on(cluster, study, cells, tmp_path, tmp_path / "rows.jsonl", said.append)
-    assert (taken, failed) == ([cells[1]], [cells[0]])
+    assert (taken, list(failed)) == ([cells[1]], [cells[0]])
+    assert "gone" in failed[cells[0]]
     assert any(line.startswith(f"{cells[0].name}: failed: ") and "gone" in line for line in said)
     assert any(f"process {os.getpid()} on " in line for line in said)
     monkeypatch.setattr("drgs.cluster.cells.sees", _sees_nothing)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import torch_rasterizer as tr
+from test_active import write_still
 
 import drgs
+from drgs import cli
+from drgs.cameras import orbit
+from drgs.fitting.config import ActiveConfig
 from drgs.libllvm import require_llvm
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -253,3 +259,103 @@ def test_listing_and_compositing_of_pairs():
         torch.arange(4, dtype=torch.int32),
     )
     assert [x.tolist() for x in listed] == [[0, 2], [0, 0], [0, 0]]
+
+
+# ------------------------------------------------------------------------------------------------------ view selectors
+
+
+def splatfacto(g: drgs.Gaussians, cameras) -> dict:
+    """What nbv_gym hands to a selector, as far as ours looks at it: shapes and units of Nerfstudio 1.1."""
+    from examples import nbv_gym_adapter
+
+    sh = g.sh
+    parameters = {
+        "means": g.means,
+        "scales": g.log_scales,
+        "quats": g.quats,
+        "features_dc": sh[:, 0],
+        "features_rest": sh[:, 1:],
+        "opacities": g.logit_opacities[:, None],
+    }
+    model = types.SimpleNamespace(gauss_params=torch.nn.ParameterDict(parameters))
+    shown = nbv_gym_adapter.Cameras(cameras)
+    return {
+        "model": model,
+        "datamanager": types.SimpleNamespace(train_dataset=types.SimpleNamespace(cameras=shown)),
+        "step": 200,
+    }
+
+
+def test_our_policies_as_their_selector():
+    """The picks are those of `drgs.select` on the same Gaussians and cameras, in their numbering; poses come back."""
+    from examples import nbv_gym_adapter
+
+    generator = torch.Generator().manual_seed(0)
+    n = 60
+    means = torch.randn(n, 3, generator=generator)
+    normal = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
+    g = drgs.Gaussians(means, normal(n, 4), normal(n, 3) * 0.3 - 2, normal(n), 0.2 * normal(n, 4, 3))
+    views = orbit((0, 0, 0), 4.0, 4, width=32, height=24, elevation=20)
+    views += orbit((0, 0.1, 0), 3.0, 3, width=32, height=24, elevation=50)  # no two distances are the same
+    active, remaining = [5, 1], [0, 2, 3, 4, 6]
+    context = splatfacto(g, views)
+    back = nbv_gym_adapter.camera_of(context["datamanager"].train_dataset.cameras[3:4], 10**6)
+    np.testing.assert_allclose(back.w2c, views[3].w2c, atol=1e-6)
+    assert (back.width, back.height) == (32, 24)
+    np.testing.assert_allclose(back.K, views[3].K, rtol=1e-6)
+    for policy, fields in (("fisher", {"criterion": "eig"}), ("farthest", {})):
+        chosen = nbv_gym_adapter.DrgsViewSelector(policy, **fields).select_views(active, remaining, 2, **context)
+        known, others = [views[i] for i in active], [views[i] for i in remaining]
+        wanted = drgs.select.select(g, others, known, 2, policy, **fields)
+        assert chosen == [remaining[pick.index] for pick in wanted.picks]
+    assert nbv_gym_adapter.DrgsViewSelector().select_views(active, [], 2, **context) == []
+
+
+def test_their_selector_as_our_policy():
+    """It sees known views first; what it chooses is picked in its order; too few or unknown views are refused."""
+    from examples import nbv_gym_adapter
+
+    views = orbit((0, 0, 0), 4.0, 8, width=32, height=24)
+    g = drgs.Gaussians(torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3))
+    found = drgs.select.select(g, views[2:], views[:2], 2, "examples.nbv_gym_adapter:nearest_first")
+    assert [pick.index for pick in found.picks] == [0, 1], "the neighbors of view 1 on that side"
+    assert [score > 0 for score in found.scores] == [True, True, False, False, False, False]
+
+    class Greedy:
+        def select_views(self, active_indices, remaining_indices, num_to_select, **context):
+            return [active_indices[0]]
+
+    drgs.select.POLICIES["greedy"] = nbv_gym_adapter.policy_of(Greedy())
+    try:
+        with pytest.raises(ValueError, match=r"Greedy: must choose 1 of the 6 remaining views, got \[0\]"):
+            drgs.select.select(g, views[2:], views[:2], 1, "greedy")
+    finally:
+        del drgs.select.POLICIES["greedy"]
+
+
+def test_a_policy_that_is_none(tmp_path):
+    """A function that cannot be imported, or is none, is refused in one line."""
+    g = drgs.Gaussians(torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3))
+    views = orbit((0, 0, 0), 4.0, 3, width=32, height=24)
+    for name, told in (
+        ("no_such_module:f", "must be importable, got ModuleNotFoundError"),
+        ("math:pi", "math must have a function pi, has none"),
+        ("math:", "must be package.module:function"),
+        ("best", "policy must be one of fisher"),
+    ):
+        with pytest.raises(ValueError, match=told) as error:
+            drgs.select.select(g, views[1:], views[:1], 1, name)
+        assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="active: policy must be one of fisher"):
+        ActiveConfig(policy="best")
+
+
+def test_a_fit_with_their_selector(tmp_path):
+    """`drgs fit --policy package.module:function` takes it at every pick, and says so in selection.json."""
+    write_still(tmp_path / "data")
+    command = f"fit {tmp_path / 'data'} -o {tmp_path / 'run'} --views active --add 2 --every 2 --max-steps 8 --quiet"
+    options = "--max-gaussians 60 --sh-degree 0 --policy examples.nbv_gym_adapter:nearest_first --no-report"
+    assert cli.main([*command.split(), *options.split()]) == 0
+    chosen = json.loads((tmp_path / "run" / "selection.json").read_text())
+    assert chosen["policy"] == "examples.nbv_gym_adapter:nearest_first"
+    assert len(chosen["picks"]) == 2

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import drgs
-from drgs import cli
+from drgs import cli, machine
 from drgs.cameras import orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
@@ -104,6 +104,16 @@ def test_frames_take_what_is_said(gaussians):
     assert 0.9 < int(done.stdout) / estimate < 1.6
 
 
+def test_peaks_are_a_process_s_own():
+    """What the process that started it holds is no part of a process's peak."""
+    if not os.path.exists("/proc/self/status"):
+        pytest.skip("no /proc to read the peak from")
+    held = bytearray(b"x" * (256 << 20))
+    code = f"import runpy; print(runpy.run_path({machine.__file__!r})['peak_memory']())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert machine.peak_memory() > len(held) > 2 * int(done.stdout) > 2 << 20
+
+
 def test_render_refuses_what_does_not_fit(gaussians, one_gigabyte):
     """From Python: more pixels, more rays, gradients or tangents than there is memory for."""
     with pytest.raises(ValueError, match=f"render: {TOLD}render a smaller one") as error:
@@ -182,3 +192,16 @@ def test_ulimit_is_an_error_and_no_crash(gaussians, tmp_path):
     assert done.returncode == 2, done.stderr
     assert "view 'orbit_0000': there must be memory for its 16384x16384 pixels" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_peak_memory_is_counted_anew():
+    """After a large array is gone and the peak is forgotten, what is told is what is held now."""
+    held = bytearray(b"x") * (300 << 20)
+    most = machine.peak_memory()
+    assert most > len(held)
+    del held
+    assert machine.peak_memory() == most
+    machine.forget_peak_memory()
+    if machine.peak_memory() == most:
+        pytest.skip("this system does not let a process forget")
+    assert machine.peak_memory() < most - (200 << 20)

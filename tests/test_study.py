@@ -21,10 +21,12 @@ from drgs.files import write_json
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.guards.locks import InUse
 from drgs.studies import cells as engine
-from drgs.studies.cells import Cell, Metric, Study, append_row, cell_of, distinct_seeds, read_study, run_cell, run_cells
+from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
 from drgs.studies.curves import draw_curves
-from drgs.studies.tables import fill_between, study_report
+from drgs.studies.experiments import EXPERIMENTS
+from drgs.studies.rows import Cell, append_row, cell_of, read_study
 from drgs.studies.statistics import at_views, differences, estimate, unit_of, view_counts
+from drgs.studies.tables import fill_between, study_report
 
 METRICS = (
     Metric("psnr", "PSNR", 2),
@@ -95,10 +97,10 @@ def test_units_are_outermost(still, faked, tmp_path):
     assert len(cells) == len(set(cells)) == len({cell.name for cell in cells}) == 8
     assert [cell.policy for cell in cells] == ["farthest", "Random, 1"] * 4
     said = []
-    assert run_cells(study, cells[:4], tmp_path, rows, said.append) == ([], [])
+    assert run_cells(study, cells[:4], tmp_path, rows, said.append) == ([], {})
     assert [cell_of(row) for row in read_study(rows)] == [("tiny", cell) for cell in cells[:4]]
     assert len(faked) == 4
-    assert run_cells(study, cells, tmp_path, rows, said.append) == ([], [])
+    assert run_cells(study, cells, tmp_path, rows, said.append) == ([], {})
     assert len(faked) == 8
     assert [cell_of(row)[1] for row in read_study(rows)] == cells
 
@@ -133,7 +135,7 @@ def test_a_folder_of_another_fit_is_refused(still, faked, tmp_path):
         run_cell(other, cell, tmp_path)
     assert len(faked) == 1
     said = []
-    assert run_cells(other, [cell], tmp_path, tmp_path / "rows.jsonl", said.append) == ([], [cell])
+    assert run_cells(other, [cell], tmp_path, tmp_path / "rows.jsonl", said.append)[1].keys() == {cell}
     assert "failed: " in said[-1]
     assert "every was 3" in said[-1]
 
@@ -201,7 +203,7 @@ def test_units_of_held_out_cameras(filmed, faked, tmp_path):
     with pytest.raises(ValueError, match="cam9"):
         study.dataset(dataclasses.replace(cells[0], camera="cam9"))
     rows = tmp_path / "rows.jsonl"
-    assert run_cells(study, cells, tmp_path, rows, str) == ([], [])
+    assert run_cells(study, cells, tmp_path, rows, str) == ([], {})
     assert [config.test_cameras for config, _ in faked] == [("cam01",), ("cam01",), ("cam02",), ("cam02",)]
     assert [active and active.schedule for _, active in faked] == ["times", None, "times", None]
     found = read_study(rows)
@@ -279,7 +281,7 @@ def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
     finally:
         other.kill()
         other.wait()
-    assert run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None) == ([], [])
+    assert run_cells(study, cells, tmp_path, tmp_path / "rows.jsonl", lambda line: None) == ([], {})
     assert len(faked) == len(cells)
 
 
@@ -295,9 +297,32 @@ def test_a_data_set_that_another_process_makes_is_waited_for(still, faked, tmp_p
 
     monkeypatch.setattr(engine, "_PATIENCE", 0.0)
     study = dataclasses.replace(small(still), folder=folder)
-    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, tmp_path / "rows.jsonl", str) == ([], [])
+    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, tmp_path / "rows.jsonl", str) == ([], {})
     assert len(calls) == 3
     assert caplog.text.count("waiting: ") == 1
+
+
+def test_lpips_comes_later(still, faked, tmp_path, monkeypatch):
+    """Finished cells get it without another fit, once; a row that has it, or says that it cannot be, is left alone."""
+    rows, measured = tmp_path / "rows.jsonl", []
+    study = small(still)
+    cell = study.cells(units((0,)))[0]
+    assert run_cells(study, [cell], tmp_path, rows, str) == ([], {})
+
+    def evaluate(run, claimed, lpips):
+        measured.append(lpips)
+        found = json.loads((run.path / "metrics.json").read_text())
+        write_json(run.path / "metrics.json", {**found, "mean": {**found["mean"], "lpips": 0.25}})
+
+    monkeypatch.setattr(engine, "evaluate_run", evaluate)
+    monkeypatch.setattr(engine, "Lpips", lambda weights: weights)
+    weighed = dataclasses.replace(study, metrics=(*METRICS, Metric("lpips", "LPIPS")), lpips=tmp_path / "w.pth")
+    for _ in range(2):
+        assert run_cells(weighed, [cell], tmp_path, rows, str) == ([], {})
+    assert len(faked) == 1
+    assert measured == [tmp_path / "w.pth"]
+    assert [row["metrics"]["lpips"] for row in read_study(rows)] == [0.25]
+    assert run_cells(study, [cell], tmp_path, rows, str) == ([], {}), "without weights it is done as well"
 
 
 def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
@@ -305,9 +330,9 @@ def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
     real, said, rows = engine._row, [], tmp_path / "rows.jsonl"
     monkeypatch.setattr(engine, "_row", lambda *arguments: {**real(*arguments), "seconds": None})
     study = small(still)
-    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, rows, said.append) == ([], [])
+    assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, rows, said.append) == ([], {})
     assert [row["seconds"] for row in read_study(rows)] == [None]
-    assert said[-1].endswith("steps 10.0")
+    assert said[-1].endswith("steps 10")
 
 
 # ---- one real cell
@@ -535,7 +560,7 @@ def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
         cells = study.cells(semantic.units_of(study, 3))
         assert len(cells) == len({cell.name for cell in cells}) == 3 * 5 * 10
         for start in range(0, len(cells), 10):
-            assert [cell.policy for cell in cells[start : start + 10]] == list(semantic.POLICIES)
+            assert [cell.policy for cell in cells[start : start + 10]] == list(study.policies)
             assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 10]}) == 1
         assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
         assert {cell.scene for cell in cells if cell.protocol == "paper"} == {"room-1"}
@@ -553,9 +578,9 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
     for scale in kitchen.SCALES:
         study = kitchen.study_of(scale, tmp_path)
         cells = study.cells(kitchen.units_of(study, 3))
-        count = len(kitchen.POLICIES)
+        count = len(study.policies)
         assert len(cells) == len({cell.name for cell in cells}) == 3 * count
-        assert [cell.policy for cell in cells] == 3 * list(kitchen.POLICIES)
+        assert [cell.policy for cell in cells] == 3 * list(study.policies)
         assert len({repr(study.configs(cell)) for cell in cells[:count]}) == count
         assert {study.configs(cell)[0].test_cameras for cell in cells} == {("cam00",)}
         rows = [
@@ -569,11 +594,12 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
         ]
         text = kitchen.report(study, rows)
         assert [line for line in text.splitlines() if line.startswith("### ")] == [
-            "### Policies",
+            "### Policies where things move",
             "### lambda",
-            "### Blocks",
+            "### What the criterion counts",
         ]
         for reference in ("random", "joint", "geometry"):
             assert f"#### Against `{reference}`" in text
-        assert {name for table in kitchen.TABLES for name in table[2]} == set(kitchen.POLICIES)
+        tables = [table.policies for table in EXPERIMENTS.values() if table.study == "dynamic"]
+        assert {label for policies in tables for label in policies} == set(study.policies)
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"

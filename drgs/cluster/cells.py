@@ -19,7 +19,9 @@ from drgs.cluster.agreement import check_agreement, statement, this_worker
 from drgs.cluster.parcels import Missing, opened_parcel
 from drgs.files import atomic_write
 from drgs.guards.locks import InUse, host_of
-from drgs.studies.cells import Cell, Study, append_row, cell_of, read_study, result_line, run_cell
+from drgs.guards.writing import is_full
+from drgs.studies.cells import Study, result_line, run_cell
+from drgs.studies.rows import Cell, append_row, is_done, read_study
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -42,7 +44,7 @@ def run_cells_on(
     runs: Path,
     rows: Path,
     say: Callable[[str], object] = print,
-) -> tuple[list[Cell], list[Cell]]:
+) -> tuple[list[Cell], dict[Cell, str]]:
     """Work through cells on a cluster, one at a time on each worker; rows are appended here, as they come.
 
     A fit that fails is told and left for the next call; the others go on. On Ctrl-C, workers of this machine end;
@@ -56,17 +58,22 @@ def run_cells_on(
         rows: The JSON-lines file, of this machine alone; cells that it has are skipped.
         say: Takes a line whenever a cell begins or ends.
     Returns:
-        Cells that other processes have, and cells that failed.
+        Cells that other processes have, and those that failed, with the reason.
     Raises:
+        OSError: If there is no room left on the disk of a worker.
         ValueError: If a worker does not see the folder of the runs, or computes with something else than this process.
         ConnectionError: If the scheduler, or all workers, have gone.
     """
     runs = runs.resolve()
     runs.mkdir(parents=True, exist_ok=True)
-    there = {cell_of(row) for row in read_study(rows)}
-    left = [(number, cell) for number, cell in enumerate(cells, 1) if (study.name, cell) not in there]
+    there = read_study(rows)
+    left = [
+        (number, cell)
+        for number, cell in enumerate(cells, 1)
+        if not is_done(study.name, cell, there, study.measured_later)
+    ]
     if not left:
-        return [], []
+        return [], {}
     with _token(runs) as token:
         _check_shared(cluster, token)
         return _Round(cluster, study, left, len(cells), runs, rows, token, say).all()
@@ -123,9 +130,9 @@ class _Round:
         self.tries: dict[int, int] = {}
         self.elsewhere: set[int] = set()  # cells that were handed to a machine that has their lock
         self.taken: list[Cell] = []
-        self.failed: list[Cell] = []
+        self.failed: dict[Cell, str] = {}
 
-    def all(self) -> tuple[list[Cell], list[Cell]]:
+    def all(self) -> tuple[list[Cell], dict[Cell, str]]:
         """Until every cell is done, taken or failed."""
         named, client = dict(self.cells), self.cluster.client
         client.subscribe_topic(self.topic, lambda event: self.news.put(("begun", event[1])))
@@ -173,8 +180,7 @@ class _Round:
         except ConnectionError:
             if self.cluster.client.status != "running":
                 raise
-            self.say(f"{cell.name}: failed: its workers died of it")
-            self.failed.append(cell)
+            self.fail(cell, "its workers died of it")
             return
         if "missing" in found:
             self.tries[number] = self.tries.get(number, 0) + 1
@@ -193,11 +199,15 @@ class _Round:
                 self.say(f"{cell.name}: taken: {found['why']}")
                 self.taken.append(cell)
         elif "failed" in found:
-            self.say(f"{cell.name}: failed: {found['failed']}")
-            self.failed.append(cell)
+            self.fail(cell, found["failed"])
         else:
             append_row(self.rows, found["row"])
             self.say(f"{result_line(self.study, cell, found['row'])}, worker {found['worker']}")
+
+    def fail(self, cell: Cell, why: str) -> None:
+        """Tell that a cell has failed, and remember it."""
+        self.say(f"{cell.name}: failed: {why}")
+        self.failed[cell] = why
 
 
 # --------------------------------------------------------------------------------------------------- on the worker
@@ -250,4 +260,6 @@ def do_cell(
                 return said | {"taken": host_of(Path(runs) / whole.name / cell.name), "why": str(busy)}
             time.sleep(1.0)
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            if is_full(error):
+                raise
             return said | {"failed": str(error)}

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from drgs import data
 from drgs.display import tables
-from drgs.display.pictures import file_names
+from drgs.evaluation import evaluate_run
 from drgs.files import Run
-from drgs.fitting.frames import load_frames
-from drgs.fitting.records import fit_record, fitted_views, load_run
+from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
-from drgs.fitting.stages import moving_labels
-from drgs.metrics import METRICS, MOVING, VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
+from drgs.metrics import METRICS, MOVING, Lpips
 
 if TYPE_CHECKING:
     from drgs.commands.options import Eval
-    from drgs.deform import DynamicGaussians
-    from drgs.fitting.frames import Frame
-    from drgs.fitting.records import LoadedRun
-    from drgs.fitting.segments import Segmentation
 
 __all__ = ["print_table", "run", "viewers_line"]
 
@@ -31,78 +24,10 @@ def run(args: Eval) -> None:
     run = Run(args.run)
     recorded = fit_record(run)
     recorded.check_data(run.path)
-    output = claim_run(run, "eval")
-    loaded = load_run(run)
-    g, scene = loaded.gaussians, loaded.scene
-    config = recorded.config
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
-    # Of an active run, images may be missing that were never picked.
-    dataset = data.load(
-        recorded.data,
-        test_every=config.test_every,
-        test_offset=config.test_offset,
-        times=config.times,
-        test_cameras=config.test_cameras,
-        background=config.settings.background,
-        lazy=recorded.is_active,
-        points=False,
-        strict=args.strict,
-        semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
-    )
-    train, test = dataset.split()
-    if recorded.is_active:  # the rest of the training split was never seen
-        fitted = fitted_views(run)
-        train = [view for view in train if view.name in fitted]
-    views = {"test": test, "train": train, "all": train + test}[args.split]
-    if not views:
-        raise ValueError(f"eval: split {args.split} must hold a view, holds none ({dataset.split_rule()}); use --split")
-    frames = load_frames(views, config.max_pixels, config.mask)
-    names = file_names([frame.name for frame in frames])
-    kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
-    output.check(f"renders/{args.split}/{name}.{kind}" for name in names for kind in kinds)
-    segmentation = _segmentation(loaded, dataset, frames)
-    result = evaluate(
-        scene,
-        frames,
-        config.settings,
-        lpips=lpips,
-        pictures=run.renders / args.split,
-        segmentation=segmentation,
-        moving=moving_labels(dataset) if recorded.times else frozenset(),
-    )
-    viewers = through_viewers(scene, frames, config.settings, args.split)
-    written = write_metrics(
-        run,
-        args.split,
-        frames,
-        result,
-        split_rule=dataset.split_rule(),
-        gaussians=len(g),
-        viewers=viewers,
-        **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
-    )
+    written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict)
     if not args.quiet:
         print_table(written)
-
-
-def _segmentation(loaded: LoadedRun, dataset: data.Dataset, frames: list[Frame]) -> Segmentation | str | None:
-    """What of the run's labels is measured.
-
-    Raises:
-        ValueError: If numbers in the data set's labels mean other classes than they did when the run was fitted.
-    """
-    record, known = loaded.record.semantics, dataset.semantics
-    if record is None:
-        return None
-    from drgs.fitting.segments import segmentation_of
-
-    now = known.classes if known is not None and (known.class_file or known.embedding_file) else None
-    if now is not None and record.classes is not None and now.names != record.classes:
-        raise ValueError(
-            f"{dataset.path}: must have the classes that the run was fitted with ({', '.join(record.classes[:5])}, "
-            f"...), has {', '.join(now.names[:5])}, ...; restore its class names"
-        )
-    return segmentation_of(loaded.gaussians, loaded.decoder, loaded.classes, record, frames)
 
 
 def print_table(metrics: dict) -> None:
@@ -127,11 +52,6 @@ def print_table(metrics: dict) -> None:
 
 def _shown(value: float | None, digits: str) -> str:
     return "-" if value is None else f"{value:{digits}}"
-
-
-def _who_moves(scene: DynamicGaussians) -> dict:
-    moving = int(scene.moving.sum())
-    return {"moving": moving, "share": moving / max(len(scene), 1)}
 
 
 def _motion_line(moved: dict, count: int) -> str:

@@ -1,16 +1,17 @@
-"""What the commands that make data can be asked for: photographs to cameras, teachers, made scenes, and the demo."""
+"""What commands that make things can be asked for: photographs to cameras, teachers, scenes, studies, and the demo."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction, arg
 
 from drgs.commands.option_groups import Common, OutputPath, Timed
+from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
 
-__all__ = ["Demo", "Scene", "Sfm", "Teach"]
+__all__ = ["Demo", "Reproduce", "Scene", "Sfm", "Teach"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,3 +84,31 @@ class Scene(Common):
     """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
     test_every: int | None = None
     """One in how many views is for testing (room); default 5, which is 15 of 75 views."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reproduce(Common):
+    """Repeat a table of arXiv 2512.22771 on made scenes or on your data: fits by every policy, means, intervals."""
+
+    what: Positional[ExperimentName]
+    """Policies on static scenes, or where things move (dynamic); lambda (prior), or what the score counts (blocks)."""
+    output: OutputPath
+    """Folder for scenes, runs, rows.jsonl, tables and figures, of all four; what is finished there is kept."""
+    data: Annotated[tuple[Path, ...], arg(metavar="DATA"), UseAppendAction] = ()
+    """A data set to take in place of the made scenes; may be repeated."""
+    scale: StudyScale = "small"
+    """Of fits and scenes: minutes (tiny), hours (small: a fifth of the paper's steps), or as in the paper."""
+    seeds: int = 3
+    """Sets of initial views of each static scene; where things move, kitchens, or fits of each data set."""
+    protocol: ProtocolName = "paper"
+    """What is known at the start: points of all views (paper), or nothing of unpicked ones (blind, and variants)."""
+    policies: Annotated[tuple[str, ...], arg(name="policy", metavar="LABEL"), UseAppendAction] = ()
+    """Only this row of the table; may be repeated."""
+    test_every: int = 8
+    """Every n-th view of given data, by name, is held out, unless its files state a split."""
+    test_offset: int = 0
+    """Index of the first of them."""
+    lpips_weights: Path | None = None
+    """torchvision's AlexNet or VGG16, for LPIPS beside FLIP; needs pip install 'drgs[lpips]'."""
+    figures: bool = True
+    """Draw the comparison sheet and the maps at the end; --no-figures saves their seconds."""

@@ -201,8 +201,8 @@ class Comparing(Informed, Around, Views):
 class Choosing(Informed):
     """Options of commands that choose views."""
 
-    policy: Policy = ActiveConfig.policy
-    """How the next view is chosen (docs/information.md)."""
+    policy: Policy | str = ActiveConfig.policy
+    """How the next view is chosen (docs/information.md), or a function of your own: package.module:function."""
     criterion: Criterion = ActiveConfig.criterion
     """Score of policy fisher; v_opt chose the best views where views were few (docs/active-static.md)."""
     network: NetworkScore = ActiveConfig.network

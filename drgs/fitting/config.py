@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from drgs.guards.arguments import check_fields, must_be
 from drgs.information.choices import (
+    POLICY_NAMES,
     Block,
     Combine,
     Criterion,
     Method,
     NetworkScore,
-    Policy,
     check_combined,
     checked_blocks,
 )
@@ -246,7 +246,7 @@ class ActiveConfig:
     """How views are chosen during a fit.
 
     Attributes:
-        policy: A name in `drgs.select.POLICIES`.
+        policy: A name in `drgs.select.POLICIES`, or `package.module:function` of one's own.
         criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
         method: Of the diagonal, see `drgs.fisher.diagonal`.
         schedule: `views`: `initial` views, then one after the other. `times`: the static stage on all cameras at the
@@ -275,7 +275,7 @@ class ActiveConfig:
             picked; selection.json has the averages. What all picks lead to is in metrics.json as ever.
     """
 
-    policy: Policy = "fisher"
+    policy: str = "fisher"
     criterion: Criterion = "v_opt"
     method: Method = "exact"
     schedule: Schedule = "auto"
@@ -297,6 +297,8 @@ class ActiveConfig:
     def __post_init__(self) -> None:
         from drgs.gain import Prior
 
+        if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
+            raise ValueError(f"active: policy must be one of {', '.join(POLICY_NAMES)}, got {self.policy!r}")
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         if self.blocks is not None:

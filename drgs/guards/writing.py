@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-__all__ = ["append_line", "named"]
+__all__ = ["append_line", "is_full", "named"]
 
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -36,8 +36,14 @@ def append_line(path: Path, value: dict, **options: Any) -> None:
 
 def named(path: Path, error: OSError) -> OSError:
     """An error of writing in a sentence with the file's name: the system's has none, or that of a hidden file."""
-    if error.errno in _FULL:
-        return OSError(f"{path}: must be written, got: {error.strerror}; free some space or choose another folder")
-    if error.errno in _CLOSED:
-        return OSError(f"{path}: must be written, got: {error.strerror}; allow it or choose another folder")
-    return error
+    advice = "free some space" if error.errno in _FULL else "allow it" if error.errno in _CLOSED else ""
+    if not advice:
+        return error
+    told = OSError(f"{path}: must be written, got: {error.strerror}; {advice} or choose another folder")
+    told.errno = error.errno
+    return told
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error says that there is no room left: it will be there for whatever is tried next."""
+    return isinstance(error, OSError) and error.errno in _FULL

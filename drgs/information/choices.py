@@ -20,6 +20,7 @@ __all__ = [
     "Method",
     "NetworkScore",
     "NetworkEstimate",
+    "POLICY_NAMES",
     "Policy",
     "check_combined",
     "checked_blocks",
@@ -30,6 +31,8 @@ Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
 
 Policy = Literal["fisher", "fisherrf", "coverage", "moments", "farthest", "uniform", "random"]
 """The names in `drgs.select.POLICIES`, where the functions are."""
+
+POLICY_NAMES: tuple[Policy, ...] = typing.get_args(Policy)
 
 Method = Literal["exact", "columns", "probes", "fisherrf"]
 """How `drgs.fisher.diagonal` computes; the first is the default everywhere."""

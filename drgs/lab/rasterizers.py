@@ -8,9 +8,7 @@ here (raw.posed), so that they arrive at its motion. A dump has an image and gra
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +17,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, sh_degree_of
+from drgs.guards.imports import imported_function
 from drgs.integrator import render
 from drgs.lab.dumps import SUFFIXES, Dump, one_line, read_dump
 from drgs.lab.raw import COLORS, POSE, gaussians_of, image_of, posed
@@ -117,19 +116,7 @@ def load_rasterizer(
         if not torch.cuda.is_available():
             raise ValueError("--rasterizer gsplat: must have a CUDA card, torch finds none; use a dump made on one")
         return function(rasterization, text)
-    module, colon, attribute = text.partition(":")
-    if not (colon and module and attribute):
-        raise ValueError(
-            f"--rasterizer {text}: must be drgs:PRESET, gsplat, package.module:function, or a file .npz or .safetensors"
-        )
-    if "" not in sys.path:  # a function beside the user, also when `drgs` is an installed script
-        sys.path.insert(0, "")
-    try:
-        found = getattr(importlib.import_module(module), attribute, None)
-    except Exception as error:
-        raise ValueError(f"--rasterizer {text}: must be importable, got {type(error).__name__}: {error}") from error
-    if not callable(found):
-        raise ValueError(f"--rasterizer {text}: {module} must have a function {attribute}, has none")
+    found = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
     return function(found, text)
 
 

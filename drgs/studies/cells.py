@@ -10,80 +10,35 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import os
-import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from drgs import data
+from drgs.evaluation import evaluate_run
 from drgs.files import Run
 from drgs.fitting.active import SELECTION, ActiveViews
 from drgs.fitting.config import SAVING, ActiveConfig, FitConfig, Start
 from drgs.fitting.resume import claim_run
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
+from drgs.guards.writing import is_full
+from drgs.machine import forget_peak_memory
+from drgs.metrics import Lpips
+from drgs.studies.protocols import PROTOCOLS
+from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.train import fit
 
-__all__ = [
-    "Cell",
-    "Metric",
-    "Study",
-    "append_row",
-    "cell_of",
-    "distinct_seeds",
-    "read_study",
-    "result_line",
-    "run_cell",
-    "run_cells",
-]
+__all__ = ["Metric", "Study", "distinct_seeds", "result_line", "run_cell", "run_cells"]
 
-_Unit = tuple[str, tuple[int, int] | str, Start, "Protocol", int]
-Protocol = Literal["blind", "paper"]
-"""`blind`: nothing of a view is read before it is picked. `paper`: initial points of the whole data set (pool_leak)."""
+_Unit = tuple[str, tuple[int, int] | str, Start, str, int]
 
 _log = logging.getLogger(__name__)
+_ADVICE = "move the run folder away, to have it fitted again"
 _PATIENCE = 5.0  # seconds until a data set that another process makes is asked for again
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """One fit of a study.
-
-    Attributes:
-        scene: Name of a data set of the study.
-        split: (n, k): every n-th view by name is held out, from index k on.
-        start: `first` view by name, or the one that the `seed` draws; the others of the initial views follow from it.
-        policy: Label of a policy of the study.
-        protocol: `blind` or `paper`.
-        seed: Of everything random in the fit.
-        camera: Of what several cameras film at once: the one that is held out at all times, in place of `split`, which
-            is (0, 0); what is known at the start is what all others see at the first time, whatever `start` says.
-    """
-
-    scene: str
-    split: tuple[int, int]
-    start: Start
-    policy: str
-    protocol: Protocol
-    seed: int
-    camera: str = ""
-
-    @property
-    def name(self) -> str:
-        """Of its run folder."""
-        words = re.sub(r"[^a-z0-9.+]+", "-", self.policy.lower()).strip("-")
-        held_out = self.camera or "{}+{}".format(*self.split)
-        return f"{self.scene}-{held_out}-{self.start}{self.seed}-{self.protocol}-{words}"
-
-    def to_json(self) -> dict:
-        """As a row begins; without a camera where none is held out, as in rows of studies that know none."""
-        fields = {**dataclasses.asdict(self), "split": list(self.split)}
-        return fields if self.camera else {name: x for name, x in fields.items() if name != "camera"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +51,7 @@ class Metric:
         digits: Behind the decimal point in tables.
         larger: Whether larger is better.
         path: Keys that lead to it in metrics.json; default ("mean", key).
+        optional: Not every data set has what it takes: where a key is missing, the number is None.
     """
 
     key: str
@@ -103,6 +59,7 @@ class Metric:
     digits: int = 3
     larger: bool = True
     path: tuple[str, ...] = ()
+    optional: bool = False
 
     def read(self, metrics: Mapping[str, Any]) -> float | None:
         """The number in a metrics.json; None where it could not be computed.
@@ -113,6 +70,8 @@ class Metric:
         value: Any = metrics
         for key in self.path or ("mean", self.key):
             if not isinstance(value, Mapping) or key not in value:
+                if self.optional:
+                    return None
                 raise ValueError(f"metrics.json: must have {'.'.join(self.path or ('mean', self.key))}, has no {key!r}")
             value = value[key]
         return None if value is None else float(value)
@@ -131,6 +90,7 @@ class Study:
         metrics: What a row holds.
         reference: Label of the policy that the others are compared with.
         comparisons: More pairs (policy, reference) to be compared.
+        lpips: Weights of a backbone: every row then has LPIPS, those of finished runs, too.
     """
 
     name: str
@@ -141,6 +101,12 @@ class Study:
     metrics: tuple[Metric, ...]
     reference: str
     comparisons: tuple[tuple[str, str], ...] = ()
+    lpips: Path | None = None
+
+    @property
+    def measured_later(self) -> tuple[str, ...]:
+        """Metrics that finished cells may lack."""
+        return () if self.lpips is None else ("lpips",)
 
     def cells(self, units: Iterable[_Unit]) -> list[Cell]:
         """The cells of units (scene, split or camera held out, start, protocol, seed), units outermost: what is there
@@ -154,13 +120,15 @@ class Study:
 
     def configs(self, cell: Cell) -> tuple[FitConfig, ActiveConfig | None]:
         """What the fit of a cell is told."""
-        every, offset = cell.split
-        points = "all" if cell.protocol == "paper" else "views"
-        changed: dict[str, Any] = {"seed": cell.seed, "test_every": every, "test_offset": offset, "init_points": points}
+        (every, offset), protocol = cell.split, PROTOCOLS[cell.protocol]
+        changed: dict[str, Any] = {"seed": cell.seed, "test_every": every, "test_offset": offset}
+        changed["init_points"] = protocol.points
         if cell.camera:
             changed["test_cameras"] = (cell.camera,)
         fields, config = self.policies[cell.policy], dataclasses.replace(self.fit, **changed)
-        return config, None if fields is None else dataclasses.replace(self.active, start=cell.start, **fields)
+        if fields is None:
+            return config, None
+        return config, dataclasses.replace(self.active, start=cell.start, **{**protocol.active, **fields})
 
     def _made(self, cell: Cell) -> Path:
         """The folder of a cell's data set, once no other process is making it any more."""
@@ -187,7 +155,7 @@ class Study:
             test_offset=offset,
             background=self.fit.settings.background,
             lazy=True,
-            points=cell.protocol == "paper",
+            points=PROTOCOLS[cell.protocol].leaks,
             times=self.fit.times,
             test_cameras=(cell.camera,) if cell.camera else None,
         )
@@ -196,7 +164,7 @@ class Study:
         names = sorted(view.name for view in (*dataset.views, *dataset.absent))
         held_out = {view.name for view in dataset.split()[1]}
         there = {view.name for view in dataset.views}
-        if held_out != there & set(names[offset::every]):
+        if every and held_out != there & set(names[offset::every]):
             raise ValueError(
                 f"{dataset.path}: must hold out every {every}th view from index {offset} on, as the cell does, its "
                 "files state other test views; remove what they state"
@@ -225,116 +193,71 @@ def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int,
     )
 
 
-# ------------------------------------------------------------------------------------------------------------ rows
-
-
-def cell_of(row: Mapping[str, Any]) -> tuple[str, Cell]:
-    """The study and the cell of a row."""
-    fields = {field.name: row[field.name] for field in dataclasses.fields(Cell) if field.name != "camera"}
-    return row["study"], Cell(**{**fields, "split": tuple(fields["split"]), "camera": row.get("camera", "")})
-
-
-def read_study(*paths: Path) -> list[dict]:
-    """The rows of JSON-lines files, merged by cell; of two rows of one cell the later one counts.
-
-    A last line that a killed process left half written is left out, as is a file that is not there.
-
-    Raises:
-        ValueError: If another line is damaged.
-    """
-    rows = {}
-    for path in paths:
-        lines = path.read_bytes().split(b"\n") if path.exists() else []
-        for number, line in enumerate(lines, 1):
-            if not line.strip():
-                continue
-            try:
-                row = json.loads(line)
-                rows[cell_of(row)] = row
-            except (ValueError, KeyError, TypeError) as error:
-                if number == len(lines):  # every whole line ends with a newline
-                    continue
-                raise ValueError(
-                    f"{path}: line {number} must be a row of a study, is not ({error}); remove it"
-                ) from None
-    return list(rows.values())
-
-
-def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Add a row to a file that other processes add to as well, unless its cell is there already."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(path) as file:
-        if cell_of(row) in {cell_of(other) for other in read_study(path)}:
-            return
-        file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)  # a killed process may have left half a line
-        file.write(json.dumps(row).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[Any]:
-    """A file, opened for reading and appending, locked against the other processes that do the same."""
-    with path.open("a+b") as file:
-        with suppress(OSError, ImportError):  # a file system without it
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield file
-
-
 # ------------------------------------------------------------------------------------------------------------ runs
 
 
-def run_cell(study: Study, cell: Cell, runs: Path) -> dict:
+def run_cell(study: Study, cell: Cell, runs: Path, progress: bool = False) -> dict:
     """The row of a cell: fitted now, from its last checkpoint on, or found finished.
 
     Args:
         study, cell: What to do.
         runs: Folder of all runs.
+        progress: Show that of the fit.
     Raises:
         InUse: If another process has the cell.
         ValueError: If the folder holds another fit, or as `drgs.train.fit`.
     """
     run = Run(runs / study.name / cell.name)
     config, active = study.configs(cell)
-    with claim_run(run, "fit", resume=True):
+    with claim_run(run, "fit", resume=True) as claimed:
         if (run.path / "config.json").is_file():
             _check_same(run, config, active)
         if not (run.path / "metrics.json").is_file():
-            fit(study.dataset(cell), run.path, config, active=active, resume=True, progress=False)
+            forget_peak_memory()  # of the cell before
+            fit(study.dataset(cell), run.path, config, active=active, resume=True, progress=progress)
+        if study.lpips is not None and _metrics(run)["mean"].get("lpips") is None:
+            evaluate_run(run, claimed, lpips=Lpips(study.lpips))
         return _row(study, cell, run)
 
 
 def run_cells(
-    study: Study, cells: Sequence[Cell], runs: Path, rows: Path, say: Callable[[str], object] = print
-) -> tuple[list[Cell], list[Cell]]:
+    study: Study,
+    cells: Sequence[Cell],
+    runs: Path,
+    rows: Path,
+    say: Callable[[str], object] = print,
+    progress: bool = False,
+) -> tuple[list[Cell], dict[Cell, str]]:
     """Work through cells, in their order; rows are appended as they come.
 
-    A fit that fails is told and left for the next call; the others go on.
+    A fit that fails is told and left for the next call; the others go on, unless there is no room left on the disk.
 
     Args:
         study, cells: What to do.
         runs: Folder of all runs.
         rows: The JSON-lines file; cells that it has are skipped.
         say: Takes a line whenever a cell begins or ends.
+        progress: Show that of every fit.
     Returns:
-        Cells that other processes have, and cells that failed.
+        Cells that other processes have, and those that failed, with the reason.
+    Raises:
+        OSError: If there is no room left.
     """
-    taken, failed = [], []
+    taken, failed = list[Cell](), dict[Cell, str]()
     for number, cell in enumerate(cells, 1):
-        if (study.name, cell) in {cell_of(row) for row in read_study(rows)}:
+        if is_done(study.name, cell, read_study(rows), study.measured_later):
             continue
         say(f"{number} of {len(cells)}: {cell.name}")
         try:
-            row = run_cell(study, cell, runs)
+            row = run_cell(study, cell, runs, progress)
         except InUse:
             taken.append(cell)
             continue
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            if is_full(error):
+                raise
             say(f"{cell.name}: failed: {error}")
-            failed.append(cell)
+            failed[cell] = str(error)
             continue
         append_row(rows, row)
         say(result_line(study, cell, row))
@@ -343,8 +266,12 @@ def run_cells(
 
 def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
     """What a finished cell has found, in a line."""
-    numbers = ", ".join(f"{m.title} {row['metrics'][m.key]}" for m in study.metrics)
+    numbers = ", ".join(_said(m, row["metrics"][m.key]) for m in study.metrics)
     return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
+
+
+def _said(metric: Metric, value: float | None) -> str:
+    return f"{metric.title} {'none' if value is None else f'{value:.{metric.digits}f}'}"
 
 
 def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> None:
@@ -364,23 +291,29 @@ def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> Non
                 )
 
 
-def _row(study: Study, cell: Cell, run: Run) -> dict:
-    """What a finished run found."""
-    advice = "move the run folder away, to have it fitted again"
-    metrics = read_json(run.path / "metrics.json", "the metrics of a fit", advice)
+def _metrics(run: Run) -> dict:
+    """What a finished run's test views show."""
+    metrics = read_json(run.path / "metrics.json", "the metrics of a fit", _ADVICE)
     if metrics.get("split") != "test":
         raise ValueError(
             f"{run.path / 'metrics.json'}: must be of the test views, is of {metrics.get('split')!r}; "
             f"run `drgs eval {run.path}`"
         )
-    env = read_json(run.path / "env.json", "where a run ran", advice)
+    return metrics
+
+
+def _row(study: Study, cell: Cell, run: Run) -> dict:
+    """What a finished run found."""
+    metrics = _metrics(run)
+    env = read_json(run.path / "env.json", "where a run ran", _ADVICE)
     measured: list[dict] = []
     if study.policies[cell.policy] is None:
-        start, picks, leak = run.config()["train"], [], cell.protocol == "paper"
+        start, picks, leak = run.config()["train"], [], PROTOCOLS[cell.protocol].leaks
     else:
-        chosen = read_json(run.path / SELECTION, "the record of the chosen views", advice)
+        chosen = read_json(run.path / SELECTION, "the record of the chosen views", _ADVICE)
         start, picks, leak = [view["name"] for view in chosen["start"]], chosen["picks"], chosen["pool_leak"]
         measured = chosen.get("measured", [])
+    done = next((event for event in run.events()[::-1] if event.get("event") == "done"), {})
     return {
         "study": study.name,
         **cell.to_json(),
@@ -391,7 +324,8 @@ def _row(study: Study, cell: Cell, run: Run) -> dict:
         "curve": {str(x["views"]): {metric.key: metric.read(x) for metric in study.metrics} for x in measured},
         "views": metrics["count"],
         "gaussians": metrics.get("gaussians"),
-        "seconds": metrics.get("seconds"),
+        "seconds": metrics.get("seconds", done.get("seconds")),
+        "peak_memory": done.get("peak_memory"),
         "pick_seconds": float(np.mean([pick["seconds"] for pick in picks])) if picks else None,
         "pool_leak": leak,
         "commit": env["commit"],

@@ -11,17 +11,14 @@ import numpy as np
 
 from drgs.files import atomic_write
 from drgs.studies.cells import Metric, Study
+from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import Effect, Unit, at_views, differences, estimate, unit_of, values_of, view_counts
 
-__all__ = ["fill_between", "study_report"]
+__all__ = ["comparison_table", "explained", "fill_between", "markdown_table", "paragraph", "study_report"]
 
 StudyRows = Sequence[Mapping[str, Any]]
 
 _FEWEST = 6  # units: five that all agree do so by chance in one of 16 studies (sign test, both sides)
-_PROTOCOLS = {
-    "blind": "nothing of a view is read before it is picked",
-    "paper": "initial points of the whole data set, views that are never picked included (`pool_leak`)",
-}
 
 
 def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
@@ -29,18 +26,18 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
 
     Args:
         study: What was studied.
-        rows: Its rows (`drgs.studies.cells.read_study`); others are left out.
+        rows: Its rows (`drgs.studies.rows.read_study`); others are left out.
         level: Of the headings.
     """
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in study.policies]
     if not rows:
         return "No cell is finished."
-    parts = [_wrapped(_size(rows))]
-    protocols = [name for name in _PROTOCOLS if any(row["protocol"] == name for row in rows)]
+    parts = [paragraph(_size(rows))]
+    protocols = [name for name in PROTOCOLS if any(row["protocol"] == name for row in rows)]
     for protocol in protocols:
         mine = [row for row in rows if row["protocol"] == protocol]
         if len(protocols) > 1:
-            parts.append(f"{'#' * level} Protocol `{protocol}`: {_PROTOCOLS[protocol]}")
+            parts.append(f"{'#' * level} Protocol `{protocol}`: {PROTOCOLS[protocol].told}")
         below = "#" * (level + (len(protocols) > 1))
         for scene in dict.fromkeys(row["scene"] for row in mine):
             parts += [f"{below} {scene}", _means(study, [row for row in mine if row["scene"] == scene])]
@@ -48,13 +45,13 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             others = [(label, study.reference) for label in study.policies if label != study.reference]
             parts += [
                 f"{below} Against `{study.reference}`",
-                _wrapped(_explained(mine, len(others) * len(study.metrics))),
-                _compared(study, mine, others),
+                paragraph(explained(mine, len(others) * len(study.metrics))),
+                comparison_table(study, mine, others),
             ]
             if verdicts := _verdicts(study, mine, others):
                 parts.append(verdicts)
         if any(_estimates(study, mine, *pair)[study.metrics[0].key] for pair in study.comparisons):
-            table = _compared(study, mine, study.comparisons, named=True)
+            table = comparison_table(study, mine, study.comparisons, named=True)
             if verdicts := _verdicts(study, mine, study.comparisons):
                 table += "\n\n" + verdicts
             parts += [f"{below} Other pairs", table]
@@ -81,7 +78,8 @@ def fill_between(page: Path, name: str, text: str) -> None:
         file.write(f"{before}{begin}\n\n{text}\n\n{end}{after}".encode())
 
 
-def _wrapped(text: str) -> str:
+def paragraph(text: str) -> str:
+    """A paragraph in lines of 120 characters."""
     return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
@@ -130,7 +128,8 @@ def _labels(study: Study, rows: StudyRows) -> list[str]:
     return [label for label in study.policies if any(row["policy"] == label for row in rows)]
 
 
-def _table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+def markdown_table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table of Markdown."""
     rule = "|" + "---|" * len(heads)
     return "\n".join(["| " + " | ".join(heads) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)])
 
@@ -149,7 +148,7 @@ def _means(study: Study, rows: StudyRows) -> str:
         count = len({unit_of(row) for row in rows if row["policy"] == label})
         lines.append([label, *cells, f"{np.mean(seconds):.2f}" if seconds else "none", str(count)])
     heads = ["policy", *(_title(metric) for metric in study.metrics), "seconds a pick", "units"]
-    return _table(heads, lines)
+    return markdown_table(heads, lines)
 
 
 def _by_median(rows: StudyRows) -> list[dict[str, Any]]:
@@ -161,7 +160,7 @@ def _title(metric: Metric) -> str:
     return metric.title if metric.larger else f"{metric.title} (lower is better)"
 
 
-def _explained(rows: StudyRows, intervals: int) -> str:
+def explained(rows: StudyRows, intervals: int) -> str:
     """How to read the table of differences, which has so many intervals."""
     scenes, units = len({row["scene"] for row in rows}), len({unit_of(row) for row in rows})
     told = (
@@ -179,8 +178,17 @@ def _explained(rows: StudyRows, intervals: int) -> str:
     )
 
 
-def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], named: bool = False) -> str:
-    """Pairs of policies against metrics; below them the size of a difference that can be seen."""
+def comparison_table(
+    study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], named: bool = False, names: Mapping[str, str] = {}
+) -> str:
+    """Pairs of policies against metrics as a table; below them the size of a difference that can be seen.
+
+    Args:
+        study, rows: What is compared.
+        pairs: (policy, reference) each.
+        named: Name the reference in every line.
+        names: Label -> what is printed in its place.
+    """
     lines: list[list[str]] = []
     sizes: dict[str, list[float]] = {metric.key: [] for metric in study.metrics}
     for policy, reference in pairs:
@@ -193,11 +201,12 @@ def _compared(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], n
             cells.append(_difference(metric, one) if one else "none")
             if one and one.units > 1:
                 sizes[metric.key].append(one.seen)
-        lines.append([f"{policy} against {reference}" if named else policy, *cells])
+        label = names.get(policy, policy)
+        lines.append([f"{label} against {names.get(reference, reference)}" if named else label, *cells])
     if not lines:
         return "No pair of policies has a unit in common yet."
     last = [f"{np.median(sizes[m.key]):.{m.digits}f}" if sizes[m.key] else "none" for m in study.metrics]
-    return _table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
+    return markdown_table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
 
 
 def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
@@ -209,14 +218,14 @@ def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
     heads, labels = ["policy", *(f"{count} views" for count in counts)], _labels(study, rows)
     against = [(label, label, study.reference) for label in labels if label != study.reference]
     pairs = [(f"{policy} against {reference}", policy, reference) for policy, reference in study.comparisons]
-    parts = [_wrapped(told)]
+    parts = [paragraph(told)]
     for metric in study.metrics:
         means = []
         for label in labels:
             values = [values_of(at_views(rows, count), metric.key, label) for count in counts]
             averages = [estimate(found).mean if found else None for found in values]
             means.append([label, *("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)])
-        parts += [f"{_title(metric)}:", _table(heads, means)]
+        parts += [f"{_title(metric)}:", markdown_table(heads, means)]
         for said, wanted in ((f"The same, less that of `{study.reference}`:", against), ("Other pairs:", pairs)):
             lines = []
             for name, *pair in wanted:
@@ -225,7 +234,7 @@ def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
                     cells = [_difference(metric, estimate(found)) if found else "none" for found in values]
                     lines.append([name, *cells])
             if lines:
-                parts += [said, _table(heads, lines)]
+                parts += [said, markdown_table(heads, lines)]
     return "\n\n".join(parts)
 
 
@@ -241,7 +250,7 @@ def _leaked(study: Study, rows: StudyRows) -> str:
     if not lines:
         return "No policy has a unit in common yet."
     told = "The same policy on the same unit; how to read the numbers is said above."
-    return told + "\n\n" + _table(["policy", *(_title(metric) for metric in study.metrics)], lines)
+    return told + "\n\n" + markdown_table(["policy", *(_title(metric) for metric in study.metrics)], lines)
 
 
 def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Effect | None]:
@@ -308,7 +317,7 @@ def _points(study: Study, rows: StudyRows) -> str:
                 found[unit_of(row)].append("none" if value is None else f"{value:.{metric.digits}f}")
             lines.append([label, *(" ".join(numbers) for numbers in found.values())])
         title = f"<details><summary>{_title(metric)}</summary>"
-        parts.append(f"{title}\n\n{_table(['policy', *(names[u] for u in units)], lines)}\n\n</details>")
+        parts.append(f"{title}\n\n{markdown_table(['policy', *(names[u] for u in units)], lines)}\n\n</details>")
     return "\n\n".join(parts)
 
 

@@ -1,0 +1,114 @@
+"""Measuring a run that has been fitted: all metrics of its views, with pictures, as `drgs fit` leaves them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from drgs import data
+from drgs.display.pictures import file_names
+from drgs.fitting.frames import load_frames
+from drgs.fitting.records import fit_record, fitted_views, load_run
+from drgs.fitting.stages import moving_labels
+from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
+
+if TYPE_CHECKING:
+    from drgs.deform import DynamicGaussians
+    from drgs.files import Run
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.records import LoadedRun
+    from drgs.fitting.segments import Segmentation
+    from drgs.guards.outputs import Claim
+
+__all__ = ["evaluate_run"]
+
+
+def evaluate_run(
+    run: Run, claimed: Claim, split: str = "test", lpips: Lpips | None = None, strict: bool = False
+) -> dict[str, Any]:
+    """Measure a run and write its metrics.json and the pictures of its views.
+
+    Args:
+        run: What to measure.
+        claimed: Its folder, as `drgs.fitting.resume.claim_run` returns it.
+        split: `test`, `train` (of an active fit the views that it saw) or `all`.
+        lpips: As `drgs.metrics.evaluate` takes it.
+        strict: Refuse a data set some of whose images are missing.
+    Returns:
+        What metrics.json holds.
+    Raises:
+        ValueError: If there is no such view, or the run or its data set is damaged.
+    """
+    recorded = fit_record(run)
+    loaded = load_run(run)
+    g, scene = loaded.gaussians, loaded.scene
+    config = recorded.config
+    # Of an active run, images may be missing that were never picked.
+    dataset = data.load(
+        recorded.data,
+        test_every=config.test_every,
+        test_offset=config.test_offset,
+        times=config.times,
+        test_cameras=config.test_cameras,
+        background=config.settings.background,
+        lazy=recorded.is_active,
+        points=False,
+        strict=strict,
+        semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
+    )
+    train, test = dataset.split()
+    if recorded.is_active:  # the rest of the training split was never seen
+        fitted = fitted_views(run)
+        train = [view for view in train if view.name in fitted]
+    views = {"test": test, "train": train, "all": train + test}[split]
+    if not views:
+        raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
+    frames = load_frames(views, config.max_pixels, config.mask)
+    names = file_names([frame.name for frame in frames])
+    kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
+    claimed.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
+    segmentation = _segmentation(loaded, dataset, frames)
+    result = evaluate(
+        scene,
+        frames,
+        config.settings,
+        lpips=lpips,
+        pictures=run.renders / split,
+        segmentation=segmentation,
+        moving=moving_labels(dataset) if recorded.times else frozenset(),
+    )
+    viewers = through_viewers(scene, frames, config.settings, split)
+    return write_metrics(
+        run,
+        split,
+        frames,
+        result,
+        split_rule=dataset.split_rule(),
+        gaussians=len(g),
+        viewers=viewers,
+        **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
+    )
+
+
+def _segmentation(loaded: LoadedRun, dataset: data.Dataset, frames: list[Frame]) -> Segmentation | str | None:
+    """What of the run's labels is measured.
+
+    Raises:
+        ValueError: If numbers in the data set's labels mean other classes than they did when the run was fitted.
+    """
+    record, known = loaded.record.semantics, dataset.semantics
+    if record is None:
+        return None
+    from drgs.fitting.segments import segmentation_of
+
+    now = known.classes if known is not None and (known.class_file or known.embedding_file) else None
+    if now is not None and record.classes is not None and now.names != record.classes:
+        raise ValueError(
+            f"{dataset.path}: must have the classes that the run was fitted with ({', '.join(record.classes[:5])}, "
+            f"...), has {', '.join(now.names[:5])}, ...; restore its class names"
+        )
+    return segmentation_of(loaded.gaussians, loaded.decoder, loaded.classes, record, frames)
+
+
+def _who_moves(scene: DynamicGaussians) -> dict:
+    moving = int(scene.moving.sum())
+    return {"moving": moving, "share": moving / max(len(scene), 1)}

@@ -1,0 +1,36 @@
+"""Functions that a user names on the command line: `package.module:function`."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["imported_function"]
+
+
+def imported_function(option: str, text: str, or_else: str = "") -> Callable[..., Any]:
+    """The function that `package.module:function` names; modules in the working directory are found, too.
+
+    Only for what the caller of drgs typed: importing runs the module. Never for a name that a file holds.
+
+    Args:
+        option: Where it was given, e.g. `--policy`.
+        text: The name.
+        or_else: What else the option takes, for the message.
+    Raises:
+        ValueError: If it is no such name, importing fails, or there is no such function; one line.
+    """
+    module, colon, attribute = text.partition(":")
+    if not (colon and module and attribute):
+        raise ValueError(f"{option} {text}: must be {or_else}package.module:function")
+    if "" not in sys.path:  # a function beside the user, also when `drgs` is an installed script
+        sys.path.insert(0, "")
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except Exception as error:
+        raise ValueError(f"{option} {text}: must be importable, got {type(error).__name__}: {error}") from error
+    if not callable(found):
+        raise ValueError(f"{option} {text}: {module} must have a function {attribute}, has none")
+    return found

@@ -1,0 +1,11 @@
+"""What studies can be asked for; imports nothing heavy, for the options of the command line read it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+__all__ = ["ExperimentName", "ProtocolName", "StudyScale"]
+
+ExperimentName = Literal["static", "dynamic", "prior", "blocks"]
+ProtocolName = Literal["paper", "blind", "fisherrf", "nbv-gym"]
+StudyScale = Literal["tiny", "small", "paper"]

@@ -1,0 +1,252 @@
+"""The experiments of arXiv 2512.22771, one a table of the paper: policies, scenes, sizes, and the paper's own numbers.
+
+    static     policies on static scenes with labels
+    dynamic    policies where things move: one camera at each later time
+    prior      lambda, where things move
+    blocks     what the criterion counts, where things move
+
+The last three are of one study: they share cells. Their policies' labels are names in rows, and stay.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.studies.cells import Metric, Study
+from drgs.studies.choices import ExperimentName, StudyScale
+from drgs.studies.made import Sizes, made_folder
+
+__all__ = ["EXPERIMENTS", "SIZES", "Experiment", "PaperNumbers", "metrics_of", "study_of"]
+
+PaperNumbers = Mapping[str, float]
+"""Metric -> what the paper states."""
+
+_BASELINES = ("random", "uniform", "farthest", "moments", "fisherrf")
+_JOINT = "geometry+semantic, eig"
+_DEFAULT = "geometry+semantic+backdrop, v_opt"
+_MOVING_DEFAULT = "joint+backdrop, v_opt"
+
+
+def _fisher(criterion: str, *blocks: str, **fields: Any) -> dict[str, Any]:
+    return {"policy": "fisher", "criterion": criterion, "blocks": blocks, **fields}
+
+
+_EVERYTHING = ("geometry", "semantic", "deformation")
+_POLICIES: Mapping[str, Mapping[str, Any] | None] = {
+    **{name: {"policy": name} for name in _BASELINES},
+    _JOINT: _fisher("eig", "geometry", "semantic"),
+    _DEFAULT: {"policy": "fisher"},
+    "geometry": _fisher("eig", "geometry"),
+    "geometry+semantic": _fisher("eig", "geometry", "semantic"),
+    "geometry+deformation": _fisher("eig", "geometry", "deformation"),
+    "joint": _fisher("eig", *_EVERYTHING),
+    **{f"joint, lambda {x}": _fisher("eig", *_EVERYTHING, prior=float(x)) for x in ("0", "1e-7", "1e-5")},
+    _MOVING_DEFAULT: {"policy": "fisher"},
+    "all views": None,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A table of the paper.
+
+    Attributes:
+        title, told: What it shows.
+        study: `static` or `dynamic`: whose cells they are.
+        policies: Label -> what the table calls it.
+        reference: The label that the others are compared with.
+        paper: Label -> the paper's numbers, as far as its text states them.
+        source: Where in the paper, on which data.
+    """
+
+    title: str
+    told: str
+    study: Literal["static", "dynamic"]
+    policies: Mapping[str, str]
+    reference: str
+    paper: Mapping[str, PaperNumbers]
+    source: str
+
+
+_NAMES = {name: name for name in _BASELINES} | {"moments": "Magic Moments", "fisherrf": "FisherRF"}
+_REPLICA = "Replica, 640x480, 7,000 steps, an L40, single runs"
+_NEU3D = "Neural 3D Video, 1352x1014, 17,000 steps, an L40, single runs"
+
+EXPERIMENTS: Mapping[ExperimentName, Experiment] = {
+    "static": Experiment(
+        "Policies on static scenes",
+        "Two views, one more every so many steps; color and labels of held-out views.",
+        "static",
+        {**_NAMES, _JOINT: "the paper's: geometry + semantic, eig", _DEFAULT: "drgs: with backdrop, v_opt"},
+        "random",
+        {_JOINT: {"psnr": 33.60}, "fisherrf": {"psnr": 32.17}, "moments": {"psnr": 33.52}},
+        _REPLICA,
+    ),
+    "dynamic": Experiment(
+        "Policies where things move",
+        "All cameras but the held-out one at the first time, then one camera at each later time.",
+        "dynamic",
+        {
+            **_NAMES,
+            "joint": "the paper's: geometry + semantic + deformation, eig",
+            _MOVING_DEFAULT: "drgs: with backdrop, v_opt",
+            "all views": "all cameras at all times",
+        },
+        "random",
+        {"joint": {"psnr": 28.62}, "fisherrf": {"psnr": 27.67}, "moments": {"psnr": 28.38}},
+        _NEU3D,
+    ),
+    "prior": Experiment(
+        "lambda",
+        "The joint criterion by its prior precision, where things move.",
+        "dynamic",
+        {
+            "joint, lambda 0": "lambda 0",
+            "joint, lambda 1e-7": "lambda 1e-7",
+            "joint": "lambda 1e-6",
+            "joint, lambda 1e-5": "lambda 1e-5",
+        },
+        "joint",
+        {
+            "joint, lambda 0": {"psnr": 28.59},
+            "joint, lambda 1e-7": {"psnr": 28.06},
+            "joint": {"psnr": 28.62},
+            "joint, lambda 1e-5": {"psnr": 28.53},
+        },
+        _NEU3D,
+    ),
+    "blocks": Experiment(
+        "What the criterion counts",
+        "Of an image: its colors about the Gaussians, its features, and both about the deformation network.",
+        "dynamic",
+        {
+            "geometry": "geometry",
+            "geometry+semantic": "+ semantic",
+            "geometry+deformation": "+ deformation",
+            "joint": "all",
+        },
+        "geometry",
+        {"joint": {"psnr": 28.62}},
+        _NEU3D,
+    ),
+}
+"""The paper's numbers are those that its text states: PSNR of its own criterion, of FisherRF and of Magic Moments (by
+their distances), and of every lambda."""
+
+
+def _fit(**fields: Any) -> FitConfig:
+    return FitConfig(**{"feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
+
+
+SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
+    ("static", "tiny"): Sizes(
+        _fit(
+            max_pixels=1_200,
+            max_gaussians=500,
+            max_steps=150,
+            feature_width=8,
+            feature_rate=5e-2,
+            decoder_rate=1e-2,
+        ),
+        (40, 30),
+        (20, 15),
+        every=20,
+        add=3,
+        views=24,
+    ),
+    ("static", "small"): Sizes(
+        _fit(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, feature_width=32),
+        (160, 120),
+        (40, 30),
+        every=40,
+        views=84,
+    ),
+    ("static", "paper"): Sizes(FitConfig(max_steps=7000), (320, 240), (80, 60), every=200, views=84),
+    ("dynamic", "tiny"): Sizes(
+        _fit(
+            times=4,
+            max_pixels=800,
+            max_gaussians=500,
+            max_steps=120,
+            feature_width=8,
+            feature_rate=5e-2,
+            decoder_rate=1e-2,
+            grid_rate=(8e-3, 8e-4),
+            field_rate=(8e-4, 8e-5),
+        ),
+        (32, 24),
+        (16, 12),
+        cameras=5,
+    ),
+    ("dynamic", "small"): Sizes(
+        _fit(
+            times=14,
+            max_pixels=10_800,
+            max_gaussians=8_000,
+            max_steps=900,
+            feature_width=32,
+            grid_rate=(8e-3, 8e-4),
+            field_rate=(8e-4, 8e-5),
+        ),
+        (120, 90),
+        (40, 30),
+        cameras=10,
+        info_pixels=2_700,
+    ),
+    ("dynamic", "paper"): Sizes(FitConfig(max_steps=17_000), (240, 180), (60, 45), cameras=15),
+}
+"""Of the fits, and of the scenes that are made. As `small` has a fifth of the paper's steps on static scenes, and a
+nineteenth on those that move, features and decoder go five times as fast, and there the field, too."""
+
+
+def metrics_of(study: Literal["static", "dynamic"], lpips: bool = False) -> tuple[Metric, ...]:
+    """What a row holds; those of labels are None where a data set has none."""
+    color = [Metric("ssim", "SSIM"), Metric("psnr", "PSNR", 2), Metric("flip", "FLIP", larger=False)]
+    if lpips:
+        color.append(Metric("lpips", "LPIPS", larger=False))
+    if study == "dynamic":
+        color.append(Metric("psnr_moving", "PSNR, moving pixels", 2, optional=True))
+    labels = {"pixel_accuracy": "pixel accuracy", "class_accuracy": "class-mean accuracy", "miou": "mIoU"}
+    return (
+        *color,
+        *(Metric(key, title, path=("segmentation", "run", key), optional=True) for key, title in labels.items()),
+    )
+
+
+def study_of(
+    study: Literal["static", "dynamic"],
+    scale: StudyScale,
+    made: Path,
+    given: Mapping[str, Path] | None = None,
+    policies: Mapping[str, Mapping[str, Any] | None] | None = None,
+    lpips: Path | None = None,
+) -> Study:
+    """The study that an experiment's cells are of.
+
+    Args:
+        study: Which of the two.
+        scale: Of its fits, and of the scenes that are made.
+        made: Folder of the scenes that are made.
+        given: Scene -> data set, of those that are not made.
+        policies: Label -> fields of `ActiveConfig`; default those of all its experiments.
+        lpips: Weights of a backbone, for LPIPS.
+    """
+    sizes = SIZES[study, scale]
+    own = [label for x in EXPERIMENTS.values() if x.study == study for label in x.policies]
+    active = ActiveConfig(add=sizes.add, every=sizes.every, info_pixels=sizes.info_pixels)
+    if study == "dynamic":
+        active = dataclasses.replace(active, schedule="times")
+    return Study(
+        name=f"{study}-{scale}",
+        folder=made_folder(study, sizes, made / scale, given or {}),
+        policies=policies or {label: _POLICIES[label] for label in dict.fromkeys(own)},
+        fit=sizes.fit,
+        active=active,
+        metrics=metrics_of(study, lpips is not None),
+        reference="random",
+        lpips=lpips,
+    )

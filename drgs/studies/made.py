@@ -1,0 +1,95 @@
+"""The data sets of studies: rooms and kitchens that are made where they are not there yet, and those that are given."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+from drgs.display.progress import Bar
+from drgs.fitting.config import FitConfig
+
+__all__ = ["MADE_SPLIT", "Sizes", "made_folder"]
+
+MADE_SPLIT = (3, 0)
+"""Of a room's views: every third is for testing, drawn as the candidates are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """How large the fits of a study are, and the scenes that are made for it.
+
+    Attributes:
+        fit: Of every cell.
+        image, teacher: (width, height) of images and of a teacher's maps.
+        every: Steps between two picks; None: by the number of steps, where things move.
+        add: Views to be picked; None: 10, or one at each later time.
+        views: Of a room.
+        cameras: Of a kitchen; it has as many times as the fit takes.
+        info_pixels: Of the views that information is computed from; None: those of the fit.
+    """
+
+    fit: FitConfig
+    image: tuple[int, int]
+    teacher: tuple[int, int]
+    every: int | None = None
+    add: int | None = None
+    views: int = 0
+    cameras: int = 0
+    info_pixels: int | None = None
+
+
+def made_folder(
+    study: Literal["static", "dynamic"], sizes: Sizes, made: Path, given: Mapping[str, Path]
+) -> Callable[[str, tuple[int, int]], Path]:
+    """Scene and split -> folder of the data set, as `Study.folder`; other processes can be sent it."""
+    return functools.partial(_room if study == "static" else _kitchen, sizes, made, dict(given))
+
+
+def _room(sizes: Sizes, made: Path, given: Mapping[str, Path], scene: str, split: tuple[int, int]) -> Path:
+    """A room, `room-N` of seed N."""
+    if scene in given:
+        return given[scene]
+    from scenes import room
+
+    (width, height), (w, h) = sizes.image, sizes.teacher
+    with Bar(f"path tracing {scene}") as bar:
+        return room.generate(
+            made / scene,
+            views=sizes.views,
+            width=width,
+            height=height,
+            seed=_number(scene),
+            teacher_width=w,
+            teacher_height=h,
+            test_every=split[0],
+            progress=bar.update,
+        )
+
+
+def _kitchen(sizes: Sizes, made: Path, given: Mapping[str, Path], scene: str, split: tuple[int, int]) -> Path:
+    """A kitchen, `kitchen-N` of seed N."""
+    if scene in given:
+        return given[scene]
+    from scenes import kitchen
+
+    (width, height), (w, h) = sizes.image, sizes.teacher
+    with Bar(f"path tracing {scene}") as bar:
+        return kitchen.generate(
+            made / scene,
+            cameras=sizes.cameras,
+            times=sizes.fit.times,
+            width=width,
+            height=height,
+            seed=_number(scene),
+            teacher_width=w,
+            teacher_height=h,
+            progress=bar.update,
+        )
+
+
+def _number(scene: str) -> int:
+    """Of `room-2`: 2."""
+    return int(scene.rpartition("-")[2])

@@ -1,0 +1,140 @@
+"""The cells of an experiment on scenes that are made, or on data sets that are given: which, and what is left out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from drgs import data
+from drgs.studies.cells import Study, distinct_seeds
+from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
+from drgs.studies.experiments import EXPERIMENTS, Experiment, study_of
+from drgs.studies.made import MADE_SPLIT
+from drgs.studies.protocols import PROTOCOLS
+from drgs.studies.rows import Cell
+
+__all__ = ["StudyPlan", "plan_of"]
+
+_ROOMS = {"tiny": ("room-1",), "small": ("room-1", "room-2"), "paper": ("room-1", "room-2")}
+_CAMERA = "cam00"  # of a kitchen: in the middle of the arc
+_UNKNOWN = (0, 0)  # the split that a data set states
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyPlan:
+    """What is to be done.
+
+    Attributes:
+        experiment: Whose table it is.
+        study: Of its cells.
+        cells: Units outermost.
+        notes: Sentences about what is left out, and why.
+    """
+
+    experiment: Experiment
+    study: Study
+    cells: tuple[Cell, ...]
+    notes: tuple[str, ...]
+
+
+def plan_of(
+    name: ExperimentName,
+    scale: StudyScale,
+    made: Path,
+    given: Sequence[Path] = (),
+    seeds: int = 3,
+    protocol: ProtocolName = "paper",
+    policies: Sequence[str] = (),
+    split: tuple[int, int] = (8, 0),
+    lpips: Path | None = None,
+) -> StudyPlan:
+    """The cells of an experiment.
+
+    Args:
+        name: Of the experiment.
+        scale: Of fits and of the scenes that are made.
+        made: Folder of these.
+        given: Data sets in place of them.
+        seeds: Sets of initial views of each static scene; where things move, kitchens, or fits of each data set.
+        protocol: A name of `PROTOCOLS`.
+        policies: Labels of the experiment; default all.
+        split: (n, k) of given data sets that state none: every n-th view is held out, from the k-th on.
+        lpips: Weights of a backbone, for LPIPS.
+    Raises:
+        ValueError: If an argument is unknown, or a data set is not of the experiment's kind.
+    """
+    experiment = EXPERIMENTS[name]
+    moves = experiment.study == "dynamic"
+    if moves and PROTOCOLS[protocol].static:
+        able = ", ".join(key for key, x in PROTOCOLS.items() if not x.static)
+        raise ValueError(f"reproduce: --protocol must be one of {able} where things move, got {protocol}; choose one")
+    if unknown := [label for label in policies if label not in experiment.policies]:
+        known = "; ".join(experiment.policies)
+        raise ValueError(f"reproduce: --policy must be one of: {known}; got {unknown[0]!r}; correct it")
+    if seeds < 1:
+        raise ValueError(f"reproduce: --seeds must be at least 1, got {seeds}; raise it")
+    wanted = [label for label in experiment.policies if not policies or label in policies]
+    scenes = {path.resolve().name: path.resolve() for path in given}
+    if len(scenes) < len(given):
+        raise ValueError("reproduce: --data must be folders of different names, got one twice; rename or link one")
+    study = study_of(experiment.study, scale, made, scenes, lpips=lpips)
+    study = dataclasses.replace(study, policies={label: study.policies[label] for label in wanted})
+    units, notes, lacking = [], list[str](), set[tuple[str, str]]()
+    for scene, path in scenes.items():
+        dataset = data.load(
+            path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.times
+        )
+        found = _units_of(study, scene, dataset, moves, split, seeds, protocol)
+        units += found
+        told, missing = _missing(study, scene, dataset)
+        notes += told
+        lacking |= {(scene, label) for label in missing}
+    if not given and moves:
+        units = [(f"kitchen-{seed}", _CAMERA, "first", protocol, 0) for seed in range(1, seeds + 1)]
+    elif not given:
+        drawn = {scene: distinct_seeds(study, scene, MADE_SPLIT, seeds) for scene in _ROOMS[scale]}
+        units = [(scene, MADE_SPLIT, "seed", protocol, drawn[scene][k]) for k in range(seeds) for scene in drawn]
+    cells = [cell for cell in study.cells(units) if (cell.scene, cell.policy) not in lacking]
+    return StudyPlan(experiment, study, tuple(cells), tuple(notes))
+
+
+def _units_of(
+    study: Study, scene: str, dataset: data.Dataset, moves: bool, split: tuple[int, int], seeds: int, protocol: str
+) -> list:
+    """Those of a data set that was given."""
+    if dataset.is_dynamic != moves:
+        want, is_one = ("several times", "one") if moves else ("one time", "several")
+        raise ValueError(f"{dataset.path}: must show a scene at {want}, shows {is_one}; choose another experiment")
+    train, test = dataset.split()
+    if not test:
+        raise ValueError(f"{dataset.path}: must hold out views, holds out none; give --test-every")
+    if moves:
+        cameras = sorted({view.camera_name for view in test})
+        if len(cameras) != 1 or not cameras[0]:
+            raise ValueError(
+                f"{dataset.path}: must hold out one of several synchronous cameras, holds out "
+                f"{', '.join(cameras) or 'views of none'}; correct its split"
+            )
+        return [(scene, cameras[0], "first", protocol, seed) for seed in range(seeds)]
+    names = sorted(view.name for view in (*train, *test, *dataset.absent))
+    every, offset = split
+    states = {view.name for view in test} != set(names[offset::every]) - {view.name for view in dataset.absent}
+    held_out = _UNKNOWN if states else split
+    return [(scene, held_out, "seed", protocol, seed) for seed in distinct_seeds(study, scene, held_out, seeds)]
+
+
+def _missing(study: Study, scene: str, dataset: data.Dataset) -> tuple[list[str], list[str]]:
+    """What is said of a data set without a teacher or without labels, and the policies that it has nothing for."""
+    known = dataset.semantics
+    if known is not None and known.maps:
+        if known.labels:
+            return [], []
+        return [f"{scene} has no labels: its accuracies and mIoU are against the teacher's own labels."], []
+    lacks = [
+        label
+        for label, fields in study.policies.items()
+        if fields is not None and "semantic" in (fields.get("blocks") or ())
+    ]
+    told = f"{scene} has no teacher's maps: its rows have no accuracies and no mIoU"
+    return [f"{told}, and without features there is no {'; '.join(lacks)}." if lacks else f"{told}."], lacks

@@ -1,0 +1,51 @@
+"""How an active fit of a study is run, by name: what is known at the start, and what happens at a pick."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from drgs.fitting.config import InitPoints
+
+__all__ = ["PROTOCOLS", "Protocol"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """What a cell's fit is told beyond its study.
+
+    Attributes:
+        told: In words, for pages.
+        points: `FitConfig.init_points`.
+        active: Fields of `ActiveConfig` that replace those of the study.
+        static: Whether it is only for loops that add views of one time.
+    """
+
+    told: str
+    points: InitPoints
+    active: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    static: bool = False
+
+    @property
+    def leaks(self) -> bool:
+        """Whether something of views that are never picked is known at the start."""
+        return self.points == "all"
+
+
+PROTOCOLS: Mapping[str, Protocol] = {
+    "blind": Protocol("nothing of a view is read before it is picked", "views"),
+    "paper": Protocol(
+        "initial points of the whole data set, views that are never picked included (`pool_leak`)",
+        "all",
+    ),
+    "fisherrf": Protocol(
+        "as `blind`, and after each pick the Gaussians begin again, as in FisherRF's code (there at points of the "
+        "whole data set)",
+        "views",
+        {"restart": "always"},
+        static=True,
+    ),
+    "nbv-gym": Protocol("as `blind`, with 10 initial views", "views", {"initial": 10}, static=True),
+}
+"""Name -> protocol. The study says how many views are added and how often; at `paper` scale one every 200 steps."""

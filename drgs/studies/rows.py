@@ -1,0 +1,121 @@
+"""The cells of studies, and their rows: JSON lines that several processes append to, one for each finished cell."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from drgs.fitting.config import Start
+from drgs.guards.writing import named
+
+__all__ = ["Cell", "append_row", "cell_of", "is_done", "read_study"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One fit of a study.
+
+    Attributes:
+        scene: Name of a data set of the study.
+        split: (n, k): every n-th view by name is held out, from index k on; (0, 0): those that the data set states.
+        start: `first` view by name, or the one that the `seed` draws; the others of the initial views follow from it.
+        policy: Label of a policy of the study.
+        protocol: A name of `drgs.studies.protocols.PROTOCOLS`.
+        seed: Of everything random in the fit.
+        camera: Of what several cameras film at once: the one that is held out at all times, in place of `split`, which
+            is (0, 0); what is known at the start is what all others see at the first time, whatever `start` says.
+    """
+
+    scene: str
+    split: tuple[int, int]
+    start: Start
+    policy: str
+    protocol: str
+    seed: int
+    camera: str = ""
+
+    @property
+    def name(self) -> str:
+        """Of its run folder."""
+        words = re.sub(r"[^a-z0-9.+]+", "-", self.policy.lower()).strip("-")
+        held_out = self.camera or "{}+{}".format(*self.split)
+        return f"{self.scene}-{held_out}-{self.start}{self.seed}-{self.protocol}-{words}"
+
+    def to_json(self) -> dict:
+        """As a row begins; without a camera where none is held out, as in rows of studies that know none."""
+        fields = {**dataclasses.asdict(self), "split": list(self.split)}
+        return fields if self.camera else {name: x for name, x in fields.items() if name != "camera"}
+
+
+def cell_of(row: Mapping[str, Any]) -> tuple[str, Cell]:
+    """The study and the cell of a row."""
+    fields = {field.name: row[field.name] for field in dataclasses.fields(Cell) if field.name != "camera"}
+    return row["study"], Cell(**{**fields, "split": tuple(fields["split"]), "camera": row.get("camera", "")})
+
+
+def read_study(*paths: Path) -> list[dict]:
+    """The rows of JSON-lines files, merged by cell; of two rows of one cell the later one counts.
+
+    A last line that a killed process left half written is left out, as is a file that is not there.
+
+    Raises:
+        ValueError: If another line is damaged.
+    """
+    rows = {}
+    for path in paths:
+        lines = path.read_bytes().split(b"\n") if path.exists() else []
+        for number, line in enumerate(lines, 1):
+            if not line.strip():
+                continue
+            try:
+                row = json.loads(line)
+                rows[cell_of(row)] = row
+            except (ValueError, KeyError, TypeError) as error:
+                if number == len(lines):  # every whole line ends with a newline
+                    continue
+                raise ValueError(
+                    f"{path}: line {number} must be a row of a study, is not ({error}); remove it"
+                ) from None
+    return list(rows.values())
+
+
+def is_done(study: str, cell: Cell, rows: Iterable[Mapping[str, Any]], keys: Iterable[str]) -> bool:
+    """Whether a cell has a row that holds these metrics, be it None for what could not be computed."""
+    found = [row for row in rows if cell_of(row) == (study, cell)]
+    return any(set(keys) <= set(row["metrics"]) for row in found)
+
+
+def append_row(path: Path, row: Mapping[str, Any]) -> None:
+    """Add a row to a file that other processes add to as well, unless one that says as much of its cell is there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(path) as file:
+        if is_done(*cell_of(row), read_study(path), row["metrics"]):
+            return
+        file.seek(0)
+        whole = file.read().rfind(b"\n") + 1
+        file.truncate(whole)  # a killed process may have left half a line
+        try:
+            file.write(json.dumps(row).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError as error:
+            with suppress(OSError):
+                os.truncate(path, whole)
+            raise named(path, error) from None
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[Any]:
+    """A file, opened for reading and appending, locked against the other processes that do the same."""
+    with path.open("a+b") as file:
+        with suppress(OSError, ImportError):  # a file system without it
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield file

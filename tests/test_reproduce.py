@@ -1,0 +1,265 @@
+"""`drgs reproduce`: which cells there are, what the tables say of their rows, figures, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from test_active import write_still
+from test_dynamic_data import cameras, coded, write_poses, write_video
+
+from drgs import cli
+from drgs.studies.experiments import EXPERIMENTS, SIZES, study_of
+from drgs.studies.plan import plan_of
+from drgs.studies.protocols import PROTOCOLS
+from drgs.studies.results import best_of_units, results_page, results_rows
+from drgs.studies.rows import Cell, read_study
+from drgs.studies.statistics import at_views
+
+DRGS = [sys.executable, "-m", "drgs"]
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """Photographs without labels or teacher."""
+    folder = tmp_path_factory.mktemp("reproduce") / "still"
+    write_still(folder)
+    return folder
+
+
+def rows_of(study, policies, units=3, **values) -> list[dict]:
+    """A row for each policy and unit; `values` policy -> PSNR."""
+    found = []
+    for unit in range(units):
+        for policy in policies:
+            cell = Cell(f"room-{unit % 2 + 1}", (3, 0), "seed", policy, "paper", unit)
+            metrics = {m.key: 0.5 for m in study.metrics} | {"psnr": values.get(policy, 20.0) + 0.1 * unit}
+            found.append(
+                {
+                    "study": study.name,
+                    **cell.to_json(),
+                    "initial": [f"a{unit}", "b"],
+                    "picks": [],
+                    "metrics": metrics,
+                    "medians": {},
+                    "curve": {},
+                    "views": 8,
+                    "seconds": 90.0,
+                    "peak_memory": 2_500_000_000 if policy != "uniform" else None,
+                    "pick_seconds": 1.5,
+                    "commit": "0123456789",
+                }
+            )
+    return found
+
+
+# --------------------------------------------------------------------------------------------------------------- plan
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_cells_of_made_scenes(name, tmp_path, monkeypatch):
+    """Every policy on a unit before the next, as many units as scenes and seeds say; configs are legal and differ."""
+    monkeypatch.setattr("drgs.studies.plan.distinct_seeds", lambda study, scene, split, count: list(range(count)))
+    for scale in ("tiny", "small", "paper"):
+        plan = plan_of(name, scale, tmp_path, seeds=2)
+        labels = list(plan.experiment.policies)
+        scenes = {"static": 1 if scale == "tiny" else 2}.get(plan.experiment.study, 1)
+        assert [cell.policy for cell in plan.cells] == 2 * scenes * labels
+        assert len({cell.name for cell in plan.cells}) == len(plan.cells)
+        assert len({repr(plan.study.configs(cell)) for cell in plan.cells[: len(labels)]}) == len(labels)
+        assert {plan.study.configs(cell)[0].init_points for cell in plan.cells} == {"all"}
+    assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
+
+
+def test_protocols(tmp_path):
+    """What a name does to the two configs of a cell, and that pool leaks are marked."""
+    study = study_of("static", "paper", tmp_path)
+    found = {name: study.configs(Cell("room-1", (3, 0), "seed", "fisherrf", name, 0)) for name in PROTOCOLS}
+    assert {name: fit.init_points for name, (fit, _) in found.items()} == {
+        "blind": "views",
+        "paper": "all",
+        "fisherrf": "views",
+        "nbv-gym": "views",
+    }
+    assert [name for name, x in PROTOCOLS.items() if x.leaks] == ["paper"]
+    fit, active = found["paper"]
+    assert (fit.max_steps, active.initial, active.every, active.add, active.restart) == (7000, 2, 200, None, "auto")
+    assert found["fisherrf"][1].restart == "always"
+    assert (found["nbv-gym"][1].initial, found["nbv-gym"][1].every) == (10, 200)
+
+
+def test_data_that_is_given(still, tmp_path):
+    """Without a teacher: policies that need one are left out, said, and so are the numbers; split by --test-every."""
+    plan = plan_of("static", "tiny", tmp_path, [still], seeds=2, split=(4, 1))
+    assert {cell.scene for cell in plan.cells} == {"still"}
+    assert {cell.split for cell in plan.cells} == {(4, 1)}
+    assert "geometry+semantic, eig" not in {cell.policy for cell in plan.cells}
+    assert plan.notes[0].startswith("still has no teacher's maps: its rows have no accuracies and no mIoU")
+    assert "geometry+semantic, eig" in plan.notes[0]
+
+
+def test_cameras_that_are_given(tmp_path):
+    """Of videos the camera that the data set holds out; a static experiment refuses them."""
+    folder = tmp_path / "filmed"
+    folder.mkdir()
+    write_poses(folder, cameras())
+    for number in range(len(cameras())):
+        write_video(folder / f"cam{number:02}.mp4", [coded(number, k) for k in range(4)])
+    plan = plan_of("dynamic", "tiny", tmp_path, [folder], seeds=2, policies=["random"])
+    assert [(cell.camera, cell.seed) for cell in plan.cells] == [("cam00", 0), ("cam00", 1)]
+    with pytest.raises(ValueError, match="must show a scene at one time, shows several"):
+        plan_of("static", "tiny", tmp_path, [folder])
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"name": "dynamic", "protocol": "fisherrf"}, "must be one of blind, paper where things move, got fisherrf"),
+        ({"name": "static", "policies": ["best"]}, "--policy must be one of: random; uniform; .* got 'best'"),
+        ({"name": "static", "seeds": 0}, "--seeds must be at least 1"),
+        ({"name": "dynamic", "given": True}, "must show a scene at several times, shows one"),
+    ],
+)
+def test_what_cannot_be(options, told, still, tmp_path):
+    """One line each."""
+    options = {**options, "given": [still] if options.get("given") else []}
+    with pytest.raises(ValueError, match=told) as error:
+        plan_of(scale="tiny", made=tmp_path, **options)
+    assert "\n" not in str(error.value)
+
+
+# -------------------------------------------------------------------------------------------------------------- tables
+
+
+def test_who_is_best(tmp_path):
+    """Counted in units that all policies have, whatever is fitted to all views aside; equal ones both win."""
+    study = study_of("dynamic", "small", tmp_path)
+    rows = rows_of(
+        study, ("random", "joint", "farthest", "all views"), joint=21.0, farthest=21.0, **{"all views": 30.0}
+    )
+    assert best_of_units(rows) == ({"random": 0, "joint": 3, "farthest": 3}, 3)
+    assert best_of_units(rows[1:]) == ({"random": 0, "joint": 2, "farthest": 2}, 2)
+    assert best_of_units([]) == ({}, 0)
+
+
+def test_the_page(tmp_path):
+    """Means, costs, the paper's numbers marked as another data set's, the leak, differences within units."""
+    study, experiment = study_of("static", "small", tmp_path), EXPERIMENTS["static"]
+    rows = rows_of(study, experiment.policies, units=6, fisherrf=22.0)
+    text = results_page(study, experiment, rows, told=("Something is missing.",))
+    line = next(x for x in text.splitlines() if x.startswith("| FisherRF |"))
+    cells = [x.strip() for x in line.strip("|").split("|")]
+    assert cells == ["FisherRF", "0.500", "22.25", *["0.500"] * 4, "6", "1.50", "2.50", "1.50", "32.17"]
+    assert next(x for x in text.splitlines() if x.startswith("| uniform |")).split("|")[10].strip() == "–"
+    for words in ("Something is missing.", "Pool leak", "another data set and other", "best PSNR (of 6)"):
+        assert words in text
+    assert "+2.00 [+2.00, +2.00] **gain**, 6 of 6" in text
+    found = {row["policy"]: row for row in results_rows(study, experiment, rows)}
+    assert found["fisherrf"]["psnr"] == pytest.approx(22.25)
+    assert found["fisherrf"]["best"] == {"units": 6, "of": 6}
+    assert found["uniform"]["peak_memory"] is None
+    assert "No cell is finished." in results_page(study, experiment, [])
+
+
+def test_the_paper_is_quoted_as_it_stands():
+    """Differences that its text states: 1.43 and 0.94 dB over FisherRF (so rounded), 0.08 and 0.24 over moments."""
+    for name, joint, rival, moments in (
+        ("static", "geometry+semantic, eig", 1.43, 0.08),
+        ("dynamic", "joint", 0.95, 0.24),
+    ):
+        paper = EXPERIMENTS[name].paper
+        assert paper[joint]["psnr"] - paper["fisherrf"]["psnr"] == pytest.approx(rival, abs=1e-9)
+        assert paper[joint]["psnr"] - paper["moments"]["psnr"] == pytest.approx(moments, abs=1e-9)
+    assert all(set(x.paper) <= set(x.policies) for x in EXPERIMENTS.values())
+
+
+# --------------------------------------------------------------------------------------------------------- the command
+
+
+def test_a_study_that_is_killed_goes_on(tmp_path):
+    """SIGKILL in the middle of the second cell: the first is kept, the rest is done, tables and figures are there; what
+    is finished is not done again, and a row that lost its end is.
+    """
+    out = tmp_path / "out"
+    line = ["reproduce", "static", "--scale", "tiny", "--seeds", "1", "--policy", "random", "--policy", "farthest"]
+    line += ["-o", str(out), "--quiet"]
+    process = subprocess.Popen([*DRGS, *line], stderr=subprocess.PIPE)
+    until = time.monotonic() + 240
+    while time.monotonic() < until and process.poll() is None and not list(out.glob("runs/*/*farthest/log.jsonl")):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    rows = out / "rows.jsonl"
+    assert [row["policy"] for row in read_study(rows)] == ["random"]
+    before = rows.read_bytes()
+    assert cli.main(line) == 0
+    assert rows.read_bytes().startswith(before)
+    found = read_study(rows)
+    assert [row["policy"] for row in found] == ["random", "farthest"]
+    assert all(row["peak_memory"] > 1e8 and row["pool_leak"] for row in found)
+    assert all(row["metrics"]["miou"] > 0.05 for row in found)
+    page = (out / "static.md").read_text()
+    assert all(text in page for text in ("![", "| random |", "| farthest |"))
+    assert [row["policy"] for row in json.loads((out / "static.json").read_text())["rows"]] == ["random", "farthest"]
+    import cv2
+
+    sheet = cv2.imread(str(out / "static.png"))
+    height, width = sheet.shape[:2]
+    assert width > 4 * 300, "four columns"
+    assert height > 3 * 220, "two policies and the truth"
+    assert np.std(sheet) > 20
+    assert list((out / "static-maps").glob("*.maps.png"))
+    stamp = rows.stat().st_mtime_ns
+    assert cli.main([*line, "--no-figures"]) == 0
+    assert rows.stat().st_mtime_ns == stamp, "nothing was left to do"
+    assert at_views(found, 5), "two views and three picks"
+
+
+def test_data_without_labels(still, tmp_path, capsys):
+    """Rows without numbers of labels, said on stdout and on the page; another data set of that name is refused."""
+    out = tmp_path / "out"
+    line = ["reproduce", "static", "--scale", "tiny", "--seeds", "1", "--policy", "uniform", "--data", str(still)]
+    line += ["-o", str(out)]
+    assert cli.main(line) == 0
+    said = capsys.readouterr().out
+    assert "note: still has no teacher's maps" in said
+    assert "mIoU" not in said.partition("Policies on static scenes")[2]
+    row = read_study(out / "rows.jsonl")[0]
+    assert row["metrics"]["miou"] is None
+    assert row["metrics"]["psnr"] > 5
+    assert "no accuracies and no mIoU" in " ".join((out / "static.md").read_text().split())
+    write_still(tmp_path / "still")
+    assert cli.main([*line[:-3], str(tmp_path / "still"), "-o", str(out)]) == 2
+    assert "must be of one still, holds rows of" in capsys.readouterr().err
+
+
+def test_no_room_for_a_study(still, tmp_path):
+    """A disk that is full in the middle: one line that says so, exit code 2, and nothing lost once there is room."""
+    out = tmp_path / "out"
+    line = ["reproduce", "static", "--scale", "tiny", "--seeds", "1", "--policy", "uniform", "--no-figures", "--quiet"]
+    line += ["--data", str(still), "-o", str(out)]
+    code = (
+        "import resource, sys\n"
+        "from drgs import cli\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "sys.exit(cli.main(sys.argv[1:]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *line], capture_output=True, text=True, env={**os.environ})
+    assert done.returncode == 2, done.stderr
+    assert "free some space" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not read_study(out / "rows.jsonl")
+    assert cli.main(line) == 0
+    assert len(read_study(out / "rows.jsonl")) == 1
+
+
+def test_sizes_are_those_of_the_paper():
+    """7,000 steps and a view every 200 of them; 17,000 where things move."""
+    assert (SIZES["static", "paper"].fit.max_steps, SIZES["static", "paper"].every) == (7000, 200)
+    assert SIZES["dynamic", "paper"].fit.max_steps == 17_000
