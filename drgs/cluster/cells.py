@@ -19,6 +19,7 @@ from drgs.cluster.agreement import check_agreement, statement, this_worker
 from drgs.cluster.parcels import Missing, opened_parcel
 from drgs.files import atomic_write
 from drgs.guards.locks import InUse, host_of
+from drgs.guards.writing import is_full
 from drgs.studies.cells import Study, result_line, run_cell
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 
@@ -59,14 +60,18 @@ def run_cells_on(
     Returns:
         Cells that other processes have, and those that failed, with the reason.
     Raises:
+        OSError: If there is no room left on the disk of a worker.
         ValueError: If a worker does not see the folder of the runs, or computes with something else than this process.
         ConnectionError: If the scheduler, or all workers, have gone.
     """
     runs = runs.resolve()
     runs.mkdir(parents=True, exist_ok=True)
     there = read_study(rows)
-    numbered = enumerate(cells, 1)
-    left = [(number, cell) for number, cell in numbered if not is_done(study.name, cell, there, study.measured_later)]
+    left = [
+        (number, cell)
+        for number, cell in enumerate(cells, 1)
+        if not is_done(study.name, cell, there, study.measured_later)
+    ]
     if not left:
         return [], {}
     with _token(runs) as token:
@@ -175,8 +180,7 @@ class _Round:
         except ConnectionError:
             if self.cluster.client.status != "running":
                 raise
-            self.say(f"{cell.name}: failed: its workers died of it")
-            self.failed[cell] = "its workers died of it"
+            self.fail(cell, "its workers died of it")
             return
         if "missing" in found:
             self.tries[number] = self.tries.get(number, 0) + 1
@@ -195,11 +199,15 @@ class _Round:
                 self.say(f"{cell.name}: taken: {found['why']}")
                 self.taken.append(cell)
         elif "failed" in found:
-            self.say(f"{cell.name}: failed: {found['failed']}")
-            self.failed[cell] = found["failed"]
+            self.fail(cell, found["failed"])
         else:
             append_row(self.rows, found["row"])
             self.say(f"{result_line(self.study, cell, found['row'])}, worker {found['worker']}")
+
+    def fail(self, cell: Cell, why: str) -> None:
+        """Tell that a cell has failed, and remember it."""
+        self.say(f"{cell.name}: failed: {why}")
+        self.failed[cell] = why
 
 
 # --------------------------------------------------------------------------------------------------- on the worker
@@ -252,4 +260,6 @@ def do_cell(
                 return said | {"taken": host_of(Path(runs) / whole.name / cell.name), "why": str(busy)}
             time.sleep(1.0)
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            if is_full(error):
+                raise
             return said | {"failed": str(error)}
