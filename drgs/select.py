@@ -134,7 +134,9 @@ def policy_named(name: str) -> Callable[[Pool], Selection]:
     if isinstance(name, str) and ":" in name:
         return imported_function("--policy", name)
     if name not in POLICIES:
-        raise ValueError(f"select: policy must be one of {', '.join(POLICIES)}, got {name!r}; choose one")
+        raise ValueError(
+            f"select: policy must be one of {', '.join(POLICIES)}, or package.module:function, got {name!r}; choose one"
+        )
     return POLICIES[name]
 
 

@@ -603,7 +603,7 @@ def test_command(still, tmp_path, capsys):
         ),
         ("--views active --add 2 --every 4 --measure 2 --test-every 0", "--measure must have held-out views, got none"),
         ("--policy random", "--policy must have --views active, got --views all"),
-        ("--views active --policy best", "--policy"),
+        ("--views active --policy best", "policy must be one of fisher, fisherrf, "),
     ],
 )
 def test_bad_options_are_one_line(still, tmp_path, capsys, options, message):

@@ -601,7 +601,7 @@ not_a_function = 3
         ("bad_rasterizers:missing", "must have a function missing, has none"),
         ("no_such_module:f", "must be importable, got ModuleNotFoundError"),
         ("drgs:nothing", "must be drgs:ewa or drgs: and one of exact"),
-        ("nonsense", "must be drgs:PRESET, gsplat, package.module:function, or a file"),
+        ("nonsense", "must be drgs:PRESET, gsplat, a file .npz or .safetensors, or package.module:function"),
         ("missing.npz", "must be a file, there is none"),
         ("scene.txt.npz", "must be a .npz file of arrays"),
     ],

@@ -173,7 +173,7 @@ def test_photograph_that_does_not_fit(tmp_path, one_gigabyte):
     write_image(tmp_path / "a.png", gradient())
     data = bytearray((tmp_path / "a.png").read_bytes())
     data[16:24] = (30_000).to_bytes(4, "big") * 2
-    (tmp_path / "a.png").write_bytes(data)
+    (tmp_path / "a.png").write_bytes(data + bytes(200_000))  # so many that they might hold as many pixels
     with pytest.raises(ValueError, match=f"a.png: {TOLD}reduce the image"):
         read_image(tmp_path / "a.png")
 
@@ -200,8 +200,8 @@ def test_peak_memory_is_counted_anew():
     most = machine.peak_memory()
     assert most > len(held)
     del held
-    assert machine.peak_memory() == most
+    assert machine.peak_memory() > most - (16 << 20)  # Linux counts in steps
     machine.forget_peak_memory()
-    if machine.peak_memory() == most:
+    if machine.peak_memory() > most - (16 << 20):
         pytest.skip("this system does not let a process forget")
     assert machine.peak_memory() < most - (200 << 20)

@@ -176,7 +176,7 @@ def test_dome_is_even(count):
         ("run --candidates data -k 0", "k must be a whole number in 1..5 candidates, got 0"),
         ("run --candidates run --train data", "must hold a view that is not known yet, all 9 of split all are"),
         ("scene.ply --candidates orbit", "a file of Gaussians has no record of its views: --train must name"),
-        ("run --candidates data --policy best", "--policy"),
+        ("run --candidates data --policy best", "random, or package.module:function, got 'best'"),
         ("run --candidates data --prior -1", "lambda (value) must be in [0, inf), got -1"),
         ("run --candidates orbit --split test", "--split test must have --candidates DATA, an orbit has no split"),
         ("run --candidates orbit --count 0", "--count must be in [1, 10000], got 0"),

@@ -140,12 +140,12 @@ def test_a_command_without_memory_says_so(tmp_path, monkeypatch, capsys):
         def fail(*_, error=error, **__):
             raise error
 
-        monkeypatch.setattr("drgs.commands.eval.evaluate", fail)
+        monkeypatch.setattr("drgs.evaluation.evaluate", fail)
         assert cli.main(["eval", str(tmp_path / "run"), "--quiet"]) == 2
         assert capsys.readouterr().err == (
             "drgs eval: there must be more memory, none was left; free some, or ask for smaller views\n"
         )
-    monkeypatch.setattr("drgs.commands.eval.evaluate", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
+    monkeypatch.setattr("drgs.evaluation.evaluate", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
         cli.main(["eval", str(tmp_path / "run"), "--quiet"])
 

@@ -298,7 +298,8 @@ class ActiveConfig:
         from drgs.gain import Prior
 
         if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
-            raise ValueError(f"active: policy must be one of {', '.join(POLICY_NAMES)}, got {self.policy!r}")
+            known = ", ".join(POLICY_NAMES)
+            raise ValueError(f"active: policy must be one of {known}, or package.module:function, got {self.policy!r}")
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         if self.blocks is not None:
