@@ -42,6 +42,7 @@ from drgs.studies.tables import fill_between  # noqa: E402
 
 COUNTS, PAGE = ROOT / "benchmarks" / "fuzz.json", ROOT / "docs" / "reliability.md"
 FINDINGS, LOCK = ROOT / "runs" / "fuzz" / "findings", ROOT / "runs" / "fuzz" / "lock"
+WORKER = ROOT / "benchmarks" / "fuzz_worker.py"
 _MEMORY = Path("/dev/shm")  # noqa: S108 (millions of files are not for disks)
 _KEPT = 3  # inputs of one cause
 _STUCK = 60.0  # seconds by the clock without an answer, where no processor time is taken
@@ -76,7 +77,7 @@ class Reader:
     def _process(self, scratch: Path, inputs: int, until: float) -> None:
         """One process, until it is done, time is up, or it is dead or has to be ended."""
         begin = self.row["inputs"]
-        line = [sys.executable, str(ROOT / "benchmarks" / "fuzz_worker.py"), self.name, str(begin), str(inputs)]
+        line = [sys.executable, str(WORKER), self.name, str(begin), str(inputs)]
         with (scratch / "said").open("w") as said:
             pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": said}
             process = subprocess.Popen([*line, str(scratch), *([str(self.corpus)] if self.corpus else [])], **pipes)
@@ -146,7 +147,7 @@ class Reader:
             return
         folder = FINDINGS / re.sub(r"\W+", "-", self.name)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{number}.txt").write_text(f"{self.name}, input {number}: {what}\n\n{trace}\n", errors="replace")
+        (folder / f"{number}.log").write_text(f"{self.name}, input {number}: {what}\n\n{trace}\n", errors="replace")
         if news is not None:
             (folder / f"{number}{Path(news['file']).suffix}").write_bytes(news["data"])
         print(f"{self.name}, input {number}: {what}", flush=True)
@@ -212,7 +213,7 @@ def table(result: dict[str, Any]) -> str:
         lines += ["", "Chosen by what they reach in drgs (atheris), beside these:", ""]
         lines += ["| reader | inputs | kept, since they reached new lines | findings |", "|---|---|---|---|"]
         for name in TARGETS:
-            if name in reached:
+            if reached.get(name, {}).get("inputs"):
                 row = reached[name]
                 lines.append(f"| {name} | {row['inputs']:,} | {row['kept']:,} | {_found(row)} |")
                 total.update(reached=row["inputs"], found_so=_found(row))

@@ -203,7 +203,7 @@ def _changed(value: Any, draw: Random) -> Any:
     elif isinstance(held, list):
         held[:] = draw.choice((held * 2, held[::-1], held[:1], held[1:], []))
     elif isinstance(held, int | float):
-        parent[key] = draw.choice((-held, held + 1, held * 1e9, held + 0.5, 1 << 40))
+        parent[key] = draw.choice((-held, held + 1, held * 10**9, held + 1000, 1 << 40))
     else:
         parent[key] = copy.deepcopy(draw.choice(_ODD))
     return value

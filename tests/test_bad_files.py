@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import splat_encoders as encode
+import torch
 from splat_samples import sog_scene, write_sample
 from test_bad_values import save, write_transforms
 
@@ -25,6 +26,8 @@ from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json
 from drgs.data.checks import check_npz, file_inside, read_image, read_npy
 from drgs.data.image_headers import can_hold, is_whole, stated_size
+from drgs.features.decoder import Decoder, load_decoder, save_decoder
+from drgs.features.teacher import read_map
 
 
 @pytest.fixture
@@ -145,6 +148,19 @@ def test_archives_of_arrays_that_claim_gigabytes(tmp_path, little_room):
     struct.pack_into("<I", data, at + 24, 1 << 31)  # the size unpacked, in the directory
     path.write_bytes(data)
     refused(check_npz, path, "2147483648 bytes of a.npy")
+
+
+def test_parts_of_torch_files_that_claim_gigabytes(tmp_path, little_room):
+    """In the index of the archive: torch would allocate them. Decoders and maps of a teacher alike."""
+    save_decoder(Decoder(3, 5), tmp_path / "a.pth")
+    torch.save(torch.ones(2, 3, 4), tmp_path / "a.pt")
+    for name, read in (("a.pth", load_decoder), ("a.pt", read_map)):
+        read(tmp_path / name)
+        data = bytearray((tmp_path / name).read_bytes())
+        at = data.index(b"PK\x01\x02")
+        struct.pack_into("<II", data, at + 20, 3 << 30, 3 << 30)
+        (tmp_path / name).write_bytes(data)
+        refused(read, tmp_path / name, "must be a whole file, '.*' claims 3221225472 bytes of")
 
 
 # ---- names

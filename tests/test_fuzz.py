@@ -12,12 +12,15 @@ from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 
+import fuzz
 from fuzz_formats import mutate
-from fuzz_targets import TARGETS, Bench, fault_of
+from fuzz_targets import TARGETS, Bench, Target, fault_of
 from test_report import active  # noqa: F401 (a fixture)
 
 EXAMPLES = {"videos": 25, "masks, depths, labels": 60, "COLMAP text": 100, "COLMAP binary": 100}
+EXAMPLES |= dict.fromkeys(("classes", "train_meta.json", "poses_bounds.npy", "transforms.json"), 100)
 """Of readers that take more than a few milliseconds; of others 200."""
+pytestmark = pytest.mark.filterwarnings("ignore:Duplicate name")  # of archives that have a part twice
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +99,51 @@ def test_inputs_are_damaged_and_then_restored(bench):
 def test_what_counts_as_a_fault(error, fault):
     """One line that names the file, of the few kinds that commands answer with exit code 2."""
     assert fault_of(error, Path("/d")) == fault
+
+
+WORKER = """
+import mmap, os, sys
+sys.path[:0] = [{benchmarks!r}]
+import fuzz_targets, fuzz_worker
+
+CALLS = []
+
+def read(folder):
+    CALLS.append(folder)
+    if len(CALLS) == 1:  # the valid file
+        return
+    number = int(sys.argv[2]) + len(CALLS) - 2
+    if number == 0:
+        raise KeyError(str(folder))
+    if number == 1:
+        mmap.mmap(-1, 3 << 29).close()  # not touched
+    if number == 2:
+        os.abort()
+
+write = lambda folder: (folder / "a.txt").write_bytes(b"1 2 3")
+fuzz_targets.TARGETS["bad"] = fuzz_targets.Target("bad", (write,), ("a.txt",), read)
+fuzz_worker.main()
+"""
+
+
+def test_what_a_bad_reader_does_is_found(tmp_path, monkeypatch, capsys):
+    """A wrong exception, memory beyond all measure and a crash, in a real process, each with the file that did it; the
+    count goes on behind them.
+    """
+    (tmp_path / "worker.py").write_text(WORKER.format(benchmarks=str(Path(fuzz.__file__).parent)))
+    monkeypatch.setattr(fuzz, "WORKER", tmp_path / "worker.py")
+    monkeypatch.setattr(fuzz, "FINDINGS", tmp_path / "findings")
+    row: dict = {}
+    fuzz.Reader("bad", row).go_on(6, 120)
+    assert (row["inputs"], row["findings"], row["crashes"], row["hangs"]) == (6, 2, 1, 0)
+    assert row["ends"] == {"read": 3}  # of the process that crashed, what it had not told is lost
+    kept = tmp_path / "findings" / "bad"
+    told = [(kept / f"{number}.log").read_text() for number in range(3)]
+    assert "KeyError instead of ValueError" in told[0]
+    assert "asks for 1.5 GiB for" in told[1]
+    assert "crash (-6)" in told[2]
+    assert "Fatal Python error: Aborted" in told[2]
+    bad = Target("bad", (lambda folder: (folder / "a.txt").write_bytes(b"1 2 3"),), ("a.txt",), lambda _: None)
+    bench = Bench(bad, tmp_path / "again")
+    for number in range(3):
+        assert (kept / f"{number}.txt").read_bytes() == bench.place(number)[2]

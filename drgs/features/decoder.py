@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from drgs.features.teacher import check_archive
 from drgs.files import atomic_write
 from drgs.guards.doors import check_path
 from drgs.guards.foreign import refuse_foreign
@@ -131,7 +132,9 @@ def load_decoder(path: str | os.PathLike) -> Decoder:
         raise FileNotFoundError(f"{path}: must be a decoder's state (.pth), found none; check the path")
     with path.open("rb") as file:
         is_zip = file.read(2) == b"PK"  # what torch writes, and what `refuse_foreign` would call by its general name
-    if not is_zip:
+    if is_zip:
+        check_archive(path)
+    else:
         refuse_foreign(path, "a decoder's state (.pth)")
     try:
         if not is_zip:  # torch's reader would warn, or try other formats

@@ -23,7 +23,7 @@ from drgs.guards.foreign import refuse_foreign
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["check_finite", "map_name", "read_map", "read_tensor", "used_map"]
+__all__ = ["check_archive", "check_finite", "map_name", "read_map", "read_tensor", "used_map"]
 
 # `CxHxW` are the letters in the files of Feature 3DGS; numbers in their place must agree with the tensor.
 _NAME = re.compile(r"(.+)_fmap_(CxHxW|(\d+)x(\d+)x(\d+))\.pt")
@@ -90,7 +90,7 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
         raise ValueError(
             f"{path}: must be a zip file as torch.save writes it, got other bytes; save the tensor with torch.save"
         )
-    _check_archive(path)
+    check_archive(path)
     try:
         with warnings.catch_warnings():  # of pickle protocols that no one uses; what they say comes to nothing
             warnings.simplefilter("ignore")
@@ -111,15 +111,28 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
     return value.detach()
 
 
-def _check_archive(path: Path) -> None:
-    """Refuse a zip file that ends early, or has compressed parts: mapped, their bytes would be taken for numbers."""
+def check_archive(path: Path) -> None:
+    """Refuse a file of `torch.save` that ends early, or has parts that are compressed or claim more than the file.
+
+    Mapped, the bytes of compressed parts would be taken for numbers; torch allocates what a part claims.
+    """
+    size = path.stat().st_size
     try:
         with zipfile.ZipFile(path) as archive:
-            packed = [part.filename for part in archive.infolist() if part.compress_type != zipfile.ZIP_STORED]
+            parts = archive.infolist()
     except Exception:  # zipfile raises whatever the damage leads to
         raise ValueError(f"{path}: must be a whole file, got one without its index; copy it again") from None
-    if packed:
-        raise ValueError(f"{path}: must hold its tensor as it is, {packed[0]!r} is compressed; save it with torch.save")
+    for part in parts:
+        if part.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(
+                f"{path}: must hold tensors as they are, {part.filename[:_SHOWN]!r} is compressed; save it with "
+                "torch.save"
+            )
+        if part.file_size > size:
+            raise ValueError(
+                f"{path}: must be a whole file, {part.filename[:_SHOWN]!r} claims {part.file_size} bytes of {size}; "
+                "copy it again"
+            )
 
 
 def check_finite(values: torch.Tensor, path: str | os.PathLike) -> None:
