@@ -8,6 +8,7 @@ import io
 import json
 import resource
 import struct
+import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,6 +21,10 @@ import torch
 from splat_samples import sog_scene, write_sample
 from test_bad_values import save, write_transforms
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+
+from fuzz_seeds import DUMPS, dumped
+
 from drgs.cameras import Camera, intrinsics
 from drgs.codecs import load_gaussians
 from drgs.data import load
@@ -28,6 +33,7 @@ from drgs.data.checks import check_npz, file_inside, read_image, read_npy
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
+from drgs.lab.dumps import read_dump
 
 
 @pytest.fixture
@@ -148,6 +154,19 @@ def test_archives_of_arrays_that_claim_gigabytes(tmp_path, little_room):
     struct.pack_into("<I", data, at + 24, 1 << 31)  # the size unpacked, in the directory
     path.write_bytes(data)
     refused(check_npz, path, "2147483648 bytes of a.npy")
+
+
+def test_dumps_of_another_byte_order(tmp_path):
+    """Arrays of big-endian numbers are the same numbers; torch refuses them as they are."""
+    DUMPS[0](tmp_path)
+    path = tmp_path / "dump.npz"
+    wanted = read_dump(path, *dumped())
+    with np.load(path) as arrays:
+        swapped = {name: x.astype(x.dtype.newbyteorder(">")) for name, x in arrays.items()}
+    np.savez(path, **swapped)
+    found = read_dump(path, *dumped())
+    assert torch.equal(found.image, wanted.image)
+    assert all(torch.equal(found.gradients[name], x) for name, x in wanted.gradients.items())
 
 
 def test_parts_of_torch_files_that_claim_gigabytes(tmp_path, little_room):
