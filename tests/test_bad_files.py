@@ -33,6 +33,7 @@ from drgs.data.checks import check_npz, file_inside, read_image, read_npy
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
+from drgs.files import Run
 from drgs.lab.dumps import read_dump
 
 
@@ -165,7 +166,7 @@ def test_dumps_of_another_byte_order(tmp_path):
         swapped = {name: x.astype(x.dtype.newbyteorder(">")) for name, x in arrays.items()}
     np.savez(path, **swapped)
     found = read_dump(path, *dumped())
-    assert torch.equal(found.image, wanted.image)
+    assert torch.equal(found.images, wanted.images)
     assert all(torch.equal(found.gradients[name], x) for name, x in wanted.gradients.items())
 
 
@@ -284,3 +285,9 @@ def test_windows_of_zstandard(tmp_path):
     table = struct.pack("<QQ", len(frame), 9) + head[48:]
     (tmp_path / "a.spz").write_bytes(head[:32] + table + frame + data[112 + len(first) :])
     refused(load_gaussians, tmp_path / "a.spz", "must be a Zstandard frame, got a window above 128 MiB")
+
+
+def test_messages_about_runs_are_short(tmp_path):
+    """A schema of thousands of letters."""
+    (tmp_path / "config.json").write_text(json.dumps({"schema": "1" * 5000}))
+    refused(lambda path: Run(path).config(), tmp_path, "schema must be 1, got '1+; fit again")
