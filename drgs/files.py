@@ -297,7 +297,8 @@ def _opened_state(path: Path) -> Iterator[tuple[Any, dict]]:
             schema = header.get("schema") if isinstance(header, dict) else None
             if schema != SCHEMA:
                 raise ValueError(
-                    f"{path}: checkpoint schema must be {SCHEMA}, got {schema!r}; fit into another run folder (-o)"
+                    f"{path}: checkpoint schema must be {SCHEMA}, got {repr(schema)[:40]}; fit into another run "
+                    "folder (-o)"
                 )
             yield file, header
     except (SafetensorError, struct.error) as error:
@@ -365,7 +366,7 @@ class Run:
         config = read_json(path, "a run's config.json", "fit again in another folder")
         if not isinstance(config, dict) or config.get("schema") != SCHEMA:
             got = config.get("schema") if isinstance(config, dict) else type(config).__name__
-            raise ValueError(f"{path}: schema must be {SCHEMA}, got {got!r}; fit again in another folder")
+            raise ValueError(f"{path}: schema must be {SCHEMA}, got {repr(got)[:40]}; fit again in another folder")
         return config
 
     def log(self, event: str, **fields: Any) -> None:

@@ -8,6 +8,7 @@ import io
 import json
 import resource
 import struct
+import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,6 +21,10 @@ import torch
 from splat_samples import sog_scene, write_sample
 from test_bad_values import save, write_transforms
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+
+from fuzz_seeds import DUMPS, dumped
+
 from drgs.cameras import Camera, intrinsics
 from drgs.codecs import load_gaussians
 from drgs.data import load
@@ -28,6 +33,8 @@ from drgs.data.checks import check_npz, file_inside, read_image, read_npy
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
+from drgs.files import Run
+from drgs.lab.dumps import read_dump
 
 
 @pytest.fixture
@@ -150,6 +157,19 @@ def test_archives_of_arrays_that_claim_gigabytes(tmp_path, little_room):
     refused(check_npz, path, "2147483648 bytes of a.npy")
 
 
+def test_dumps_of_another_byte_order(tmp_path):
+    """Arrays of big-endian numbers are the same numbers; torch refuses them as they are."""
+    DUMPS[0](tmp_path)
+    path = tmp_path / "dump.npz"
+    wanted = read_dump(path, *dumped())
+    with np.load(path) as arrays:
+        swapped = {name: x.astype(x.dtype.newbyteorder(">")) for name, x in arrays.items()}
+    np.savez(path, **swapped)
+    found = read_dump(path, *dumped())
+    assert torch.equal(found.images, wanted.images)
+    assert all(torch.equal(found.gradients[name], x) for name, x in wanted.gradients.items())
+
+
 def test_parts_of_torch_files_that_claim_gigabytes(tmp_path, little_room):
     """In the index of the archive: torch would allocate them. Decoders and maps of a teacher alike."""
     save_decoder(Decoder(3, 5), tmp_path / "a.pth")
@@ -265,3 +285,9 @@ def test_windows_of_zstandard(tmp_path):
     table = struct.pack("<QQ", len(frame), 9) + head[48:]
     (tmp_path / "a.spz").write_bytes(head[:32] + table + frame + data[112 + len(first) :])
     refused(load_gaussians, tmp_path / "a.spz", "must be a Zstandard frame, got a window above 128 MiB")
+
+
+def test_messages_about_runs_are_short(tmp_path):
+    """A schema of thousands of letters."""
+    (tmp_path / "config.json").write_text(json.dumps({"schema": "1" * 5000}))
+    refused(lambda path: Run(path).config(), tmp_path, "schema must be 1, got '1+; fit again")
