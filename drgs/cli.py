@@ -80,6 +80,7 @@ def main(argv: list[str] | None = None) -> int:
     """
     # Before torch starts them: OpenMP threads that spin between operations take cores from Dr.Jit's.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # the same of NumPy's, which else spin for 2^26 cycles
     argv = sys.argv[1:] if argv is None else list(argv)
     if argv == ["--version"]:
         print(f"drgs {drgs.__version__}")

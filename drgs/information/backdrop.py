@@ -94,7 +94,7 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
     rays = camera.pixel_directions().reshape(-1, 3)
     if sphere:
         start = (camera.center - np.array(sphere.center)) / sphere.radius
-        along = rays @ start
+        along = np.einsum("pk,k->p", rays, start)  # no `@`, as in `Camera.pixel_directions`
         # Of a camera that is outside, a ray that misses: where it is nearest.
         rays = start + rays * (np.sqrt(np.maximum(along**2 + 1 - start @ start, 0.0)) - along)[:, None]
     axis = np.abs(rays).argmax(1)
