@@ -229,6 +229,17 @@ def scene_rows(rows: dict) -> list[str]:
     return lines
 
 
+def missed(rows: dict) -> str:
+    """Which of the bounds are not kept."""
+    over = []
+    for threads, found in rows.items():
+        for name, row in found.items():
+            for kind, limit in zip(KINDS, LIMITS, strict=True):
+                if row and (ratio := row["seconds"][f"exact, {kind}"] / row["seconds"][f"fast, {kind}"]) > limit:
+                    over.append(f"{name}, {kind}, {threads} thread{'s' if int(threads) > 1 else ''}: {ratio:.1f}x")
+    return f"Not kept: {'; '.join(over)}." if over else "All are kept."
+
+
 def report(result: dict) -> str:
     """The page."""
     memory, peers = result["memory"], result["peers"]
@@ -242,7 +253,7 @@ def report(result: dict) -> str:
         "could do without are not left out ([numerics.md](numerics.md)).",
         "",
         *scene_rows(result["scenes"]),
-        f"The bounds are {LIMITS[0]}x, {LIMITS[1]}x and {LIMITS[2]}x.",
+        f"The bounds are {LIMITS[0]}x, {LIMITS[1]}x and {LIMITS[2]}x. {missed(result['scenes'])}",
         "",
         f"The {CROP[0]}x{CROP[1]} pixels in the middle of these views against the float64 oracle, by brute force; near",
         "a tie or a cut-off float32 may decide otherwise: such pixels are counted and left out.",
