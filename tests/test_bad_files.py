@@ -236,6 +236,22 @@ def test_lists_in_a_compressed_ply_claim_nothing(tmp_path, rng, little_room):
     refused(load_gaussians, tmp_path / "a.ply", "must be a readable PLY")
 
 
+def test_lists_for_numbers_in_a_compressed_ply(tmp_path):
+    """A column of SH that is a list, of a length that fits the file."""
+    packed = np.zeros((1, 4), "<u4")
+    names = [f"{end}_{name}" for end in ("min", "max") for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")]
+    lines = ["ply", "format binary_little_endian 1.0", "element chunk 1", *(f"property float {x}" for x in names)]
+    lines += ["element vertex 1", *(f"property uint packed_{x}" for x in ("position", "rotation", "scale", "color"))]
+    for listed in (False, True):
+        kind = "list uchar uchar" if listed else "uchar"
+        own = ["element sh 1", f"property {kind} f_rest_0", *(f"property uchar f_rest_{i}" for i in range(1, 9))]
+        header = "\n".join([*lines, *own, "end_header", ""]).encode()
+        body = np.ones(12, "<f4").tobytes() + packed.tobytes() + (b"\x01" if listed else b"") + bytes(9)
+        (tmp_path / f"{listed}.ply").write_bytes(header + body)
+    assert len(load_gaussians(tmp_path / "False.ply")) == 1
+    refused(load_gaussians, tmp_path / "True.ply", "the sh column f_rest_0 must be a number, is a list")
+
+
 def test_messages_about_sog_scenes_are_short(tmp_path, rng):
     """Versions, names and decoders' own words that go on for pages."""
     meta, images, _ = sog_scene(rng)

@@ -14,6 +14,8 @@ import tomllib
 import pytest
 from doc_pages import PAGES, ROOT, blocks, elsewhere, figures, inline_commands, lines_of, make_folder, smaller
 
+import drgs.gain
+import drgs.select
 from drgs import cli
 
 # What has tests of its own, which run the very blocks.
@@ -43,6 +45,9 @@ def test_blocks_run(page, made, tmp_path, monkeypatch, capsys):
     shutil.copytree(made, folder)
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
+    for owner, name in ((drgs.select, "POLICIES"), (drgs.gain, "_TERMS")):  # which pages add to
+        monkeypatch.setattr(owner, name, dict(getattr(owner, name)))
+    monkeypatch.setattr(drgs.gain, "CRITERIA", drgs.gain.CRITERIA)
     names: dict = {"__name__": "docs"}
     for block in blocks(page):
         where = f"{_name(page)}:{block.line}"

@@ -45,6 +45,13 @@ def load_packed_ply(path: Path) -> Gaussians:
     except (plyfile.PlyParseError, ValueError, OSError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: must be a readable PLY, got {text}; {_ADVICE}") from None
+    wanted = {"chunk": elements["chunk"].columns, "vertex": _PACKED, "sh": ()}
+    if coefficients > 1:
+        wanted["sh"] = elements["sh"].columns
+    for name, columns in wanted.items():
+        lists = [column for column in columns if ply[name].data.dtype[column].hasobject]
+        if lists:
+            raise ValueError(f"{path}: the {name} column {lists[0]} must be a number, is a list; {_ADVICE}")
     chunks, vertex = ply["chunk"].data, ply["vertex"].data
     chunk = np.arange(count) // _CHUNK
     position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
