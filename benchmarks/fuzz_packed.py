@@ -84,7 +84,7 @@ def _frames(data: bytes, draw: Random) -> bytes:
         extensions += struct.pack("<II", kind, draw.choice((0, 4, 4, 1 << 31))) + draw.randbytes(4)
         head = head[:14] + bytes([head[14] | 2]) + head[15:]
     head = head[:16] + struct.pack("<I", _HEAD_4 + len(extensions)) + head[20:]
-    table = b"".join(struct.pack("<QQ", len(frame), size) for frame, size in frames)
+    table = b"".join(struct.pack("<QQ", len(frame), size % 2**64) for frame, size in frames)
     return head + extensions + table + b"".join(frame for frame, _ in frames)
 
 
