@@ -17,6 +17,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, write_json
 from drgs.fitting.losses import psnr_of
+from drgs.guards.archives import check_archive
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 
@@ -159,16 +160,18 @@ class Lpips:
 
 def _read_weights(path: Path) -> dict:
     """The state dictionary in a file, which must not run code; empty if it holds something else."""
-    import pickle
-
+    with path.open("rb") as file:
+        is_zip = file.read(2) == b"PK"  # torchvision's VGG16 is of the format before it
+    if is_zip:
+        check_archive(path)
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, OSError, ValueError, EOFError) as error:
-        text = " ".join(str(error).split())[:120]
+    except Exception as error:  # torch's readers raise whatever the damage leads to
+        text = " ".join(str(error).split())[:120] or type(error).__name__
         raise ValueError(f"{path}: must be readable weights, got {text}; download the file again") from None
     return state if isinstance(state, dict) else {}
 

@@ -35,6 +35,7 @@ from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
 from drgs.files import Run
 from drgs.lab.dumps import read_dump
+from drgs.metrics import _read_weights
 
 
 @pytest.fixture
@@ -171,10 +172,11 @@ def test_dumps_of_another_byte_order(tmp_path):
 
 
 def test_parts_of_torch_files_that_claim_gigabytes(tmp_path, little_room):
-    """In the index of the archive: torch would allocate them. Decoders and maps of a teacher alike."""
+    """In the index of the archive: torch would allocate them. Decoders, maps of a teacher and weights alike."""
     save_decoder(Decoder(3, 5), tmp_path / "a.pth")
     torch.save(torch.ones(2, 3, 4), tmp_path / "a.pt")
-    for name, read in (("a.pth", load_decoder), ("a.pt", read_map)):
+    torch.save({"x": torch.ones(2)}, tmp_path / "weights.pth")
+    for name, read in (("a.pth", load_decoder), ("a.pt", read_map), ("weights.pth", _read_weights)):
         read(tmp_path / name)
         data = bytearray((tmp_path / name).read_bytes())
         at = data.index(b"PK\x01\x02")

@@ -15,8 +15,8 @@ from typing import Any
 
 import torch
 
-from drgs.features.teacher import check_archive
 from drgs.files import atomic_write
+from drgs.guards.archives import check_archive
 from drgs.guards.doors import check_path
 from drgs.guards.foreign import refuse_foreign
 

@@ -12,18 +12,18 @@ import os
 import pickle
 import re
 import warnings
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.guards.archives import check_archive
 from drgs.guards.foreign import refuse_foreign
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["check_archive", "check_finite", "map_name", "read_map", "read_tensor", "used_map"]
+__all__ = ["check_finite", "map_name", "read_map", "read_tensor", "used_map"]
 
 # `CxHxW` are the letters in the files of Feature 3DGS; numbers in their place must agree with the tensor.
 _NAME = re.compile(r"(.+)_fmap_(CxHxW|(\d+)x(\d+)x(\d+))\.pt")
@@ -109,30 +109,6 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
         kind = type(value).__name__ if not isinstance(value, torch.Tensor) else f"tensor of layout {value.layout}"
         raise ValueError(f"{path}: must hold one plain tensor, got a {kind}; save the tensor alone")
     return value.detach()
-
-
-def check_archive(path: Path) -> None:
-    """Refuse a file of `torch.save` that ends early, or has parts that are compressed or claim more than the file.
-
-    Mapped, the bytes of compressed parts would be taken for numbers; torch allocates what a part claims.
-    """
-    size = path.stat().st_size
-    try:
-        with zipfile.ZipFile(path) as archive:
-            parts = archive.infolist()
-    except Exception:  # zipfile raises whatever the damage leads to
-        raise ValueError(f"{path}: must be a whole file, got one without its index; copy it again") from None
-    for part in parts:
-        if part.compress_type != zipfile.ZIP_STORED:
-            raise ValueError(
-                f"{path}: must hold tensors as they are, {part.filename[:_SHOWN]!r} is compressed; save it with "
-                "torch.save"
-            )
-        if part.file_size > size:
-            raise ValueError(
-                f"{path}: must be a whole file, {part.filename[:_SHOWN]!r} claims {part.file_size} bytes of {size}; "
-                "copy it again"
-            )
 
 
 def check_finite(values: torch.Tensor, path: str | os.PathLike) -> None:
