@@ -2,7 +2,7 @@
 process ends, and this one says so in a line.
 
 Questions and answers are lines of JSON on a socket, arrays lie in memory that both map. There is one process for all
-files; it starts with the first question (0.3 s) and ends with this process.
+files; it starts with the first question and ends with this process.
 """
 
 from __future__ import annotations
