@@ -142,16 +142,12 @@ def _fit(**fields: Any) -> FitConfig:
     return FitConfig(**{"feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
 
 
+_TINY: Mapping[str, Any] = {"max_gaussians": 500, "feature_width": 8, "feature_rate": 5e-2, "decoder_rate": 1e-2}
+_FAST_FIELD: Mapping[str, Any] = {"grid_rate": (8e-3, 8e-4), "field_rate": (8e-4, 8e-5)}
+
 SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
     ("static", "tiny"): Sizes(
-        _fit(
-            max_pixels=1_200,
-            max_gaussians=500,
-            max_steps=150,
-            feature_width=8,
-            feature_rate=5e-2,
-            decoder_rate=1e-2,
-        ),
+        _fit(max_pixels=1_200, max_steps=150, **_TINY),
         (40, 30),
         (20, 15),
         every=20,
@@ -170,13 +166,9 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
         _fit(
             times=4,
             max_pixels=800,
-            max_gaussians=500,
             max_steps=120,
-            feature_width=8,
-            feature_rate=5e-2,
-            decoder_rate=1e-2,
-            grid_rate=(8e-3, 8e-4),
-            field_rate=(8e-4, 8e-5),
+            **_TINY,
+            **_FAST_FIELD,
         ),
         (32, 24),
         (16, 12),
@@ -189,8 +181,7 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
             max_gaussians=8_000,
             max_steps=900,
             feature_width=32,
-            grid_rate=(8e-3, 8e-4),
-            field_rate=(8e-4, 8e-5),
+            **_FAST_FIELD,
         ),
         (120, 90),
         (40, 30),

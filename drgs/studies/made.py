@@ -45,49 +45,28 @@ def made_folder(
     study: Literal["static", "dynamic"], sizes: Sizes, made: Path, given: Mapping[str, Path]
 ) -> Callable[[str, tuple[int, int]], Path]:
     """Scene and split -> folder of the data set, as `Study.folder`; other processes can be sent it."""
-    return functools.partial(_room if study == "static" else _kitchen, sizes, made, dict(given))
+    return functools.partial(_made, study, sizes, made, dict(given))
 
 
-def _room(sizes: Sizes, made: Path, given: Mapping[str, Path], scene: str, split: tuple[int, int]) -> Path:
-    """A room, `room-N` of seed N."""
+def _made(
+    study: Literal["static", "dynamic"],
+    sizes: Sizes,
+    made: Path,
+    given: Mapping[str, Path],
+    scene: str,
+    split: tuple[int, int],
+) -> Path:
+    """The room `room-N` or the kitchen `kitchen-N`, of seed N."""
     if scene in given:
         return given[scene]
-    from scenes import room
+    from scenes import kitchen, room
 
     (width, height), (w, h) = sizes.image, sizes.teacher
+    size = {"width": width, "height": height, "teacher_width": w, "teacher_height": h, "seed": _number(scene)}
     with Bar(f"path tracing {scene}") as bar:
-        return room.generate(
-            made / scene,
-            views=sizes.views,
-            width=width,
-            height=height,
-            seed=_number(scene),
-            teacher_width=w,
-            teacher_height=h,
-            test_every=split[0],
-            progress=bar.update,
-        )
-
-
-def _kitchen(sizes: Sizes, made: Path, given: Mapping[str, Path], scene: str, split: tuple[int, int]) -> Path:
-    """A kitchen, `kitchen-N` of seed N."""
-    if scene in given:
-        return given[scene]
-    from scenes import kitchen
-
-    (width, height), (w, h) = sizes.image, sizes.teacher
-    with Bar(f"path tracing {scene}") as bar:
-        return kitchen.generate(
-            made / scene,
-            cameras=sizes.cameras,
-            times=sizes.fit.times,
-            width=width,
-            height=height,
-            seed=_number(scene),
-            teacher_width=w,
-            teacher_height=h,
-            progress=bar.update,
-        )
+        if study == "static":
+            return room.generate(made / scene, views=sizes.views, test_every=split[0], progress=bar.update, **size)
+        return kitchen.generate(made / scene, cameras=sizes.cameras, times=sizes.fit.times, progress=bar.update, **size)
 
 
 def _number(scene: str) -> int:
