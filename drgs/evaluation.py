@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from drgs import data
 from drgs.display.pictures import file_names
-from drgs.fitting.frames import load_frames
+from drgs.fitting.frames import load_dataset, load_frames
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.stages import moving_labels
 from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
 
 if TYPE_CHECKING:
+    from drgs.data import Dataset
     from drgs.deform import DynamicGaussians
     from drgs.files import Run
     from drgs.fitting.frames import Frame
@@ -43,13 +43,9 @@ def evaluate_run(
     g, scene = loaded.gaussians, loaded.scene
     config = recorded.config
     # Of an active run, images may be missing that were never picked.
-    dataset = data.load(
+    dataset = load_dataset(
         recorded.data,
-        test_every=config.test_every,
-        test_offset=config.test_offset,
-        times=config.times,
-        test_cameras=config.test_cameras,
-        background=config.settings.background,
+        config,
         lazy=recorded.is_active,
         points=False,
         strict=strict,
@@ -89,7 +85,7 @@ def evaluate_run(
     )
 
 
-def _segmentation(loaded: LoadedRun, dataset: data.Dataset, frames: list[Frame]) -> Segmentation | str | None:
+def _segmentation(loaded: LoadedRun, dataset: Dataset, frames: list[Frame]) -> Segmentation | str | None:
     """What of the run's labels is measured.
 
     Raises:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from drgs import data
 from drgs.commands.clustered import check_workers, workers_of
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
 from drgs.files import Run
+from drgs.fitting.frames import load_dataset
 from drgs.fitting.resume import claim_run
 from drgs.report.write import FILE
 from drgs.train import FitConfig, fit
@@ -29,13 +29,9 @@ def run(args: Fit) -> None:
     check_workers(args)
     # Before minutes of reading images and triangulating points.
     claim_run(Run(args.output), "fit", args.resume, [args.data])
-    dataset = data.load(
+    dataset = load_dataset(
         args.data,
-        test_every=config.test_every,
-        test_offset=config.test_offset,
-        times=config.times,
-        test_cameras=config.test_cameras,
-        background=config.settings.background,
+        config,
         lazy=active is not None,
         points=active is None or config.init_points == "all",
         strict=args.strict,

@@ -6,9 +6,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs import data
 from drgs.commands.repeat import fit_command
 from drgs.files import Run
+from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import active_record, fit_record
 from drgs.fitting.resume import claim_run
 from drgs.guards.outputs import check_file
@@ -36,19 +36,8 @@ def run(args: Report) -> None:
         if path.suffix.lower() not in (".html", ".htm"):
             raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")
         check_file(path, "report", [folder.path / "config.json"], is_report)
-    config = record.config
     try:
-        dataset = data.load(
-            record.data,
-            test_every=config.test_every,
-            test_offset=config.test_offset,
-            times=config.times,
-            test_cameras=config.test_cameras,
-            background=config.settings.background,
-            lazy=True,
-            points=False,
-            semantics=False,
-        )
+        dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
     except (OSError, ValueError) as error:
         _log.warning("%s; the report goes without the data set's cameras", str(error).partition(";")[0])
         dataset = None

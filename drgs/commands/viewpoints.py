@@ -23,6 +23,7 @@ from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_di
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.files import Run
 from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 from drgs.sizes import at_most, resized_alike
 
@@ -207,12 +208,10 @@ def _captured(given: Given) -> list[Camera]:
         return []
     try:
         names = set(fitted_views(given.run))
-        views = data.load(
-            given.record.data, lazy=True, points=False, semantics=False, times=given.record.config.times
-        ).views
+        dataset = load_dataset(given.record.data, given.record.config, lazy=True, points=False, semantics=False)
     except (ValueError, OSError, KeyError):
         return []
-    return [view.camera.undistorted() for view in views if view.name in names]
+    return [view.camera.undistorted() for view in dataset.views if view.name in names]
 
 
 def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:

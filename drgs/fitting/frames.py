@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 
+from drgs import data
 from drgs.display.progress import Bar
 from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.data import View
+    from drgs.data import Dataset, View
+    from drgs.fitting.config import FitConfig
 
-__all__ = ["Frame", "load_frames"]
+__all__ = ["Frame", "load_dataset", "load_frames"]
 
 _Map = Callable[[], torch.Tensor]
 _Labels = Callable[[], np.ndarray]
@@ -54,6 +57,27 @@ class Frame:
     def target(self) -> torch.Tensor:
         """`image`, black outside the mask."""
         return self.image() if self.mask is None else self.image() * self.mask[..., None]
+
+
+def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> Dataset:
+    """The data set of a fit: its frames, split and background are those that the fit is told.
+
+    Args:
+        path: Of the data set.
+        config: Of the fit.
+        options: Others of `drgs.data.load`.
+    Raises:
+        FileNotFoundError, ValueError: As `drgs.data.load`.
+    """
+    return data.load(
+        path,
+        test_every=config.test_every,
+        test_offset=config.test_offset,
+        times=config.times,
+        test_cameras=config.test_cameras,
+        background=config.settings.background,
+        **options,
+    )
 
 
 def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[Frame]:

@@ -13,15 +13,15 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs import data
 from drgs.evaluation import evaluate_run
 from drgs.files import Run
 from drgs.fitting.active import SELECTION, ActiveViews
 from drgs.fitting.config import SAVING, ActiveConfig, FitConfig, Start
+from drgs.fitting.frames import load_dataset
 from drgs.fitting.resume import claim_run
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
@@ -31,6 +31,9 @@ from drgs.metrics import Lpips
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.train import fit
+
+if TYPE_CHECKING:
+    from drgs.data import Dataset
 
 __all__ = ["Metric", "Study", "distinct_seeds", "result_line", "run_cell", "run_cells"]
 
@@ -142,23 +145,14 @@ class Study:
                 told = True
                 time.sleep(_PATIENCE)
 
-    def dataset(self, cell: Cell) -> data.Dataset:
+    def dataset(self, cell: Cell) -> Dataset:
         """The views of a cell, none of them opened.
 
         Raises:
             ValueError: If the data set states another split than the cell's: it would win.
         """
-        every, offset = cell.split
-        dataset = data.load(
-            self._made(cell),
-            test_every=every,
-            test_offset=offset,
-            background=self.fit.settings.background,
-            lazy=True,
-            points=PROTOCOLS[cell.protocol].leaks,
-            times=self.fit.times,
-            test_cameras=(cell.camera,) if cell.camera else None,
-        )
+        (every, offset), (config, _) = cell.split, self.configs(cell)
+        dataset = load_dataset(self._made(cell), config, lazy=True, points=PROTOCOLS[cell.protocol].leaks)
         if cell.camera:
             return dataset  # which knows the camera, or has been refused
         names = sorted(view.name for view in (*dataset.views, *dataset.absent))

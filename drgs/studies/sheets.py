@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs import data
 from drgs.display import pictures
 from drgs.features.pictures import FeatureColors, label_picture
 from drgs.features.segmentation import classify
 from drgs.files import Run
-from drgs.fitting.frames import load_frames
+from drgs.fitting.frames import load_dataset, load_frames
 from drgs.fitting.records import load_run
 from drgs.integrator import render
 
@@ -77,17 +76,7 @@ def comparison_sheet(runs: Mapping[str, Path], path: Path, view: str | None = No
 def _frame(run: LoadedRun, name: str | None) -> tuple[Frame, int]:
     """The test view, and how many classes there are."""
     record, config = run.record, run.record.config
-    dataset = data.load(
-        record.data,
-        test_every=config.test_every,
-        test_offset=config.test_offset,
-        times=config.times,
-        test_cameras=config.test_cameras,
-        background=config.settings.background,
-        lazy=True,
-        points=False,
-    )
-    test = dataset.split()[1]
+    test = load_dataset(record.data, config, lazy=True, points=False).split()[1]
     views = [view for view in test if name is None or view.name == name]
     if not views:
         raise ValueError(f"comparison_sheet: view must be one of {', '.join(v.name for v in test)}, got {name!r}")
