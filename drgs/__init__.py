@@ -1,4 +1,4 @@
-"""drgs: differentiable Gaussian rendering with Dr.Jit and Mitsuba 3, on any CPU and on CUDA.
+"""drgs: differentiable Gaussian rendering with Dr.Jit and Mitsuba 3, on any CPU; CUDA is written and not yet run.
 
     import drgs
     g = drgs.load_ply("point_cloud.ply")

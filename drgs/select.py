@@ -74,7 +74,7 @@ def select(
         scoring: How views are scored; default `Scoring()`.
         rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
         masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside was not learned from.
-            Nothing is known of candidates'. Of `fisher`, `coverage` and what is made of them.
+            Candidates have none. Only `fisher`, `coverage` and policies that are made of these use masks.
         empty_outside: Nothing is outside of the masks, as of an object's: what these views leave open there is known
             to be empty (block `backdrop`).
         cache: Where to look for and keep information of single views.

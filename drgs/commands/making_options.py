@@ -47,7 +47,7 @@ class Teach(Common, Timed):
     scales: str = "0.75,1,1.5"
     """Of the photographs as the model sees them, averaged; 1: the short side is twice the model's image size."""
     flip: bool = True
-    """Average with the mirrored photographs, too; --no-flip takes half the time."""
+    """Average with the mirrored photographs, too, unless --no-flip is given, which takes half the time."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,13 +97,13 @@ class Reproduce(Common, Clustered):
     data: Annotated[tuple[Path, ...], arg(metavar="DATA"), UseAppendAction] = ()
     """A data set to take in place of the made scenes; may be repeated."""
     scale: StudyScale = "small"
-    """Of fits and scenes: minutes (tiny), hours (small: a fifth of the paper's steps), or as in the paper."""
+    """Of fits and scenes: minutes (tiny), hours (small: 1,400 steps, or 900 where things move), or as in the paper."""
     seeds: int = 3
     """Sets of initial views of each static scene; where things move, kitchens, or fits of each data set."""
     protocol: ProtocolName = "paper"
     """What is known at the start: points of all views (paper), or nothing of unpicked ones (blind, and variants)."""
     policies: Annotated[tuple[str, ...], arg(name="policy", metavar="LABEL"), UseAppendAction] = ()
-    """Only this row of the table; may be repeated."""
+    """Only this row of the table, by its label in rows.jsonl (docs/results.md lists them); may be repeated."""
     test_every: int = 8
     """Every n-th view of given data, by name, is held out, unless its files state a split."""
     test_offset: int = 0
@@ -111,4 +111,4 @@ class Reproduce(Common, Clustered):
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16, for LPIPS beside FLIP; needs pip install 'drgs[lpips]'."""
     figures: bool = True
-    """Draw the comparison sheet and the maps at the end; --no-figures saves their seconds."""
+    """Draw the comparison sheet and the maps at the end, unless --no-figures is given, which saves their seconds."""

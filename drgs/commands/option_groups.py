@@ -204,9 +204,9 @@ class Choosing(Informed):
     policy: Policy | str = ActiveConfig.policy
     """How the next view is chosen (docs/information.md), or a function of your own: package.module:function."""
     criterion: Criterion = ActiveConfig.criterion
-    """Score of policy fisher; v_opt chose the best views where views were few (docs/active-static.md)."""
+    """Score of policy fisher; v_opt chose the best views from six on, level below (docs/active-static.md)."""
     network: NetworkScore = ActiveConfig.network
-    """How the block deformation scores: against what known views say of the field (ratio), or by a trace without it."""
+    """How the block deformation scores: against what known views say of the field (ratio), or alone (trace, paper)."""
     combine: Combine | None = ActiveConfig.combine
     """Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace."""
     seed: int = 0
@@ -218,7 +218,7 @@ class Clustered:
     """Options of commands that can let other processes compute."""
 
     scheduler: str | None = None
-    """HOST:PORT of a Dask cluster whose workers compute what views tell (docs/many-machines.md)."""
+    """HOST:PORT of a Dask cluster that computes: information of views, or whole fits (docs/many-machines.md)."""
     workers: int | None = None
     """The same on this machine: so many processes of one thread each."""
 
@@ -234,7 +234,7 @@ class Taught:
     feature_weight: float = FitConfig.feature_weight
     """Weight of the features' distance to the teacher's maps in the loss; that of the photographs' is 1."""
     feature_rate: float = FitConfig.feature_rate
-    """Learning rate of the features; some times as much for fits of few steps (docs/semantic.md)."""
+    """Learning rate of the features; five times as much for fits of about 1,000 steps (docs/semantic.md)."""
     decoder_rate: float = FitConfig.decoder_rate
     """Learning rate of the decoder, a tenth of the features' as a rule."""
     feature_resolution: FeatureSize = FitConfig.feature_resolution

@@ -138,7 +138,7 @@ class Fit(Choosing, Clustered, Data, Taught, Moving):
     save_minutes: float = FitConfig.save_minutes
     """Minutes after which one is written all the same."""
     mask: MaskUse = FitConfig.mask
-    """Outside of masks is nothing (object; auto, if there are mask files) or something unknown (valid); or no masks."""
+    """Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files."""
     background: tuple[float, float, float] = RenderSettings.background
     """RGB in [0, 1] behind everything."""
     views: Literal["all", "active"] = "all"
@@ -148,19 +148,19 @@ class Fit(Choosing, Clustered, Data, Taught, Moving):
     initial: int = ActiveConfig.initial
     """Views at the start: that of --start, then those farthest away."""
     start: Start = ActiveConfig.start
-    """The first of these: the first training view by name, or one that the seed draws."""
+    """The first of the initial views: the first training view by name, or one that the seed draws."""
     add: int | None = ActiveConfig.add
     """Views to be chosen on the way, others are not read; default 10, or one for every time after the first."""
     every: int | None = ActiveConfig.every
-    """Steps before the first of them, and between two; default 200, or at times the same part of 17,000."""
+    """Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of 17,000."""
     pick_points: PickPoints = ActiveConfig.pick_points
     """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
     restart: Restart = ActiveConfig.restart
     """After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never."""
     measure: tuple[int, ...] = ActiveConfig.measure
-    """Measure the held-out views also when there are so many views, just before the next one is chosen."""
+    """Numbers of training views at which the held-out views are measured, too, just before the next pick."""
     report: bool = True
-    """Write report.html into the run folder at the end; --no-report saves its seconds."""
+    """Write report.html into the run folder at the end, unless --no-report is given, which saves its seconds."""
 
     def settings(self) -> RenderSettings:
         """As for every command, with the background that the photographs are composited on."""
@@ -229,7 +229,7 @@ class Crossval(Seen):
     preset: Literal["auto", Preset] = "auto"
     """The model that it claims to compute; auto: the one whose image is nearest."""
     ladder: bool = True
-    """Say which approximations make that model differ from the exact one; --no-ladder saves the time."""
+    """Say which approximations make that model differ from the exact one, unless --no-ladder, which saves the time."""
     strict: bool = False
     """Conventions that differ and known deviations fail, too, and so does a data set with images that are missing."""
     export: Path | None = None

@@ -19,7 +19,7 @@ class View(Informed, Around, Views):
     """Look at a run or a Gaussian PLY in the browser, while it is fitted, too."""
 
     scene: Positional[Path]
-    """A run folder or a 3DGS point_cloud.ply."""
+    """A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md)."""
     train: str | None = None
     """Views whose cameras are shown, and that are known: a data set, a run, or a cameras.json; default the run's."""
     selection: Path | None = None
