@@ -36,7 +36,9 @@ def results_page(
     """
     labels = [label for label in experiment.policies if any(row["policy"] == label for row in rows)]
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in experiment.policies]
-    parts = [f"{'#' * level} {experiment.title}", paragraph(" ".join([experiment.told, *told]))]
+    renamed = [f"`{label}` ({name})" for label, name in experiment.policies.items() if label != name]
+    labels_of = [f"Labels, as `--policy` takes them: {', '.join(renamed)}."] if renamed else []
+    parts = [f"{'#' * level} {experiment.title}", paragraph(" ".join([experiment.told, *told, *labels_of]))]
     if not rows:
         return "\n\n".join([*parts, "No cell is finished."])
     for protocol in (name for name in PROTOCOLS if any(row["protocol"] == name for row in rows)):
@@ -118,11 +120,12 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
     wins, units = best_of_units(rows)
     papers = sorted({key for label in labels for key in experiment.paper.get(label, {})})
     titles = {metric.key: metric.title for metric in study.metrics}
+    costs = {key: title for key, title in _COSTS.items() if _cost(rows, key) is not None}
     heads = [
         "policy",
         *(m.title if m.larger else f"{m.title} (lower is better)" for m in study.metrics),
         f"best PSNR (of {units})",
-        *_COSTS.values(),
+        *costs.values(),
         *(f"{titles[key]} in the paper" for key in papers),
     ]
     lines = []
@@ -132,7 +135,7 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
             continue
         cells = [_mean(metric, values_of(own, metric.key, label)) for metric in study.metrics]
         cells.append("–" if label == _UPPER else str(wins[label]))
-        cells += [_digits(_cost(own, key)) for key in _COSTS]
+        cells += [_digits(_cost(own, key)) for key in costs]
         cells += [f"{x:.2f}" if (x := experiment.paper.get(label, {}).get(key)) else "–" for key in papers]
         lines.append([experiment.policies[label], *cells])
     return markdown_table(heads, lines)
@@ -149,4 +152,4 @@ def _cost(rows: ResultRows, key: str) -> float | None:
 
 
 def _digits(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
+    return "none" if value is None else f"{value:.2f}"

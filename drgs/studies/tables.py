@@ -164,16 +164,16 @@ def explained(rows: StudyRows, intervals: int) -> str:
     """How to read the table of differences, which has so many intervals."""
     scenes, units = len({row["scene"] for row in rows}), len({unit_of(row) for row in rows})
     told = (
-        f"**Gain** and **loss**: the interval leaves out 0. Of {intervals} intervals about {intervals / 20:.1f} would "
-        "if policies did not differ at all."
+        f"**Gain** and **loss**: the interval excludes 0. Were all policies equal, about {intervals / 20:.1f} of the "
+        f"{intervals} intervals would exclude it as well."
         if units >= _FEWEST
         else f"No verdicts: {units} units cannot tell a difference from chance, even if all of them agree."
     )
     return (
         "Differences within a unit: their mean (every scene counts alike), its 95 % interval from a bootstrap over "
         f"scenes ({scenes} here) first and the units of each then, and in how many units the policy was better. {told} "
-        "Can be seen: a true difference of that size (2.8 standard errors; the median of the lines) would be told from "
-        "0 in four of five such studies, a smaller one less often. Where scenes differ as much as units do, an "
+        "The last row, *detectable*, is the true difference that such a study would find with a power of 80 % (2.8 "
+        "standard errors; the median of the rows). Where scenes differ as much as units do, an "
         "interval over 3 scenes holds the true mean in 82 % of studies, not in 95 %."
     )
 
@@ -181,7 +181,7 @@ def explained(rows: StudyRows, intervals: int) -> str:
 def comparison_table(
     study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], named: bool = False, names: Mapping[str, str] = {}
 ) -> str:
-    """Pairs of policies against metrics as a table; below them the size of a difference that can be seen.
+    """Pairs of policies against metrics as a table; below them the smallest difference that is detectable.
 
     Args:
         study, rows: What is compared.
@@ -206,7 +206,7 @@ def comparison_table(
     if not lines:
         return "No pair of policies has a unit in common yet."
     last = [f"{np.median(sizes[m.key]):.{m.digits}f}" if sizes[m.key] else "none" for m in study.metrics]
-    return markdown_table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["can be seen", *last]])
+    return markdown_table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["detectable", *last]])
 
 
 def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
