@@ -95,8 +95,8 @@ def test_terms_are_explained():
         "dB": "dB is PSNR, the squared error on a logarithmic scale",
         "FLIP": "FLIP what an eye sees when it flips between two images",
         "Fisher information": "**Fisher information** about a parameter is the sum over the pixels",
-        "`logdet`": "`logdet` adds up log(1 + that ratio)",
-        "`eig`": "`eig`, as in FisherRF, adds up its information over that of the views so far",
+        "`logdet`": "`logdet` sums log(1 + that ratio)",
+        "`eig`": "`eig`, FisherRF's criterion, sums over the parameters the candidate's information divided by that of",
         "oracle": "the oracle: float64, brute force",
     }.items():
         assert explanation in " ".join(README.split()), term
