@@ -52,9 +52,10 @@ def evaluate_run(
         semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
     )
     train, test = dataset.split()
+    chosen: dict[str, Any] = {}
     if recorded.is_active:  # the rest of the training split was never seen
-        fitted = fitted_views(run)
-        train = [view for view in train if view.name in fitted]
+        chosen = {"fitted": fitted_views(run), "pool_leak": run.config().get("pool_leak")}
+        train = [view for view in train if view.name in chosen["fitted"]]
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
@@ -80,7 +81,9 @@ def evaluate_run(
         result,
         split_rule=dataset.split_rule(),
         gaussians=len(g),
+        **{name: getattr(loaded, name) for name in ("step", "seconds", "bad_steps")},
         viewers=viewers,
+        **chosen,
         **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
     )
 

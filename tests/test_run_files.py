@@ -69,6 +69,16 @@ def test_files_of_fits(place, name):
     assert found == _fields(name) - _SOMETIMES[name]
 
 
+def test_evaluating_keeps_what_the_fit_said(place):
+    """`drgs eval` writes the same fields, and those of the fit with the same values."""
+    fitted = _read(place / "active/metrics.json")
+    assert cli.main(["eval", str(place / "active"), "--quiet"]) == 0
+    again = _read(place / "active/metrics.json")
+    assert set(again) == set(fitted)
+    for name in ("step", "seconds", "bad_steps", "fitted", "pool_leak", "split_rule", "gaussians"):
+        assert again[name] == fitted[name], name
+
+
 def test_metrics_inside(place):
     """Of views, and of what viewers show."""
     metrics = _read(place / "all/metrics.json")

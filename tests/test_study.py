@@ -326,7 +326,9 @@ def test_lpips_comes_later(still, faked, tmp_path, monkeypatch):
 
 
 def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
-    """`drgs eval` writes metrics.json anew, without the seconds of the fit: the row is taken all the same."""
+    """`drgs eval` writes metrics.json anew, without the seconds where no checkpoint is left: the row is taken all the
+    same.
+    """
     real, said, rows = engine._row, [], tmp_path / "rows.jsonl"
     monkeypatch.setattr(engine, "_row", lambda *arguments: {**real(*arguments), "seconds": None})
     study = small(still)

@@ -110,6 +110,11 @@ def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys
     run_eval(Eval(run=tmp_path / "run"))
     again = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert again["mean"]["psnr"] == pytest.approx(result.metrics["mean"]["psnr"], abs=1e-3)
+    assert {k: again[k] for k in ("step", "bad_steps", "seconds")} == {
+        "step": 5,
+        "bad_steps": 0,
+        "seconds": result.seconds,
+    }
     assert again["viewers"]["psnr"] == pytest.approx(result.metrics["viewers"]["psnr"], abs=1e-3)
     said = capsys.readouterr().out
     assert "2 test views" in said

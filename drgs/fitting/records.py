@@ -116,6 +116,7 @@ class LoadedRun:
             move.
         record: How they were fitted.
         step: Of the checkpoint; None where only the PLY could be read.
+        seconds, bad_steps: Of the fit up to there, what its steps took and how many were skipped; None as `step`.
         networks: What was fitted beside them, by name: what `torch.nn.Module.load_state_dict` takes.
         decoder: What makes a teacher's features of the Gaussians'; None where it has none, or only the PLY could be
             read.
@@ -127,6 +128,8 @@ class LoadedRun:
     gaussians: Gaussians
     record: FitRecord
     step: int | None
+    seconds: float | None = None
+    bad_steps: int | None = None
     networks: dict[str, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
     decoder: Decoder | None = None
     classes: Classes | None = None
@@ -182,7 +185,8 @@ def load_run(run: Run) -> LoadedRun:
             run.point_cloud,
             run.state.name,
         )
-    return LoadedRun(gaussians, record, header["step"], networks, decoder, classes, moving)
+    done = {name: header[name] for name in ("step", "seconds", "bad_steps")}
+    return LoadedRun(gaussians, record, **done, networks=networks, decoder=decoder, classes=classes, moving=moving)
 
 
 def _shows(path: Path, gaussians: Gaussians) -> bool:
