@@ -171,7 +171,7 @@ class Informed(Settings):
     method: Method = ActiveConfig.method
     """How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does."""
     prior: float | None = ActiveConfig.prior
-    """How firmly every parameter counts as known beforehand (lambda): 1e-2 with v_opt, 1 for maps, else 1e-6."""
+    """How firmly every parameter counts as known beforehand (lambda): 1e-2 with v_opt, 1 in drgs fisher, else 1e-6."""
     relative_prior: bool = ActiveConfig.relative_prior
     """lambda is --prior times the median information of a parameter's group, where it is not 0."""
     info_pixels: int | None = ActiveConfig.info_pixels

@@ -164,9 +164,9 @@ class Selection:
     Attributes:
         picks: In the order of picking.
         scores: Of every candidate, before the first pick.
-        parts: Of every candidate, before the first pick: group -> share of its score.
-        unseen: Of every candidate: the share of its score from parameters that no training view has information
-            about (lambda alone decides how much they count).
+        parts: Of every candidate, before the first pick: group -> what it adds to the score.
+        unseen: Of every candidate: what of its score, in the same unit, is of parameters that no training view has
+            information about (lambda alone decides how much they count).
         left_out: Group -> parameters not counted because lambda = 0 and no training view has information about them.
         evaluations: How often a candidate was scored.
         computed: Views whose information was computed, not taken from the cache.
