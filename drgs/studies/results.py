@@ -51,7 +51,7 @@ def results_page(
         if experiment.reference in labels and pairs:
             parts.append(f"Against {named[experiment.reference]}, within units:")
             parts.append(comparison_table(study, mine, pairs, names=named))
-            parts.append(paragraph(explained(mine, len(others) * len(study.metrics))))
+            parts.append(paragraph(explained(study, mine, pairs)))
     if any(experiment.paper.get(label) for label in labels):
         parts.append(
             paragraph(

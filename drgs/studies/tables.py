@@ -12,9 +12,26 @@ import numpy as np
 from drgs.files import atomic_write
 from drgs.studies.cells import Metric, Study
 from drgs.studies.protocols import PROTOCOLS
-from drgs.studies.statistics import Effect, Unit, at_views, differences, estimate, unit_of, values_of, view_counts
+from drgs.studies.statistics import (
+    Effect,
+    Unit,
+    at_views,
+    coverage,
+    differences,
+    estimate,
+    unit_of,
+    values_of,
+    view_counts,
+)
 
-__all__ = ["comparison_table", "explained", "fill_between", "markdown_table", "paragraph", "study_report"]
+__all__ = [
+    "comparison_table",
+    "explained",
+    "fill_between",
+    "markdown_table",
+    "paragraph",
+    "study_report",
+]
 
 StudyRows = Sequence[Mapping[str, Any]]
 
@@ -45,7 +62,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             others = [(label, study.reference) for label in study.policies if label != study.reference]
             parts += [
                 f"{below} Against `{study.reference}`",
-                paragraph(explained(mine, len(others) * len(study.metrics))),
+                paragraph(explained(study, mine, others)),
                 comparison_table(study, mine, others),
             ]
             if verdicts := _verdicts(study, mine, others):
@@ -160,21 +177,33 @@ def _title(metric: Metric) -> str:
     return metric.title if metric.larger else f"{metric.title} (lower is better)"
 
 
-def explained(rows: StudyRows, intervals: int) -> str:
-    """How to read the table of differences, which has so many intervals."""
-    scenes, units = len({row["scene"] for row in rows}), len({unit_of(row) for row in rows})
+def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -> str:
+    """How to read the table of the differences of pairs (`comparison_table`), by what it has."""
+    found = [differences(rows, metric.key, *pair) for pair in pairs for metric in study.metrics]
+    intervals = [values for values in found if len(values) > 1]
+    scenes = len({unit[0] for values in intervals for unit in values})
+    units = len({unit for values in intervals for unit in values})
+    if not intervals:
+        return "Differences within a unit; of a single one there is no interval, and no verdict."
+    judged = sum(len(values) >= _FEWEST for values in intervals)
+    held = coverage(scenes, units)
     told = (
-        f"**Gain** and **loss**: the interval excludes 0. Were all policies equal, about {intervals / 20:.1f} of the "
-        f"{intervals} intervals would exclude it as well."
-        if units >= _FEWEST
+        f"**Gain** and **loss**: the interval excludes 0. Were all policies equal, about {judged * (1 - held):.1f} of "
+        f"the {judged} intervals would exclude it as well."
+        if judged
         else f"No verdicts: {units} units cannot tell a difference from chance, even if all of them agree."
     )
+    kind = "scenes" if scenes > 1 else "units"
+    count = scenes if scenes > 1 else units
+    alike = " that differ as much as their units do," if 1 < scenes < 8 and units >= 2 * scenes else ""
+    drawn = f"{scenes} scenes first and the units of each then" if scenes > 1 else f"the {units} units of one scene"
     return (
-        "Differences within a unit: their mean (every scene counts alike), its 95 % interval from a bootstrap over "
-        f"scenes ({scenes} here) first and the units of each then, and in how many units the policy was better. {told} "
-        "The last row, *detectable*, is the true difference that such a study would find with a power of 80 % (2.8 "
-        "standard errors; the median of the rows). Where scenes differ as much as units do, an "
-        "interval over 3 scenes holds the true mean in 82 % of studies, not in 95 %."
+        f"Differences within a unit: their mean{' (every scene counts alike)' if scenes > 1 else ''}, its 95 % "
+        f"interval from a bootstrap over {drawn}, and in how many units the policy was better. Of {count} "
+        f"{kind}{alike} the interval holds the true mean in about {held * 100:.0f} % of studies. {told} The last row, "
+        f"*detectable*, is the true difference that a t test of {count} {kind} ({count - 1} degree"
+        f"{'s' if count > 2 else ''} of freedom, 5 % of false alarms) would find in 80 % of studies that spread as "
+        "this one does (the median of the rows)."
     )
 
 
@@ -199,8 +228,8 @@ def comparison_table(
         for metric in study.metrics:
             one = found[metric.key]
             cells.append(_difference(metric, one) if one else "none")
-            if one and one.units > 1:
-                sizes[metric.key].append(one.seen)
+            if one and one.detectable is not None:
+                sizes[metric.key].append(one.detectable)
         label = names.get(policy, policy)
         lines.append([f"{label} against {names.get(reference, reference)}" if named else label, *cells])
     if not lines:
