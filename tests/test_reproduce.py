@@ -155,8 +155,8 @@ def test_the_page(tmp_path):
     text = results_page(study, experiment, rows, told=("Something is missing.",))
     line = next(x for x in text.splitlines() if x.startswith("| FisherRF |"))
     cells = [x.strip() for x in line.strip("|").split("|")]
-    assert cells == ["FisherRF", "0.500", "22.25", *["0.500"] * 4, "6", "1.50", "2.50", "1.50", "32.17"]
-    assert next(x for x in text.splitlines() if x.startswith("| uniform |")).split("|")[10].strip() == "–"
+    assert cells == ["FisherRF", "0.500", "22.25", *["0.500"] * 4, "6", "6", "1.50", "2.50", "1.50", "32.17"]
+    assert next(x for x in text.splitlines() if x.startswith("| uniform |")).split("|")[11].strip() == "none"
     for words in ("Something is missing.", "Pool leak", "another data set and other", "best PSNR (of 6)"):
         assert words in text
     assert "+2.00 [+2.00, +2.00] **gain**, 6 of 6" in text
@@ -165,6 +165,46 @@ def test_the_page(tmp_path):
     assert found["fisherrf"]["best"] == {"units": 6, "of": 6}
     assert found["uniform"]["peak_memory"] is None
     assert "No cell is finished." in results_page(study, experiment, [])
+
+
+def test_minutes_are_of_steps_and_picks(tmp_path):
+    """What a fit takes: its steps and its picks; on the page and for machines. A row that knows no seconds has none."""
+    study, experiment = study_of("static", "small", tmp_path), EXPERIMENTS["static"]
+    rows = rows_of(study, ("random", "fisherrf", "uniform"))
+    for row in rows:
+        if row["policy"] == "fisherrf":
+            row |= {"picks": ["a"] * 10, "pick_seconds": 63.0}
+        if row["policy"] == "uniform":
+            row["seconds"] = None
+    text = results_page(study, experiment, rows)
+    heads, *lines = ([x.strip() for x in line.strip("|").split("|")] for line in text.splitlines() if "|" in line)
+    at = heads.index("minutes (steps and picks)")
+    assert {line[0]: line[at] for line in lines[1:4]} == {"random": "1.50", "uniform": "none", "FisherRF": "12.00"}
+    found = {row["policy"]: row["minutes"] for row in results_rows(study, experiment, rows)}
+    assert found == {"random": pytest.approx(1.5), "fisherrf": pytest.approx(12.0), "uniform": None}
+
+
+def test_means_of_different_units_are_said_to_be_such(tmp_path):
+    """Each row says how many units it has; where they are not the same ones, a sentence says what compares."""
+    study, experiment = study_of("static", "small", tmp_path), EXPERIMENTS["static"]
+    rows = rows_of(study, ("random", "farthest"), units=6)
+    sentence = "Means of rows with different units do not compare; the differences within units do."
+    assert sentence not in results_page(study, experiment, rows)
+    text = results_page(study, experiment, rows[:-3])
+    assert sentence in text
+    heads, *lines = ([x.strip() for x in line.strip("|").split("|")] for line in text.splitlines() if "|" in line)
+    assert {line[0]: line[heads.index("units")] for line in lines[1:3]} == {"random": "5", "farthest": "4"}
+    assert sentence in results_page(study, experiment, [rows[0], rows[3]]), "as many, but others"
+
+
+def test_only_intervals_that_are_there_are_counted(tmp_path):
+    """A policy that shares no unit with the reference has no line, and no interval that could exclude 0."""
+    study, experiment = study_of("static", "small", tmp_path), EXPERIMENTS["static"]
+    rows = rows_of(study, ("random", "farthest"), units=6)
+    alone = [row | {"initial": ["c", "d"]} for row in rows_of(study, ("uniform",), units=1)]
+    text = results_page(study, experiment, [*rows, *alone])
+    assert text.count("**gain**, ") + text.count(", 0 of 6 |") == len(study.metrics)
+    assert f"of the {len(study.metrics)} intervals would exclude" in " ".join(text.split())
 
 
 def test_the_paper_is_quoted_as_it_stands():

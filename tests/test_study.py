@@ -607,7 +607,10 @@ def test_curves_are_of_the_metrics_of_then(tmp_path):
     assert len(at_views(rows, 6)) == 13
     assert view_counts(rows[-1:]) == []
     text = told(rows)
-    assert "| p | 13.00 | 14.00 | 30.00 |" in text
+    assert "| p | 13.00 | 14.00 | 30.00 | 6 to 7 |" in text
+    assert "| Random, 1 | 10.00 | 10.00 | 29.00 | 6 |" in text
+    assert "Means of rows with different units do not compare" in " ".join(text.split())
+    assert "Means of rows with" not in told(rows[:-1])
     assert "| p | +3.00 [+3.00, +3.00] **gain**, 6 of 6 | +4.00 [+4.00, +4.00] **gain**, 6 of 6 | +1.00 " in text
     assert "Other pairs:" not in text
     pairs = told(rows, comparisons=(("p", "Random, 1"), ("p", "other"))).partition("Other pairs:")[2]

@@ -11,13 +11,12 @@ from drgs.studies.cells import Metric, Study
 from drgs.studies.experiments import Experiment
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import Unit, estimate, unit_of, values_of
-from drgs.studies.tables import comparison_table, explained, markdown_table, paragraph
+from drgs.studies.tables import comparison_table, explained, markdown_table, paragraph, unlike_units
 
 __all__ = ["best_of_units", "results_page", "results_rows"]
 
 ResultRows = Sequence[Mapping[str, Any]]
-_COSTS = {"seconds": "minutes", "peak_memory": "peak memory, GB", "pick_seconds": "seconds a pick"}
-_UNITS = {"seconds": 60.0, "peak_memory": 1e9, "pick_seconds": 1.0}
+_COSTS = {"minutes": "minutes (steps and picks)", "peak_memory": "peak memory, GB", "pick_seconds": "seconds a pick"}
 _BEST_BY = "psnr"
 _UPPER = "all views"  # is given what the others choose from: it wins nothing
 
@@ -45,6 +44,8 @@ def results_page(
         mine = [row for row in rows if row["protocol"] == protocol]
         parts.append(paragraph(_size(protocol, mine)))
         parts.append(_table(study, experiment, labels, mine))
+        if unlike := unlike_units(mine):
+            parts.append(unlike)
         others = [label for label in labels if label not in (experiment.reference, _UPPER)]
         pairs = [(label, experiment.reference) for label in others]
         named = {label: experiment.policies[label] for label in labels}
@@ -124,6 +125,7 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
     heads = [
         "policy",
         *(m.title if m.larger else f"{m.title} (lower is better)" for m in study.metrics),
+        "units",
         f"best PSNR (of {units})",
         *costs.values(),
         *(f"{titles[key]} in the paper" for key in papers),
@@ -134,6 +136,7 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
         if not own:
             continue
         cells = [_mean(metric, values_of(own, metric.key, label)) for metric in study.metrics]
+        cells.append(str(len({unit_of(row) for row in own})))
         cells.append("–" if label == _UPPER else str(wins[label]))
         cells += [_digits(_cost(own, key)) for key in costs]
         cells += [f"{x:.2f}" if (x := experiment.paper.get(label, {}).get(key)) else "–" for key in papers]
@@ -147,8 +150,18 @@ def _mean(metric: Metric, values: Mapping[Unit, float]) -> str:
 
 def _cost(rows: ResultRows, key: str) -> float | None:
     """Mean over the fits that recorded it, in the unit of the table."""
-    found = [row[key] / _UNITS[key] for row in rows if row.get(key) is not None]
+    found = [x for row in rows if (x := _one_cost(row, key)) is not None]
     return float(np.mean(found)) if found else None
+
+
+def _one_cost(row: Mapping[str, Any], key: str) -> float | None:
+    """Of one fit, in the unit of the table; `seconds` of a row are of its steps alone."""
+    if key == "minutes":
+        if row.get("seconds") is None:
+            return None
+        return (row["seconds"] + len(row.get("picks") or ()) * (row.get("pick_seconds") or 0.0)) / 60
+    value = row.get(key)
+    return value / 1e9 if key == "peak_memory" and value is not None else value
 
 
 def _digits(value: float | None) -> str:

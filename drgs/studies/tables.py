@@ -31,6 +31,7 @@ __all__ = [
     "markdown_table",
     "paragraph",
     "study_report",
+    "unlike_units",
 ]
 
 StudyRows = Sequence[Mapping[str, Any]]
@@ -238,6 +239,16 @@ def comparison_table(
     return markdown_table(["policy", *(_title(metric) for metric in study.metrics)], [*lines, ["detectable", *last]])
 
 
+def unlike_units(rows: StudyRows) -> str:
+    """A sentence for below a table of means, if its policies have run on different units; else nothing."""
+    units: dict[str, set[Unit]] = {}
+    for row in rows:
+        units.setdefault(row["policy"], set()).add(unit_of(row))
+    if len({frozenset(found) for found in units.values()}) < 2:
+        return ""
+    return "Means of rows with different units do not compare; the differences within units do."
+
+
 def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
     """Of each metric: policies against numbers of views, on average over scenes; below, what is left of differences."""
     told = (
@@ -245,20 +256,24 @@ def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
         "every scene counts alike."
     )
     heads, labels = ["policy", *(f"{count} views" for count in counts)], _labels(study, rows)
+    measured = [at_views(rows, count) for count in counts]
+    units = {x: {len({unit_of(row) for row in at if row["policy"] == x}) for at in measured} for x in labels}
+    unlike = next((said for at in measured if (said := unlike_units(at))), "")
     against = [(label, label, study.reference) for label in labels if label != study.reference]
     pairs = [(f"{policy} against {reference}", policy, reference) for policy, reference in study.comparisons]
-    parts = [paragraph(told)]
+    parts = [paragraph(f"{told} {unlike}".strip())]
     for metric in study.metrics:
         means = []
         for label in labels:
-            values = [values_of(at_views(rows, count), metric.key, label) for count in counts]
+            values = [values_of(at, metric.key, label) for at in measured]
             averages = [estimate(found).mean if found else None for found in values]
-            means.append([label, *("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)])
-        parts += [f"{_title(metric)}:", markdown_table(heads, means)]
+            numbers = ("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)
+            means.append([label, *numbers, _range(units[label])])
+        parts += [f"{_title(metric)}:", markdown_table([*heads, "units"], means)]
         for said, wanted in ((f"The same, less that of `{study.reference}`:", against), ("Other pairs:", pairs)):
             lines = []
             for name, *pair in wanted:
-                values = [differences(at_views(rows, count), metric.key, *pair) for count in counts]
+                values = [differences(at, metric.key, *pair) for at in measured]
                 if any(values):
                     cells = [_difference(metric, estimate(found)) if found else "none" for found in values]
                     lines.append([name, *cells])
