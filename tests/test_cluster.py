@@ -517,18 +517,27 @@ def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_fol
 
 
 def test_cells_that_fail_or_are_taken(cluster, still_folder, tmp_path, monkeypatch):
-    """A closure names the data set; one cell's data is missing, another cell is being written by this process."""
+    """A closure names the data set; one cell's data is missing, one finds no memory left, and one is being written by
+    this process.
+    """
     from drgs.files import Run
     from drgs.fitting.resume import claim_run
 
     place = still_folder / "data"
     study = study_of(place)
-    study = dataclasses.replace(study, folder=lambda scene, split: place if scene == "still" else place / scene)
-    cells = [Cell(scene, (4, 1), "first", "random", "blind", seed) for scene, seed in (("gone", 0), ("still", 0))]
+
+    def folder(scene, split):
+        if scene == "huge":
+            raise MemoryError("huge: there must be more memory")
+        return place if scene == "still" else place / scene
+
+    study = dataclasses.replace(study, folder=folder)
+    cells = [Cell(scene, (4, 1), "first", "random", "blind", 0) for scene in ("gone", "still", "huge")]
     said: list[str] = []
     with claim_run(Run(tmp_path / study.name / cells[1].name), "fit", resume=True):
         taken, failed = run_cells_on(cluster, study, cells, tmp_path, tmp_path / "rows.jsonl", said.append)
-    assert (taken, list(failed)) == ([cells[1]], [cells[0]])
+    assert (taken, set(failed)) == ([cells[1]], {cells[0], cells[2]})
+    assert failed[cells[2]] == "huge: there must be more memory"
     assert "gone" in failed[cells[0]]
     assert any(line.startswith(f"{cells[0].name}: failed: ") and "gone" in line for line in said)
     assert any(f"process {os.getpid()} on " in line for line in said)

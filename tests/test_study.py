@@ -271,6 +271,24 @@ def test_many_processes_write_one_file(tmp_path):
     assert sorted(row["seed"] for row in read_study(path)) == list(range(60))
 
 
+def test_a_fit_without_memory_is_one_that_fails(still, faked, tmp_path, monkeypatch):
+    """It is told and left for the next call; the others go on."""
+    study, rows, fake = small(still), tmp_path / "rows.jsonl", engine.fit
+    cells = study.cells(units((0,)))
+
+    def fit(dataset, folder, *arguments, **options):
+        if Path(folder).name == cells[0].name:
+            raise MemoryError(f"{folder}: there must be more memory")
+        fake(dataset, folder, *arguments, **options)
+
+    monkeypatch.setattr(engine, "fit", fit)
+    said = []
+    taken, failed = run_cells(study, cells, tmp_path, rows, said.append)
+    assert (taken, list(failed)) == ([], cells[:1])
+    assert "there must be more memory" in failed[cells[0]]
+    assert [cell_of(row)[1] for row in read_study(rows)] == cells[1:]
+
+
 def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
     """Two processes at once: the second goes on with the next cell, and says which it left."""
     study = small(still)

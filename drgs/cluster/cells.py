@@ -20,7 +20,7 @@ from drgs.cluster.parcels import Missing, opened_parcel
 from drgs.files import atomic_write
 from drgs.guards.locks import InUse, host_of
 from drgs.guards.writing import is_full
-from drgs.studies.cells import Study, result_line, run_cell
+from drgs.studies.cells import FAILURES, Study, result_line, run_cell
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 
 if TYPE_CHECKING:
@@ -259,7 +259,7 @@ def do_cell(
             if time.monotonic() > until:
                 return said | {"taken": host_of(Path(runs) / whole.name / cell.name), "why": str(busy)}
             time.sleep(1.0)
-        except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+        except FAILURES as error:
             if is_full(error):
                 raise
             return said | {"failed": str(error)}

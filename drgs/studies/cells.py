@@ -35,7 +35,10 @@ from drgs.train import fit
 if TYPE_CHECKING:
     from drgs.data import Dataset
 
-__all__ = ["Metric", "Study", "distinct_seeds", "result_line", "run_cell", "run_cells"]
+__all__ = ["FAILURES", "Metric", "Study", "distinct_seeds", "result_line", "run_cell", "run_cells"]
+
+FAILURES = (ValueError, OSError, ArithmeticError, RuntimeError, MemoryError)
+"""What a fit raises that cannot be done; the next one may do."""
 
 _Unit = tuple[str, tuple[int, int] | str, Start, str, int]
 
@@ -247,7 +250,7 @@ def run_cells(
         except InUse:
             taken.append(cell)
             continue
-        except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+        except FAILURES as error:
             if is_full(error):
                 raise
             say(f"{cell.name}: failed: {error}")
