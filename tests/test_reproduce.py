@@ -65,7 +65,9 @@ def rows_of(study, policies, units=3, **values) -> list[dict]:
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_cells_of_made_scenes(name, tmp_path, monkeypatch):
     """Every policy on a unit before the next, as many units as scenes and seeds say; configs are legal and differ."""
-    monkeypatch.setattr("drgs.studies.plan.distinct_seeds", lambda study, scene, split, count: list(range(count)))
+    monkeypatch.setattr(
+        "drgs.studies.plan.distinct_seeds", lambda study, scene, split, count, protocol: list(range(count))
+    )
     for scale in ("tiny", "small", "paper"):
         plan = plan_of(name, scale, tmp_path, seeds=2)
         labels = list(plan.experiment.policies)
@@ -104,6 +106,23 @@ def test_data_that_is_given(still, tmp_path):
     assert "geometry+semantic, eig" in plan.notes[0]
 
 
+def test_a_split_that_is_stated(still, tmp_path):
+    """It counts whatever --test-every says, 0 included."""
+    data = json.loads((still / "transforms.json").read_text())
+    files = [frame["file_path"] for frame in data["frames"]]
+    folder = tmp_path / "stated"
+    folder.mkdir()
+    for name in ("images", "masks", "depth"):
+        (folder / name).symlink_to(still / name)
+    stated = {**data, "test_filenames": files[:2], "train_filenames": files[2:]}
+    (folder / "transforms.json").write_text(json.dumps(stated))
+    for split in ((0, 0), (4, 1)):
+        plan = plan_of("static", "tiny", tmp_path, [folder], seeds=1, split=split)
+        assert {cell.split for cell in plan.cells} == {(0, 0)}
+    with pytest.raises(ValueError, match="fit: test_every must be a whole number in .*, got -3"):
+        plan_of("static", "tiny", tmp_path, [folder], seeds=1, split=(-3, 0))
+
+
 def test_cameras_that_are_given(tmp_path):
     """Of videos the camera that the data set holds out; a static experiment refuses them."""
     folder = tmp_path / "filmed"
@@ -124,6 +143,14 @@ def test_cameras_that_are_given(tmp_path):
         ({"name": "static", "policies": ["best"]}, "--policy must be one of: random; uniform; .* got 'best'"),
         ({"name": "static", "seeds": 0}, "--seeds must be at least 1"),
         ({"name": "dynamic", "given": True}, "must show a scene at several times, shows one"),
+        ({"name": "static", "given": True, "split": (-3, 0)}, "fit: test_every must be a whole number in .*, got -3"),
+        (
+            {"name": "static", "given": True, "split": (1, 0)},
+            "fit: test_every must be 0 .hold out none. or >= 2, got 1",
+        ),
+        ({"name": "static", "given": True, "split": (4, 9)}, "fit: test_offset must be in 0..3 .* got 9; lower it"),
+        ({"name": "static", "given": True, "split": (0, 0)}, "must hold out views, holds out none"),
+        ({"name": "static", "given": True, "protocol": "nbv-gym"}, "must have 13 training views for protocol nbv-gym"),
     ],
 )
 def test_what_cannot_be(options, told, still, tmp_path):

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_active import write_still
+from test_data import write_transforms
 from test_dynamic_data import cameras, coded, write_poses, write_video
 
 from drgs import train
@@ -182,6 +183,27 @@ def test_seeds_are_of_different_initial_views(still):
     assert [sets.index(chosen) for chosen in dict.fromkeys(sets)] == seeds
     with pytest.raises(ValueError, match="must have 1000 sets of initial views"):
         distinct_seeds(study, "still", SPLIT, 1000)
+    assert distinct_seeds(study, "still", SPLIT, 4, "paper") == seeds
+
+
+def test_seeds_are_of_the_protocols_initial_views(tmp_path):
+    """Two views that differ may lead to the same ten: as many sets as wanted all the same, or one line that says why
+    there are none.
+    """
+    write_transforms(tmp_path, count=24)
+    study = small(tmp_path)
+    train = study.dataset(study.cells(units())[0]).split()[0]
+    sets = {}
+    for protocol in ("blind", "nbv-gym"):
+        for seed in distinct_seeds(study, "still", SPLIT, 8, protocol):
+            cell = Cell("still", SPLIT, "seed", "farthest", "nbv-gym", seed)
+            config, active = study.configs(cell)
+            sets.setdefault(protocol, set()).add(frozenset(engine.ActiveViews(active, train, config).chosen))
+    assert len(sets["nbv-gym"]) == 8
+    assert len(sets["blind"]) < 8, "else this test tells nothing"
+    many = dataclasses.replace(study, active=dataclasses.replace(study.active, add=None))
+    with pytest.raises(ValueError, match="still: must have 20 training views for protocol nbv-gym, 10 at the start"):
+        distinct_seeds(many, "still", SPLIT, 2, "nbv-gym")
 
 
 @pytest.fixture(scope="module")

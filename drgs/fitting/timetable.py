@@ -28,11 +28,14 @@ if TYPE_CHECKING:
     from drgs.data import View
     from drgs.fitting.config import ActiveConfig, FitConfig, Schedule
 
-__all__ = ["Timetable", "initial_views"]
+__all__ = ["VIEWS_TO_ADD", "Timetable", "initial_views"]
 
 _START = 0x57A7  # the stream of the view that a fit starts with, apart from all others of the same seed
-_ADD, _EVERY = 10, 200  # of views, as in [1]
+_EVERY = 200  # steps between two picks, as in [1]
 _PART = 200 / 17_000  # of the steps between two picks at times, as in [1]
+
+VIEWS_TO_ADD = 10
+"""As in [1], where things stand still and `ActiveConfig` does not say."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +96,7 @@ class Timetable:
     @classmethod
     def _of_views(cls, active: ActiveConfig, views: Sequence[View], config: FitConfig) -> Timetable:
         """View by view."""
-        add, every = active.add or _ADD, active.every or _EVERY
+        add, every = active.add or VIEWS_TO_ADD, active.every or _EVERY
         if active.initial + add > len(views):
             raise ValueError(
                 f"active: --initial {active.initial} and --add {add} must be at most the {len(views)} views of "

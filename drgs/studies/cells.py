@@ -23,6 +23,7 @@ from drgs.fitting.active import SELECTION, ActiveViews
 from drgs.fitting.config import SAVING, ActiveConfig, FitConfig, Start
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.resume import claim_run
+from drgs.fitting.timetable import VIEWS_TO_ADD
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
 from drgs.guards.writing import is_full
@@ -169,19 +170,31 @@ class Study:
         return dataset
 
 
-def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int, first: int = 0) -> list[int]:
-    """The first seeds, from `first` on, that draw different sets of initial views.
+def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int, protocol: str = "blind") -> list[int]:
+    """The first seeds that draw different sets of initial views.
 
+    Args:
+        study, scene, split: Of the cells.
+        count: How many.
+        protocol: A name of `PROTOCOLS`, which may say how many initial views there are.
     Raises:
-        ValueError: If there are not as many sets.
+        ValueError: If there are not as many sets, or too few views for a fit.
     """
     policy = next(label for label, fields in study.policies.items() if fields is not None)
-    cell = Cell(scene, split, "seed", policy, "blind", first)
-    train = study.dataset(cell).split()[0]
+    cell = Cell(scene, split, "seed", policy, protocol, 0)
+    train = study.dataset(dataclasses.replace(cell, protocol="blind")).split()[0]  # no points are needed
+    _, active = study.configs(cell)
+    assert active is not None  # of such a policy
+    picked = active.add or VIEWS_TO_ADD
+    if active.initial + picked > len(train):
+        raise ValueError(
+            f"{scene}: must have {active.initial + picked} training views for protocol {protocol}, {active.initial} at "
+            f"the start and {picked} to be picked, has {len(train)}; add photographs, or hold out fewer"
+        )
     found: dict[frozenset[int], int] = {}
-    for seed in range(first, first + (100 * count if count <= len(train) else 0)):
+    for seed in range(100 * count if count <= len(train) else 0):
         config, active = study.configs(dataclasses.replace(cell, seed=seed))
-        assert active is not None  # of such a policy
+        assert active is not None
         found.setdefault(frozenset(ActiveViews(active, train, config).chosen), seed)
         if len(found) == count:
             return list(found.values())

@@ -62,7 +62,8 @@ def plan_of(
         split: (n, k) of given data sets that state none: every n-th view is held out, from the k-th on.
         lpips: Weights of a backbone, for LPIPS.
     Raises:
-        ValueError: If an argument is unknown, or a data set is not of the experiment's kind.
+        ValueError: If an argument is unknown or out of range, a data set is not of the experiment's kind, or has too
+            few views for the protocol.
     """
     experiment = EXPERIMENTS[name]
     moves = experiment.study == "dynamic"
@@ -80,6 +81,7 @@ def plan_of(
         raise ValueError("reproduce: --data must be folders of different names, got one twice; rename or link one")
     study = study_of(experiment.study, scale, made, scenes, lpips=lpips)
     study = dataclasses.replace(study, policies={label: study.policies[label] for label in wanted})
+    dataclasses.replace(study.fit, test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
     units, notes, lacking = [], list[str](), set[tuple[str, str]]()
     for scene, path in scenes.items():
         dataset = data.load(
@@ -93,7 +95,7 @@ def plan_of(
     if not given and moves:
         units = [(f"kitchen-{seed}", _CAMERA, "first", protocol, 0) for seed in range(1, seeds + 1)]
     elif not given:
-        drawn = {scene: distinct_seeds(study, scene, MADE_SPLIT, seeds) for scene in _ROOMS[scale]}
+        drawn = {scene: distinct_seeds(study, scene, MADE_SPLIT, seeds, protocol) for scene in _ROOMS[scale]}
         units = [(scene, MADE_SPLIT, "seed", protocol, drawn[scene][k]) for k in range(seeds) for scene in drawn]
     cells = [cell for cell in study.cells(units) if (cell.scene, cell.policy) not in lacking]
     return StudyPlan(experiment, study, tuple(cells), tuple(notes))
@@ -119,9 +121,10 @@ def _units_of(
         return [(scene, cameras[0], "first", protocol, seed) for seed in range(seeds)]
     names = sorted(view.name for view in (*train, *test, *dataset.absent))
     every, offset = split
-    states = {view.name for view in test} != set(names[offset::every]) - {view.name for view in dataset.absent}
-    held_out = _UNKNOWN if states else split
-    return [(scene, held_out, "seed", protocol, seed) for seed in distinct_seeds(study, scene, held_out, seeds)]
+    asked = set(names[offset::every] if every else ()) - {view.name for view in dataset.absent}
+    held_out = split if {view.name for view in test} == asked else _UNKNOWN
+    drawn = distinct_seeds(study, scene, held_out, seeds, protocol)
+    return [(scene, held_out, "seed", protocol, seed) for seed in drawn]
 
 
 def _missing(study: Study, scene: str, dataset: data.Dataset) -> tuple[list[str], list[str]]:
