@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -249,6 +250,46 @@ def test_the_paper_is_quoted_as_it_stands():
 # --------------------------------------------------------------------------------------------------------- the command
 
 
+def test_what_is_refused_leaves_nothing(still, tmp_path, capsys):
+    """Weights that are not there, and a split that cannot be: one line before any fit, and no data set is remembered
+    for the next call.
+    """
+    out = tmp_path / "out"
+    line = ["reproduce", "static", "--scale", "tiny", "--seeds", "1", "--data", str(still), "-o", str(out), "--quiet"]
+    for more, told in (
+        (["--lpips-weights", str(tmp_path / "none.pth")], "must be weights of AlexNet or VGG16, found none"),
+        (["--test-every", "1"], "test_every must be 0"),
+    ):
+        assert cli.main([*line, *more]) == 2
+        said = capsys.readouterr().err.strip().splitlines()
+        assert told in said[-1]
+        assert [path.name for path in out.glob("*") if not path.name.startswith(".")] == []
+
+
+def test_workers_get_whole_paths(tmp_path, monkeypatch):
+    """What is sent to workers, which have working directories of their own, does not depend on this one."""
+    pytest.importorskip("cloudpickle")
+    from drgs.cluster.parcels import Parcel
+
+    sent = []
+
+    def run_cells(study, *rest):
+        sent.append(Parcel.of(study))
+        return [], {}
+
+    monkeypatch.setattr("drgs.commands.reproduce.run_cells", run_cells)
+    monkeypatch.setattr("drgs.commands.reproduce.Lpips", lambda path: None)  # these would be weights
+    monkeypatch.chdir(tmp_path)
+    line = "reproduce dynamic --scale tiny --seeds 1 --no-figures --quiet -o out --lpips-weights w.pth --policy random"
+    assert cli.main(line.split()) == 0
+    study = pickle.loads(sent[0].data)
+    assert study.lpips == tmp_path.resolve() / "w.pth"
+    assert study.folder.args[2] == tmp_path.resolve() / "out" / "scenes" / "tiny"
+    page = (tmp_path / "out" / "dynamic.md").read_text()
+    assert "`drgs reproduce dynamic -o out --scale tiny --seeds 1 --protocol paper --policy random" in page
+    assert "--lpips-weights w.pth --no-figures`" in page
+
+
 def test_a_study_that_is_killed_goes_on(tmp_path):
     """SIGKILL in the middle of the second cell: the first is kept, the rest is done, tables and figures are there; what
     is finished is not done again, and a row that lost its end is.
@@ -265,6 +306,8 @@ def test_a_study_that_is_killed_goes_on(tmp_path):
     rows = out / "rows.jsonl"
     assert [row["policy"] for row in read_study(rows)] == ["random"]
     before = rows.read_bytes()
+    (out / "static-maps").mkdir()
+    (out / "static-maps" / "other.maps.png").write_bytes(b"of another data set")
     assert cli.main(line) == 0
     assert rows.read_bytes().startswith(before)
     found = read_study(rows)
@@ -272,7 +315,9 @@ def test_a_study_that_is_killed_goes_on(tmp_path):
     assert all(row["peak_memory"] > 1e8 and row["pool_leak"] for row in found)
     assert all(row["metrics"]["miou"] > 0.05 for row in found)
     page = (out / "static.md").read_text()
-    assert all(text in page for text in ("![", "| random |", "| farthest |"))
+    assert all(text in page for text in ("![", "| random |", "| farthest |", ".maps.png)"))
+    assert "other.maps.png" not in page
+    assert f"`drgs {line[0]} static -o {out} --scale tiny --seeds 1 --protocol paper --policy random --policy" in page
     assert [row["policy"] for row in json.loads((out / "static.json").read_text())["rows"]] == ["random", "farthest"]
     import cv2
 
@@ -300,7 +345,9 @@ def test_data_without_labels(still, tmp_path, capsys):
     row = read_study(out / "rows.jsonl")[0]
     assert row["metrics"]["miou"] is None
     assert row["metrics"]["psnr"] > 5
-    assert "no accuracies and no mIoU" in " ".join((out / "static.md").read_text().split())
+    page = " ".join((out / "static.md").read_text().split())
+    assert "no accuracies and no mIoU" in page
+    assert f"--data {still} --policy uniform --test-every 8 --test-offset 0`" in page
     write_still(tmp_path / "still")
     assert cli.main([*line[:-3], str(tmp_path / "still"), "-o", str(out)]) == 2
     assert "must be of one still, holds rows of" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.json_files import check_json, read_json
 from drgs.guards.outputs import claim
 from drgs.machine import commit, cpu_model
+from drgs.metrics import Lpips
 from drgs.studies.cells import run_cells
 from drgs.studies.plan import StudyPlan, plan_of
 from drgs.studies.results import results_page, results_rows
@@ -37,20 +39,24 @@ def run(args: Reproduce) -> None:
     check_workers(args)
     out: Path = args.output
     claim(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
-    _same_data(out, args.data)
+    known = _same_data(out, args.data)
+    weights = args.lpips_weights and args.lpips_weights.resolve()
+    if weights:
+        Lpips(weights)  # which every fit would else find out at its end
     say = (lambda line: None) if args.quiet else print
     with workers_of(args) as workers:  # before scenes are made: whether there are any
         plan = plan_of(
             args.what,
             args.scale,
-            out / "scenes",
+            (out / "scenes").resolve(),  # workers have a working directory of their own
             args.data,
             args.seeds,
             args.protocol,
             args.policies,
             (args.test_every, args.test_offset),
-            args.lpips_weights,
+            weights,
         )
+        write_json(out / _GIVEN, known)
         for note in plan.notes:
             say(f"note: {note}")
         done = {cell_of(row) for row in read_study(out / _ROWS)}
@@ -81,8 +87,8 @@ def _run_on(workers: Cluster, *where: Any) -> tuple[list[Cell], dict[Cell, str]]
     return run_cells_on(workers, *where)
 
 
-def _same_data(out: Path, given: Sequence[Path]) -> None:
-    """Refuse a name that rows of this folder have of another data set, and remember those that are new."""
+def _same_data(out: Path, given: Sequence[Path]) -> dict[str, str]:
+    """Name -> data set of a folder's rows and of those that are given; refuses a name that rows have of another one."""
     path = out / _GIVEN
     known = read_json(path, "data sets by name", "restore it") if path.exists() else {}
     check_json(str(path), known, {}, "restore it")
@@ -90,7 +96,7 @@ def _same_data(out: Path, given: Sequence[Path]) -> None:
         real = folder.resolve()
         if known.setdefault(real.name, str(real)) != str(real):
             raise ValueError(f"{out}: must be of one {real.name}, holds rows of {known[real.name]}; choose another -o")
-    write_json(path, known)
+    return known
 
 
 def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str]]:
@@ -123,15 +129,19 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
             quiet=True,
         )
     )
-    maps = sorted((out / f"{args.what}-maps").glob("*.maps.png"))
+    folder = out / f"{args.what}-maps"
+    listed = read_json(folder / "fisher.json", "the maps of a view", "repeat the command")["views"]
+    # Not what another data set has left there.
+    maps = [folder / name for view in listed for name in view["files"] if name.endswith(".maps.png")]
     told = f"What moments, FisherRF and our blocks look at in a view of {cell.scene}, after `{last}`"
     return [(f"{args.what}.png", shown), *((f"{path.parent.name}/{path.name}", told) for path in maps)]
 
 
 def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictures: list[tuple[str, str]]) -> None:
     """The page, and the same for machines."""
-    made = f"`drgs reproduce {args.what} --scale {args.scale} --seeds {args.seeds} --protocol {args.protocol}`"
-    where = f"Made by {made} on {cpu_model()}, {datetime.date.today()}, commit {(commit() or 'unknown')[:7]}."
+    where = (
+        f"Made by `{_command(args)}` on {cpu_model()}, {datetime.date.today()}, commit {(commit() or 'unknown')[:7]}."
+    )
     text = ["# arXiv 2512.22771, repeated", where, results_page(plan.study, plan.experiment, rows, told=plan.notes)]
     text += [f"![{told}]({name})\n\n{told}." for name, told in pictures]
     with atomic_write(out / f"{args.what}.md") as file:
@@ -150,6 +160,21 @@ def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictur
             "rows": results_rows(plan.study, plan.experiment, rows),
         },
     )
+
+
+def _command(args: Reproduce) -> str:
+    """The line for a shell that makes the same cells."""
+    words = ["drgs", "reproduce", args.what, "-o", str(args.output), "--scale", args.scale, "--seeds", str(args.seeds)]
+    words += ["--protocol", args.protocol]
+    for folder in args.data:
+        words += ["--data", str(folder)]
+    for label in args.policies:
+        words += ["--policy", label]
+    if args.data:
+        words += ["--test-every", str(args.test_every), "--test-offset", str(args.test_offset)]
+    if args.lpips_weights:
+        words += ["--lpips-weights", str(args.lpips_weights)]
+    return shlex.join(words if args.figures else [*words, "--no-figures"])
 
 
 def _print(plan: StudyPlan, rows: list[dict], out: Path, what: str) -> None:
