@@ -546,6 +546,24 @@ def test_cells_that_fail_or_are_taken(cluster, still_folder, tmp_path, monkeypat
         run_cells_on(cluster, study, cells, tmp_path, tmp_path / "rows.jsonl", said.append)
 
 
+def test_a_cell_is_not_bound_to_workers_that_end(cluster, still_folder, tmp_path, monkeypatch):
+    """The lock of a cell names another machine, whose only worker ends before it takes the cell: another worker has it
+    then, and says that it is taken.
+    """
+    study = study_of(still_folder / "data")
+    cell = study.cells([("still", (4, 1), "first", "blind", 0)])[0]
+    lock = tmp_path / study.name / cell.name / ".drgs.lock"
+    lock.parent.mkdir(parents=True)
+    lock.write_text(json.dumps({"pid": 1, "host": "elsewhere", "command": "fit", "since": "today"}))
+    near = iter([["tcp://127.0.0.1:9"], []])
+    monkeypatch.setattr(cluster, "workers_of", lambda host: next(near))
+    said: list[str] = []
+    assert run_cells_on(cluster, study, [cell], tmp_path, tmp_path / "rows.jsonl", said.append) == ([cell], {})
+    begun = [line for line in said if " on worker " in line]
+    assert len(begun) == 2
+    assert begun[1].endswith(", again"), "and not that somebody who is there has gone"
+
+
 def _sees_nothing(token: str) -> bool:
     return False
 

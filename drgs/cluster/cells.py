@@ -34,7 +34,7 @@ _TOPIC = "drgs-cells-"
 _LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
 _ENDING = 10.0  # seconds that a process which was killed is given to be gone
 _APPEARING = 10.0  # seconds until a new file must be seen through a shared file system
-_TRIES = 20  # how often a cell is handed out again because its worker had not got the study
+_TRIES = 20  # how often a cell is handed out again because its worker had not got the study, or could not take it
 
 
 def run_cells_on(
@@ -125,10 +125,10 @@ class _Round:
         self.parcel = cluster.send(study)
         self.topic = _TOPIC + uuid.uuid4().hex
         self.news: queue.Queue = queue.Queue()
-        self.begun: dict[int, str] = {}  # number of the cell -> the worker that has begun it
+        self.begun: dict[int, tuple[str, str]] = {}  # number of the cell -> name and address of who has begun it
         self.pending: dict[int, Future] = {}
         self.tries: dict[int, int] = {}
-        self.elsewhere: set[int] = set()  # cells that were handed to a machine that has their lock
+        self.moved: dict[int, int] = {}  # how often a cell was handed to the machine that has its lock
         self.taken: list[Cell] = []
         self.failed: dict[Cell, str] = {}
 
@@ -146,7 +146,7 @@ class _Round:
                     self.cluster.check_alive()
                     continue
                 if kind == "begun":
-                    self.tell(what["number"], named[what["number"]], what["worker"])
+                    self.tell(what["number"], named[what["number"]], what["worker"], what["address"])
                 else:
                     self.take_in(what, named[what])
         finally:
@@ -157,19 +157,20 @@ class _Round:
         return self.taken, self.failed
 
     def hand_out(self, number: int, cell: Cell, workers: list[str] | None = None) -> None:
-        """To the next worker that is free, or to one of some."""
-        where = {"workers": workers} if workers else {}
+        """To the next worker that is free; rather to one of some, as long as these are there."""
+        where = {"workers": workers, "allow_other_workers": True} if workers else {}
         arguments = (self.cluster.ours, self.parcel, cell, str(self.runs), str(self.token), self.topic, number)
         # An earlier cell first, also where it comes again because its worker has gone.
         future = self.cluster.client.submit(do_cell, *arguments, pure=False, priority=-number, **where)
         self.pending[number] = future
         future.add_done_callback(lambda _: self.news.put(("done", number)))
 
-    def tell(self, number: int, cell: Cell, worker: str) -> None:
+    def tell(self, number: int, cell: Cell, worker: str, address: str) -> None:
         """That a worker has begun with a cell, and whether it has the cell of one that is gone."""
-        before = self.begun.get(number)
-        self.begun[number] = worker
-        again = "" if before is None else f", again: {before} has gone"
+        before, self.begun[number] = self.begun.get(number), (worker, address)
+        again = "" if before is None else ", again"
+        if before is not None and before[1] not in self.cluster.workers():
+            again += f": {before[0]} has gone"
         self.say(f"{number} of {self.count}: {cell.name} on worker {worker}{again}")
 
     def take_in(self, number: int, cell: Cell) -> None:
@@ -191,9 +192,10 @@ class _Round:
         elif "unseen" in found:
             raise ValueError(_not_shared(found["worker"], self.runs))
         elif "taken" in found:
-            near = self.cluster.workers_of(found["taken"]) if number not in self.elsewhere else []
-            if near and found["host"] != found["taken"]:
-                self.elsewhere.add(number)
+            # A worker that is far away may have it again, when all that are near are busy, or have gone.
+            tried, far = self.moved.get(number, 0), found["host"] != found["taken"]
+            if far and tried < _TRIES and (near := self.cluster.workers_of(found["taken"])):
+                self.moved[number] = tried + 1
                 self.hand_out(number, cell, near)
             else:
                 self.say(f"{cell.name}: taken: {found['why']}")
@@ -249,7 +251,7 @@ def do_cell(
         if time.monotonic() > until:
             return said | {"unseen": token}
         time.sleep(0.5)
-    get_worker().log_event(topic, {"number": number, "worker": said["worker"]})
+    get_worker().log_event(topic, {"number": number, "worker": said["worker"], "address": said["address"]})
     until = time.monotonic() + _ENDING
     while True:
         try:
