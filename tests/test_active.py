@@ -619,10 +619,12 @@ def test_bad_options_are_one_line(still, tmp_path, capsys, options, message):
     assert not (tmp_path / "run").exists()
 
 
-def test_unknown_names_are_refused():
-    """In Python, too."""
+def test_unknown_names_are_refused(still):
+    """In Python, too; a policy of one's own that is not there before the first step, not at the first pick."""
     for field in ("policy", "criterion", "method"):
         with pytest.raises(ValueError, match=f"active: {field} must be one of .*, got 'best'"):
             ActiveConfig(**{field: "best"})
     with pytest.raises(ValueError, match="at least one training view, got none"):
         ActiveViews(plan(), [], config())
+    with pytest.raises(ValueError, match="--policy nosuch.module:fn: must be importable"):
+        ActiveViews(plan(policy="nosuch.module:fn"), lazily(still).split()[0], config())

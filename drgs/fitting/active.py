@@ -75,11 +75,14 @@ class ActiveViews:
             moves: Whether a deformation is fitted.
             workers: Processes that compute what candidates tell, as `drgs.select` takes them.
         Raises:
-            ValueError: As `Timetable.of`, and if there are no views.
+            ValueError: As `Timetable.of`, and if there are no views, or no such policy.
         """
+        from drgs.select import policy_named
+
         if not views:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
         self.active, self.views, self._config, self._workers = active, list(views), config, workers
+        policy_named(active.policy)  # else the first pick would be where that is found out
         self.timetable = Timetable.of(active, self.views, config, moves)
         first, last = len(self.timetable.start), len(self.timetable.start) + self.timetable.add - 1
         for count in active.measure:
