@@ -4,9 +4,10 @@
     python benchmarks/active.py --page [--merge ROWS.jsonl ...]                              docs/active-static.md
 
 The paper's static loop (2 views, one more every 200 steps at `paper` scale) as cells of `drgs.studies.cells`: rows of
-benchmarks/active.jsonl and runs that are there are kept, killed ones resumed, and several processes may work side by
-side. A unit is (scene, split, initial views); every seed draws other initial views, and captures are held out from two
-offsets on. Made scenes (`room-N`, `still-N`, N the seed) have test views drawn as the candidates are, 24 or more.
+benchmarks/active.jsonl (of `--set choice` active-choice.jsonl) and runs that are there are kept, killed ones resumed,
+and several processes may work side by side. A unit is (scene, split, initial views); every seed draws other initial
+views, and captures are held out from two offsets on. Made scenes (`room-N`, `still-N`, N the seed) have test views
+drawn as the candidates are, 24 or more.
 
 Scenes were named before anything was run: constants of policies are chosen on `CHOICE`, the page reports `REPORT`, and
 no scene is in both. `blind` everywhere; the paper's protocol on the made scenes of the report, two units each.

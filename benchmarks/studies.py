@@ -149,7 +149,8 @@ def command(
     only: Mapping[str, Sequence[str]] | None = None,
     rows: str | None = None,
 ) -> int:
-    """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl, or ROWS.jsonl.
+    """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl or ROWS.jsonl, those of another set than
+    the first, whose page it is, to SCRIPT-SET.jsonl.
 
     Args:
         script: Its name, and that of its part of the page.
@@ -178,7 +179,10 @@ def command(
         parser.add_argument("--set", choices=list(sets), default=next(iter(sets)), help="of scenes")
     args = parser.parse_args()
     scenes = sets[args.set] if sets else None
-    results = ROOT / "benchmarks" / f"{rows or script}.jsonl"
+    if sets and args.page and args.set != next(iter(sets)):
+        parser.error(f"--page is of --set {next(iter(sets))}, got {args.set}; drop one of them")
+    name = f"{script}-{args.set}" if sets and args.set != next(iter(sets)) else rows or script
+    results = ROOT / "benchmarks" / f"{name}.jsonl"
     for path in args.merge:
         for row in read_study(path):
             append_row(results, row)

@@ -677,6 +677,25 @@ def test_a_page_comes_from_its_rows(monkeypatch):
     assert text in (root / "docs" / "active-static.md").read_text()
 
 
+def test_a_set_of_scenes_has_rows_of_its_own(monkeypatch, capsys):
+    """Those of the set of the page go beside it, those of another set elsewhere; the page is of its set alone."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    active, studies = importlib.import_module("active"), importlib.import_module("studies")
+    monkeypatch.setattr(active, "distinct_seeds", lambda study, scene, split, count: list(range(count)))
+    written = []
+    monkeypatch.setattr(studies, "run_cells", lambda study, cells, runs, rows, say: written.append(rows) or ([], {}))
+    for chosen in ([], ["--set", "choice"]):
+        monkeypatch.setattr(sys, "argv", ["active.py", "--seeds", "1", *chosen])
+        assert active.main() == 0
+    assert [path.name for path in written] == ["active.jsonl", "active-choice.jsonl"]
+    before = active.PAGE.read_bytes()
+    monkeypatch.setattr(sys, "argv", ["active.py", "--page", "--set", "choice"])
+    with pytest.raises(SystemExit, match="2"):
+        active.main()
+    assert "--page is of --set report, got choice" in capsys.readouterr().err
+    assert active.PAGE.read_bytes() == before
+
+
 def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
     """Whatever has run: all ten policies on a unit before the next, each scene's first unit before any second one, the
     paper's protocol on the first room alone; every cell's configs are legal and all differ.
