@@ -114,7 +114,8 @@ def study_of(scale: str, runs: Path) -> Study:
         metrics=METRICS,
         reference="random",
         comparisons=tuple(
-            (WINNER, other) for other in ("farthest", "uniform", "fisherrf", "eig", "eig, with backdrop")
+            (WINNER, other)
+            for other in ("farthest", "uniform", "fisherrf", "eig", "block_logdet", "v_opt", "eig, with backdrop")
         ),
     )
 

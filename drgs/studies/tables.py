@@ -164,8 +164,8 @@ def _means(study: Study, rows: StudyRows) -> str:
             cells.append(f"{mean} ({np.mean(list(middle.values())):.{metric.digits}f})" if middle else mean)
         seconds = [x for row in rows if row["policy"] == label and (x := row["pick_seconds"]) is not None]
         count = len({unit_of(row) for row in rows if row["policy"] == label})
-        lines.append([label, *cells, f"{np.mean(seconds):.2f}" if seconds else "none", str(count)])
-    heads = ["policy", *(_title(metric) for metric in study.metrics), "seconds a pick", "units"]
+        lines.append([label, *cells, f"{np.median(seconds):.2f}" if seconds else "none", str(count)])
+    heads = ["policy", *(_title(metric) for metric in study.metrics), "seconds a pick (median)", "units"]
     return markdown_table(heads, lines)
 
 
