@@ -1,4 +1,6 @@
-"""The picture of a study: a metric against the number of views, a panel a scene, a line a policy."""
+"""The picture of a study: a metric against the number of views, a panel for each scene, a line for each policy; black is what
+the study compares with others.
+"""
 
 from __future__ import annotations
 
@@ -45,17 +47,17 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
     figure, axes = plt.subplots(lines, columns, figsize=(_SIZE * columns, _SIZE * lines), dpi=100, squeeze=False)
     for axis in axes.flat[len(scenes) :]:
         axis.set_axis_off()
-    colors = plt.get_cmap("tab20")
+    colors, judged = plt.get_cmap("tab20"), {policy for policy, _ in study.comparisons}
     for axis, scene in zip(axes.flat, scenes, strict=False):
         mine = [row for row in rows if row["scene"] == scene]
         for number, label in enumerate(study.policies):
             found = [(count, values_of(at_views(mine, count), metric.key, label)) for count in counts]
             points = [(count, float(np.mean(list(values.values())))) for count, values in found if values]
             if points:
-                style = "--" if label == study.reference else "-"
-                axis.plot(
-                    *zip(*points, strict=True), style, color=colors(number % 20), lw=1.2, ms=3, marker="o", label=label
-                )
+                style: dict[str, Any] = {"ls": "--" if label == study.reference else "-", "color": colors(number % 20)}
+                if label in judged:
+                    style |= {"color": "black", "lw": 2.2, "zorder": 3}
+                axis.plot(*zip(*points, strict=True), **({"lw": 1.2} | style), ms=3, marker="o", label=label)
         axis.set(title=scene, xlabel="views", xticks=counts)
         axis.set_ylabel(metric.title if axis in axes[:, 0] else "")
         axis.grid(lw=0.3)
