@@ -14,7 +14,7 @@ from drgs import fisher
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.gain import Prior, information_gain, variances
 from drgs.information.backdrop import CELLS, Sphere, backdrop_cells, backdrop_sphere
-from drgs.select import select
+from drgs.select import Cache, select
 from drgs.settings import RenderSettings
 
 SETTINGS = RenderSettings.preset("exact")
@@ -164,6 +164,10 @@ def test_masks_hide_what_is_behind(blob, ring):
     ask = lambda **x: select(blob, candidates, train, blocks=blocks, prior=Prior(1e-2), **x).scores  # noqa: E731
     assert ask(masks=[left])[0] > 10 * ask()[0]
     assert ask(masks=[left], empty_outside=True) == ask()
+    cache = Cache()
+    for empty in (True, False):  # two answers about one view, which a cache keeps apart
+        want = pytest.approx(ask(masks=[left], empty_outside=empty), rel=1e-6)
+        assert ask(masks=[left], empty_outside=empty, cache=cache) == want
 
 
 def test_z_scores_know_the_backdrop(blob, ring):
