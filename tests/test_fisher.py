@@ -145,6 +145,20 @@ def test_fisherrf_is_its_formula(direction):
         assert error(found[name], x) <= 1e-4, name
 
 
+@pytest.mark.parametrize("logit", [2.0, 30.0, 38.0, 42.0])
+def test_fisherrf_of_opaque_gaussians(logit):
+    """Divided by alpha (1 - alpha) also where alpha rounds to 1: of gray, 9 times one channel's square over that."""
+    g, cam, _, _, _ = _one(K=1)
+    gray = g.detach().replace(logit_opacities=torch.full((len(g),), logit))
+    gray = gray.replace(sh=gray.sh[..., :1].abs().expand(-1, -1, 3).contiguous())
+    settings = Preset("fast", alpha_max=1.0)
+    theirs = fisher.diagonal(gray, cam, settings, "fisherrf")["logit_opacities"]
+    red = fisher.diagonal(gray, cam, settings, channel_weights=(1.0, 0.0, 0.0))["logit_opacities"]
+    slope = math.exp(-logit) / (1 + math.exp(-logit)) ** 2
+    assert float(red.max()) > 0
+    torch.testing.assert_close(theirs, 9 * red / slope, rtol=1e-4, atol=1e-4 * 9 * float(red.max()) / slope)
+
+
 def test_fisherrf_loses_what_cancels_between_channels():
     """Red above and blue below the background by as much: the sum over channels does not move, the image does."""
     settings = Preset("exact", background=(0.5, 0.5, 0.5))
