@@ -109,6 +109,16 @@ def test_the_policy_paints_on_the_sphere(blob, ring):
     assert not torch.equal(on, fisher.variance_map(solid, ring[3], weights, SETTINGS))
 
 
+def test_cameras_with_a_lens(blob, ring):
+    """The radius is that of their pinhole pictures; views with a lens are chosen by default where rays are traced."""
+    bent = [dataclasses.replace(camera, model="opencv", distortion=(0.05, 0.0, 0.0, 0.0)) for camera in ring]
+    solid = blob.replace(logit_opacities=blob.logit_opacities + 5)
+    assert backdrop_sphere(solid, bent) == backdrop_sphere(solid, ring)
+    found = select(solid, bent[2:], bent[:2], settings=RenderSettings.preset("exact", traversal="bvh"))
+    assert found.blocks == ["geometry", "backdrop"]
+    assert min(found.scores) > 0
+
+
 def test_information_is_the_squared_derivative(blob, ring):
     """An image is linear in the background, with 1 - alpha; what a view says adds up over its pixels and over views."""
     camera, lit = ring[0], SETTINGS.replace(background=(1.0, 1.0, 1.0))
