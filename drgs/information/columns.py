@@ -96,14 +96,13 @@ def by_columns(
     """
     result = {}
     scale = torch.tensor(weights, dtype=torch.float64)
-    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.double()
+    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
     for name, group in wanted.items():
         shape, squares = group.tangent(gaussians), []
         rows = np.argwhere(np.ones(shape))
         for start in range(0, len(rows), _BATCH):
             index = {name: rows[start : start + _BATCH]}
-            columns = jacobian_columns(scene or gaussians, camera, index, settings).double()
-            columns = columns * factor.to(columns.device)[..., None]
+            columns = jacobian_columns(scene or gaussians, camera, index, settings).cpu().double() * factor[..., None]
             told = torch.zeros(len(columns), dtype=torch.float64)
             if group.outputs == (0, 3):
                 told += (columns[..., :3].square() * scale).sum((1, 2, 3))
@@ -112,7 +111,7 @@ def by_columns(
             elif group.outputs != (0, 3):
                 told += columns[..., 3:].square().sum((1, 2, 3))
             squares.append(told)
-        result[name] = group.merge(torch.cat(squares).reshape(shape).cpu())
+        result[name] = group.merge(torch.cat(squares).reshape(shape))
     return result
 
 
