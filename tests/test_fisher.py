@@ -76,6 +76,24 @@ def test_small_entries_are_as_right_as_large_ones():
     assert float(((found - truth) / truth)[seen].abs().max()) < 1e-4
 
 
+@pytest.mark.parametrize(("response", "order", "traversal"), [kind[:3] for kind in KINDS[:6]])
+def test_rotations_of_spheres(response, order, traversal):
+    """They change nothing, to the last bit, which an H + lambda of 0 would divide by; those of what is 1 % off a sphere
+    do, by their own relative accuracy.
+    """
+    settings = _settings(response, order, traversal)
+    g, cam, _ = dense.scene(np.random.default_rng(3), settings, K=1)
+    sphere = g.detach().replace(log_scales=g.log_scales.detach()[:, :1].expand(-1, 3).contiguous())
+    assert not fisher.diagonal(sphere, cam, settings)["rotations"].any()
+    assert not fisher.blocks(sphere, cam, settings)[:, 3:6].any()
+    nearly = sphere.replace(log_scales=sphere.log_scales + torch.tensor([0.0, 0.005, 0.01]))
+    for x in nearly.parameters().values():
+        x.requires_grad_()
+    truth = dense.squares(dense.jacobian(nearly, reference.render(nearly, cam, settings)))["rotations"]
+    assert 0 < float(truth.max()) < 1e-3
+    assert error(fisher.diagonal(nearly, cam, settings)["rotations"], truth) <= 1e-4
+
+
 def _one(K=4, seed=5, direction="gaussian", **options):
     settings = Preset("exact", sh_direction=direction)
     g, cam, out = dense.scene(np.random.default_rng(seed), settings, K=K, **options)

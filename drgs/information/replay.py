@@ -149,11 +149,14 @@ class Replay:
             return None
         lib, call, inputs, moved = self.lib, self.call, self.inputs, []
         axes = [("means", _unit(k)) for k in range(3)] + [("quats", _unit(k)) for k in range(3)]
+        sizes = call.inputs["log_scales"]
+        sphere = (sizes == sizes[:, :1]).all(1)
         for name, axis in [*axes, *(("log_scales", _unit(k)) for k in range(3))]:
             x = call.inputs[name]
             tangent = torch.tensor(axis, dtype=torch.float64, device=x.device).expand(self.count, 3)
             if name == "quats":
-                tangent = 0.5 * quaternion_product(tangent, x.double())
+                # A sphere's rotation changes nothing, not even by rounding.
+                tangent = 0.5 * quaternion_product(tangent, x.double()) * ~sphere[:, None]
             dr.enable_grad(inputs[name])
             dr.set_grad(inputs[name], to_drjit(lib, tangent.to(x.dtype)))
             _, arguments = call.prepare(inputs)
