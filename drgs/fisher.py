@@ -310,7 +310,8 @@ def variance_map(
     Args:
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `backdrop`,
-            (1536, 3), is that of the color behind what the Gaussians leave open.
+            (1536, 3), is that of the color behind what the Gaussians leave open. Those above 3e32, as lambda = 0 makes
+            them of what was hardly seen, count as 3e32.
         sphere: As for `backdrop`.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)

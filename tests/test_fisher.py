@@ -14,6 +14,7 @@ from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
 from drgs.cameras import Camera
+from drgs.gain import Prior, variances
 from drgs.settings import RenderSettings
 
 Preset = RenderSettings.preset
@@ -236,6 +237,25 @@ def test_variance_map(direction):
     inverse = {name: torch.where(x > 1e-8, 1 / x, 0) for name, x in exact.items()}
     seen = sum(int((x > 1e-8).sum()) for x in exact.values())
     assert abs(float(fisher.variance_map(g, cam, inverse, settings).double().sum()) / seen - 1) < 1e-4
+
+
+@pytest.mark.parametrize("direction", ["gaussian", "ray"])
+def test_variance_without_lambda(direction):
+    """Of what is all but transparent H is 1e-38 and 1 / H beyond float32: the map is finite all the same, its sum at
+    most the number of parameters seen, and infinite weights are refused, those of SH along rays, too.
+    """
+    g, cam, settings, _, _ = _one(direction=direction)
+    settings = Preset("fast", sh_direction=direction, alpha_min=0.0)
+    for logit in (-30.0, -42.0, -44.0):
+        faint = g.detach().replace(logit_opacities=torch.full((len(g),), logit))
+        weights = variances(fisher.diagonal(faint, cam, settings), Prior(0.0))
+        found = fisher.variance_map(faint, cam, weights, settings)
+        assert bool(torch.isfinite(found).all())
+        assert float(found.sum()) <= 1.01 * sum(int((x > 0).sum()) for x in weights.values())
+    assert float(max(x.max() for x in weights.values())) > 1e38
+    weights["sh"][0, 0, 0] = math.inf
+    with pytest.raises(ValueError, match="weights must be finite, got NaN or Inf; raise lambda above 0"):
+        fisher.variance_map(faint, cam, weights, settings)
 
 
 def test_channel_weights():
