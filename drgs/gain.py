@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -77,8 +78,10 @@ class Prior:
 
     def __post_init__(self) -> None:
         for name, value in (("value", self.value), *self.groups.items()):
-            if not (isinstance(value, (int, float)) and 0 <= value < math.inf):
+            if not (isinstance(value, numbers.Real) and 0 <= value < math.inf):
                 raise ValueError(f"Prior: lambda ({name}) must be in [0, inf), got {value!r}; try 1e-6")
+        if not isinstance(self.value, (int, float)):  # NumPy's, which no file holds
+            object.__setattr__(self, "value", float(self.value))
 
     @classmethod
     def given(cls, value: float | None, relative: bool) -> Prior | None:

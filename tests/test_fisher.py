@@ -318,6 +318,18 @@ def test_nothing_to_see():
         (lambda g, c: fisher.diagonal(g, c, channel_weights=(1, -1, 1)), "channel_weights must be 3"),
         (lambda g, c: fisher.blocks(g, c, channel_weights=(1, -1, 1)), "channel_weights must be 3"),
         (lambda g, c: fisher.diagonal(g, c, method="probes", probes=0), "probes must be >= 1"),
+        (lambda g, c: fisher.diagonal(g, c, method="probes", probes=2.5), "probes must be >= 1 and whole, got 2.5"),
+        (lambda g, c: fisher.blocks(g, []), "fisher.blocks: there must be at least one camera, got none; pass one"),
+        (lambda g, c: fisher.backdrop(g, c, channel_weights=(1,)), r"fisher.backdrop: channel_weights must .*; e.g. "),
+        (
+            lambda g, c: fisher.diagonal(g, c, method="fisherrf", groups=["rotations"]),
+            "fisherrf must have more than rot",
+        ),
+        (
+            lambda g, c: fisher.jacobian_columns(g, c, {"means": [(0, 1.9)]}),
+            r"rows of 2 integers below .*\[\(0, 1.9\)\]",
+        ),
+        (lambda g, c: fisher.jacobian_columns(g, c, {"means": [(0, 1), (2,)]}), r"got \[\(0, 1\), \(2,\)\]; use whole"),
         (lambda g, c: fisher.variance_map(g, c, {"features": torch.ones(5)}), "weights must be of backdrop, means"),
         (lambda g, c: fisher.jacobian_columns(g, c, {"means": [(9, 0)]}), "index of means must be rows of 2"),
         (lambda g, c: fisher.jacobian_columns(g, c, {"scales": [(0, 0)]}), "must be one of means"),

@@ -490,6 +490,21 @@ def test_cache_computes_what_it_cannot_recognize(kind):
         assert select(moving, line(range(3)), line([5.0]), cache=cache, information=counter).computed == 4
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policy": "moments"}, "select: information must be None with policy moments, got some; use fisher"),
+        ({"policy": "random"}, "information must be None with policy random"),
+        ({"combine": "zscore"}, "combine and network must be left out with information, got zscore"),
+        ({"network": "trace"}, "combine and network must be left out with information, got trace"),
+    ],
+)
+def test_what_means_nothing_beside_information_is_refused(options, message):
+    """It was dropped in silence."""
+    with pytest.raises(ValueError, match=message):
+        select(scene(), line(range(3)), line([5.0]), information=_Counter(), **options)
+
+
 class _Here:
     """Workers that answer in this process, as they are asked."""
 

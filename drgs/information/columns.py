@@ -51,8 +51,7 @@ def jacobian_columns(
     chosen = []
     for name, rows in index.items():
         shape = _tangent_shape(seen, name, gaussians)
-        rows = np.asarray(rows, np.int64)
-        rows = rows[:, None] if rows.ndim == 1 else rows
+        rows = _whole(name, rows, shape)
         if rows.ndim != 2 or rows.shape[1] != len(shape) or (rows < 0).any() or (rows >= shape).any():
             raise ValueError(
                 f"fisher.jacobian_columns: index of {name} must be rows of {len(shape)} integers below {shape}, got "
@@ -113,6 +112,21 @@ def by_columns(
             squares.append(told)
         result[name] = group.merge(torch.cat(squares).reshape(shape))
     return result
+
+
+def _whole(name: str, rows: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Rows of integers as an array; a single axis are rows of one."""
+    try:
+        found = np.asarray(rows)
+    except ValueError:  # rows of several lengths
+        found = np.empty(0, object)
+    if found.dtype.kind not in "iu" and (found.size or found.dtype == object):
+        raise ValueError(
+            f"fisher.jacobian_columns: index of {name} must be rows of {len(shape)} integers below {shape}, got "
+            f"{rows!r:.60}; use whole numbers, as many in each row"
+        )
+    found = found.astype(np.int64)
+    return found[:, None] if found.ndim == 1 else found
 
 
 def _tangent_shape(gaussians: Gaussians, name: str, scene: Scene) -> tuple[int, ...]:
