@@ -24,14 +24,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
-import numpy as np
 import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.doors import Masks, camera_list, check_any_scene, check_scene, check_view, gaussians_at, mask_list
+from drgs.guards.doors import (
+    Masks,
+    check_any_scene,
+    check_scene,
+    check_view,
+    gaussians_at,
+    mask_list,
+    some_cameras,
+    three_weights,
+)
 from drgs.information.backdrop import CELLS, Sphere, backdrop_information, backdrop_sphere, backdrop_variance
 from drgs.information.columns import by_columns, jacobian_columns
 from drgs.information.groups import GROUPS, Group, Information, groups_of
@@ -128,14 +136,14 @@ def diagonal(
             Gaussians of a scene are not as many in all views.
     """
     backgrounds: list[tuple[float, ...]] = []
-    weights, channels = _weights(channel_weights), 3
+    weights, channels = three_weights("fisher.diagonal", channel_weights), 3
     if splats or isinstance(gaussians, torch.Tensor):
         scene = _scene_of_tensors(gaussians, cameras, splats)
         settings = settings or RenderSettings.preset("gsplat")
         gaussians, cameras, backgrounds, channels = scene.gaussians, scene.cameras, scene.backgrounds, scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
     check_any_scene("fisher.diagonal", gaussians)
-    cameras = _cameras("fisher.diagonal", cameras)
+    cameras = some_cameras("fisher.diagonal", cameras)
     seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
     check_scene("fisher.diagonal", seen, settings)
     settings = settings or RenderSettings.preset("exact")
@@ -197,13 +205,19 @@ def _checked_groups(wanted: dict[str, Group], method: str, semantics: SemanticMe
     if semantics is not None and method == "fisherrf":
         raise ValueError("fisher.diagonal: method fisherrf must have no semantics, got some; it is about colors only")
     for name, group in wanted.items():
-        known = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
-        if group.owner == "scene" and method not in known:
+        methods = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
+        if group.owner == "scene" and method not in methods:
             raise ValueError(
-                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, known))}, got {method!r}; "
+                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, methods))}, got {method!r}; "
                 "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
             )
-    return {name: group for name, group in wanted.items() if method != "fisherrf" or group.fisherrf}
+    known = {name: group for name, group in wanted.items() if method != "fisherrf" or group.fisherrf}
+    if wanted and not known:
+        raise ValueError(
+            f"fisher.diagonal: groups of method fisherrf must have more than {', '.join(wanted)}, which it does not "
+            "know; name another one, or use method exact"
+        )
+    return known
 
 
 @alone
@@ -225,6 +239,7 @@ def blocks(
     cameras = _cameras_of("fisher.blocks", gaussians, cameras, settings)
     settings = settings or RenderSettings.preset("exact")
     count = len(gaussians_at("fisher.blocks", gaussians, cameras[0]))
+    weights = three_weights("fisher.blocks", channel_weights)
     total = torch.zeros(count, BLOCK, BLOCK, dtype=torch.float64)
     for camera, mask in zip(cameras, mask_list("fisher.blocks", masks, cameras), strict=True):
         seen = gaussians_at("fisher.blocks", gaussians, camera)
@@ -232,7 +247,7 @@ def blocks(
         if semantics is not None:
             semantics.check("fisher.blocks", seen)
         if len(seen):
-            total += Replay(seen, camera, settings, semantics=semantics, mask=mask).blocks(_weights(channel_weights))
+            total += Replay(seen, camera, settings, semantics=semantics, mask=mask).blocks(weights)
     return total
 
 
@@ -284,7 +299,8 @@ def backdrop(
             f"fisher.backdrop: seen_opacity must be of the {len(cameras)} views and their sizes, got "
             f"{[tuple(x.shape) for x in seen_opacity]}; pass what diagonal found of the same views"
         )
-    settings, weights = settings or RenderSettings.preset("exact"), _weights(channel_weights)
+    settings = settings or RenderSettings.preset("exact")
+    weights = three_weights("fisher.backdrop", channel_weights)
     total = torch.zeros(CELLS, 3, dtype=torch.float64)
     known: Sequence[torch.Tensor | None] = seen_opacity or [None] * len(cameras)
     for camera, mask, opacity in zip(cameras, mask_list("fisher.backdrop", masks, cameras), known, strict=True):
@@ -310,7 +326,8 @@ def variance_map(
     Args:
         gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `backdrop`,
-            (1536, 3), is that of the color behind what the Gaussians leave open.
+            (1536, 3), is that of the color behind what the Gaussians leave open. Those above 3e32, as lambda = 0 makes
+            them of what was hardly seen, count as 3e32.
         sphere: As for `backdrop`.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
@@ -332,7 +349,8 @@ def variance_map(
     behind = weights.get("backdrop")
     if behind is not None and not bool(torch.isfinite(behind).all()):
         raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
-    weights, factors = {name: x for name, x in weights.items() if name != "backdrop"}, _weights(channel_weights)
+    weights = {name: x for name, x in weights.items() if name != "backdrop"}
+    factors = three_weights("fisher.variance_map", channel_weights)
     found = torch.zeros(camera.height, camera.width)
     if len(seen) and weights:
         found = Replay(seen, camera, settings, semantics=semantics).variance(weights, factors)
@@ -353,17 +371,10 @@ def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings 
     return flat @ flat.T
 
 
-def _cameras(where: str, cameras: object) -> list[Camera]:
-    cameras = camera_list(where, "cameras", cameras)
-    if not cameras:
-        raise ValueError("fisher: there must be at least one camera, got none")
-    return cameras
-
-
 def _cameras_of(where: str, scene: object, cameras: object, settings: RenderSettings | None) -> list[Camera]:
     """The cameras, if these are a scene and settings, too."""
     check_any_scene(where, scene)
-    cameras = _cameras(where, cameras)
+    cameras = some_cameras(where, cameras)
     check_scene(where, gaussians_at(where, scene, cameras[0]), settings)
     return cameras
 
@@ -375,13 +386,3 @@ def _check_same(where: str, name: str, total: torch.Tensor, shape: tuple[int, ..
             f"{where}: a scene must have as many Gaussians and coefficients in all views, got {name} of shape "
             f"{tuple(total.shape)} in the first and {shape} in another; take views of one time"
         )
-
-
-def _weights(channel_weights: Sequence[float]) -> list[float]:
-    try:
-        weights = [float(x) for x in channel_weights]
-    except (TypeError, ValueError):
-        weights = []
-    if len(weights) != 3 or not all(np.isfinite(weights)) or min(weights) < 0:
-        raise ValueError(f"fisher: channel_weights must be 3 finite numbers >= 0, got {channel_weights}")
-    return weights

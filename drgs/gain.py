@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,6 +25,7 @@ import torch
 from drgs.guards.arguments import must_be
 from drgs.information.chain import Chain, dense
 from drgs.information.choices import METHODS
+from drgs.information.determinants import ROUNDING, log_determinants
 
 __all__ = [
     "BLOCK_LAYOUT",
@@ -54,7 +56,6 @@ BLOCK_LAYOUT = {
 
 BLOCKS = "blocks"  # the name under which blocks (N, 13, 13) travel as an Information
 
-_ROUNDING = 1e-6  # relative to the diagonal: what float32 sums leave of an eigenvalue that is 0, on a real scene
 _CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is twice as fast
 
 
@@ -77,8 +78,10 @@ class Prior:
 
     def __post_init__(self) -> None:
         for name, value in (("value", self.value), *self.groups.items()):
-            if not (isinstance(value, (int, float)) and 0 <= value < math.inf):
+            if not (isinstance(value, numbers.Real) and 0 <= value < math.inf):
                 raise ValueError(f"Prior: lambda ({name}) must be in [0, inf), got {value!r}; try 1e-6")
+        if not isinstance(self.value, (int, float)):  # NumPy's, which no file holds
+            object.__setattr__(self, "value", float(self.value))
 
     @classmethod
     def given(cls, value: float | None, relative: bool) -> Prior | None:
@@ -172,7 +175,7 @@ def scorer(
 ) -> Callable[[Information], Gain]:
     """`information_gain` against a fixed H: what does not depend on the candidate is done once.
 
-    Neither H nor candidates are searched for NaN here, see `check`; a score that is not finite raises all the same.
+    Candidates are not searched for negative entries, see `check`; NaN or inf in them raises as the score is not finite.
     """
     if criterion not in CRITERIA:
         raise ValueError(f"information_gain: criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}")
@@ -195,8 +198,9 @@ def variances(train: Information, prior: Prior | None = None) -> dict[str, torch
     """1 / (H + l) a parameter, 0 where both are 0: what `drgs.fisher.variance_map` weighs a pixel's derivatives by.
 
     Raises:
-        ValueError: If the prior names a group that H does not have.
+        ValueError: If the prior names a group that H does not have, or an entry of H is negative, NaN or infinite.
     """
+    check("variances", train)  # else what is broken had the variance of what is perfectly known
     lambdas, result = (prior or Prior()).per_group(train), {}
     for name, H in train.items():
         precision = H.to(torch.float64) + lambdas[name]
@@ -225,22 +229,19 @@ def check(where: str, information: Information, criterion: str = "eig") -> None:
 # -------------------------------------------------- parameters taken as independent
 
 
-def _eig(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-    return ratio
-
-
-def _logdet(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-    return ratio.log1p_()
-
-
 def _trace_cov(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-    # 1/a - 1/(a + c) = (1/a) / (1 + a/c): no difference of nearly equal numbers; c = 0 gives 1 / inf.
-    return ratio.reciprocal_().add_(1).reciprocal_().mul_(variance)
+    # 1/a - 1/(a + c) = (1/a) r / (1 + r), r = c/a: no difference of nearly equal numbers; r = inf gives NaN.
+    return ratio.div_(ratio + 1).mul_(variance)
 
 
 # Criterion -> what a parameter adds, of Hc / (H + l), which it may overwrite, and 1 / (H + l); float64. Of `v_opt` the
 # second is P / (H + l).
-_TERMS = {"v_opt": _trace_cov, "eig": _eig, "logdet": _logdet, "trace_cov": _trace_cov}
+_TERMS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
+    "v_opt": _trace_cov,
+    "eig": lambda ratio, variance: ratio,
+    "logdet": lambda ratio, variance: ratio.log1p_(),
+    "trace_cov": _trace_cov,
+}
 CRITERIA = (*_TERMS, "block_logdet")
 """Names of the criteria; `drgs.select` chooses by the first unless told otherwise."""
 
@@ -279,13 +280,18 @@ class _Diagonal:
                 seen_or_not += float(terms.sum())
                 only_unseen += float(terms @ is_unseen)
             parts[name], unseen[name] = weight * seen_or_not, weight * only_unseen
-        total = math.fsum(parts.values()) if all(map(math.isfinite, parts.values())) else math.nan
-        if not math.isfinite(total):
-            raise ValueError(
-                f"information_gain: {self.criterion} must be finite, got {parts}; H + lambda is too small for float64, "
-                "raise lambda or check the information for NaN"
-            )
-        return Gain(total, parts, dict(self.left_out), unseen)
+        return Gain(_total(self.criterion, parts), parts, dict(self.left_out), unseen)
+
+
+def _total(criterion: str, parts: dict[str, float]) -> float:
+    """The sum of the parts, which must be finite."""
+    total = math.fsum(parts.values()) if all(map(math.isfinite, parts.values())) else math.nan
+    if not math.isfinite(total):
+        raise ValueError(
+            f"information_gain: {criterion} must be finite, got {parts}; H + lambda is too small for float64, "
+            "raise lambda or check the information for NaN"
+        )
+    return total
 
 
 def _told(candidate: torch.Tensor) -> torch.Tensor | Any:
@@ -319,7 +325,7 @@ def block_gain(
     train: torch.Tensor,
     prior: Prior | None = None,
     layout: Mapping[str, slice] | None = None,
-    rounding: float = _ROUNDING,
+    rounding: float = ROUNDING,
 ) -> Gain:
     """sum_i logdet(I + (H_i + L)^-1 Hc_i): what `logdet` becomes when the parameters of a Gaussian are not independent.
 
@@ -344,7 +350,7 @@ def block_gain(
 class _Blocks:
     """Scores of candidates against one block a Gaussian."""
 
-    def __init__(self, train: torch.Tensor, prior: Prior, layout: Mapping[str, slice], rounding: float = _ROUNDING):
+    def __init__(self, train: torch.Tensor, prior: Prior, layout: Mapping[str, slice], rounding: float = ROUNDING):
         if train.ndim != 3 or train.shape[1] != train.shape[2]:
             raise ValueError(
                 f"block_gain: train must have shape (N, B, B), got {tuple(train.shape)}; use fisher.blocks"
@@ -353,38 +359,15 @@ class _Blocks:
             raise ValueError(
                 f"block_gain: layout must cover 0..{train.shape[1] - 1} once, got {dict(layout)}; correct it"
             )
-        self.rounding, self.H = rounding, train.to(torch.float64)
-        diagonal = self.H.diagonal(dim1=1, dim2=2)
+        self.rounding, self.H = rounding, train
+        diagonal = train.diagonal(dim1=1, dim2=2).to(torch.float64)
         lambdas = prior.per_group({name: diagonal[:, place] for name, place in layout.items()})
         self.added = torch.empty(train.shape[1], dtype=torch.float64)
         for name, place in layout.items():
             self.added[place] = lambdas[name]
-        self.keep = diagonal + self.added > 0
+        self.keep = diagonal + self.added != 0  # NaN and what is negative stay, to be refused
         self.left_out = {name: int((~self.keep[:, place]).sum()) for name, place in layout.items()}
-        self.before, self.repaired = self._logdet(self.H)
-
-    def _logdet(self, H: torch.Tensor) -> tuple[torch.Tensor, int]:
-        """(N,) log determinants of H + L without what is left out, and how many blocks needed help."""
-        diagonal = H.diagonal(dim1=1, dim2=2) * (1 + self.rounding) + self.added
-        scale = torch.where(self.keep, diagonal.rsqrt(), 0.0)
-        # Units differ by many powers of ten; with 1 on the diagonal Cholesky loses none of the small ones.
-        A = scale[:, :, None] * (0.5 * (H + H.mT)) * scale[:, None, :]
-        A.diagonal(dim1=1, dim2=2).fill_(1.0)
-        factor, failed = torch.linalg.cholesky_ex(A)
-        bad = failed.nonzero()[:, 0]
-        repaired, ridge = len(bad), _ROUNDING
-        while len(bad):
-            if ridge > 1e-2:  # a percent of the diagonal is not rounding any more
-                raise ValueError(
-                    f"block_gain: H + lambda must be positive definite, but is not for Gaussian {int(bad[0])}; "
-                    "raise lambda or pass blocks that are sums of outer products"
-                )
-            again = A[bad]
-            again.diagonal(dim1=1, dim2=2).add_(ridge)
-            factor[bad], failed = torch.linalg.cholesky_ex(again)
-            bad, ridge = bad[failed > 0], 10 * ridge
-        logs = 2 * factor.diagonal(dim1=1, dim2=2).log() + torch.where(self.keep, diagonal, 1.0).log()
-        return logs.sum(1), repaired
+        self.before, self.repaired = log_determinants([train], self.keep, self.added, rounding)
 
     def __call__(self, candidate: Information) -> Gain:
         """The gain of one candidate."""
@@ -394,7 +377,8 @@ class _Blocks:
                 f"block_gain: candidate must have the shape of train, {tuple(self.H.shape)}, got {tuple(Hc.shape)}; "
                 "use the same Gaussians for both"
             )
-        after, repaired = self._logdet(self.H + Hc)
+        after, repaired = log_determinants([self.H, Hc], self.keep, self.added, self.rounding)
         gains = after - self.before
-        total, unseen = float(gains.sum()), float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())
-        return Gain(total, {BLOCKS: total}, dict(self.left_out), {BLOCKS: unseen}, self.repaired + repaired)
+        parts = {BLOCKS: float(gains.sum())}
+        unseen = {BLOCKS: float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())}
+        return Gain(_total("block_logdet", parts), parts, dict(self.left_out), unseen, self.repaired + repaired)

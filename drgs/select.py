@@ -79,7 +79,7 @@ def select(
             to be empty (block `backdrop`).
         cache: Where to look for and keep information of single views.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
-            Not done where scores can rise (a relative lambda, or lambda = 0).
+            Not done where scores can rise (a relative lambda, lambda = 0, or z-scores).
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
@@ -105,12 +105,15 @@ def select(
         raise ValueError("select: masks must be None with information, got both; it knows by itself what views tell")
     if workers is not None and information is not None:
         raise ValueError("select: workers must be None with information, got both; a function is called here")
+    scored = _scoring(scoring, fields)
+    if information is not None:
+        _check_beside(policy, scored)
     pool = Pool(
         scene=gaussians,
         candidates=candidates,
         train=train,
         k=k,
-        scoring=_scoring(scoring, fields),
+        scoring=scored,
         rng=rng or _GENERATOR,
         masks=mask_list("select", masks, train),
         empty_outside=empty_outside,
@@ -123,6 +126,18 @@ def select(
     selection = chosen(pool)
     selection.seconds = time.perf_counter() - started
     return selection
+
+
+def _check_beside(policy: str, scoring: Scoring) -> None:
+    """Refuse what means nothing beside information of one's own, which would be dropped in silence."""
+    asks = ("fisher", "fisherrf", "coverage")
+    if policy in POLICIES and policy not in asks:
+        raise ValueError(f"select: information must be None with policy {policy}, got some; use {', '.join(asks)}")
+    if scoring.combine is not None or scoring.network != "ratio":
+        raise ValueError(
+            "select: combine and network must be left out with information, got "
+            f"{scoring.combine or scoring.network}; its groups are scored together, by criterion"
+        )
 
 
 def policy_named(name: str) -> Callable[[Pool], Selection]:

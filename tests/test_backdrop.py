@@ -14,7 +14,7 @@ from drgs import fisher
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.gain import Prior, information_gain, variances
 from drgs.information.backdrop import CELLS, Sphere, backdrop_cells, backdrop_sphere
-from drgs.select import select
+from drgs.select import Cache, select
 from drgs.settings import RenderSettings
 
 SETTINGS = RenderSettings.preset("exact")
@@ -109,6 +109,16 @@ def test_the_policy_paints_on_the_sphere(blob, ring):
     assert not torch.equal(on, fisher.variance_map(solid, ring[3], weights, SETTINGS))
 
 
+def test_cameras_with_a_lens(blob, ring):
+    """The radius is that of their pinhole pictures; views with a lens are chosen by default where rays are traced."""
+    bent = [dataclasses.replace(camera, model="opencv", distortion=(0.05, 0.0, 0.0, 0.0)) for camera in ring]
+    solid = blob.replace(logit_opacities=blob.logit_opacities + 5)
+    assert backdrop_sphere(solid, bent) == backdrop_sphere(solid, ring)
+    found = select(solid, bent[2:], bent[:2], settings=RenderSettings.preset("exact", traversal="bvh"))
+    assert found.blocks == ["geometry", "backdrop"]
+    assert min(found.scores) > 0
+
+
 def test_information_is_the_squared_derivative(blob, ring):
     """An image is linear in the background, with 1 - alpha; what a view says adds up over its pixels and over views."""
     camera, lit = ring[0], SETTINGS.replace(background=(1.0, 1.0, 1.0))
@@ -164,6 +174,10 @@ def test_masks_hide_what_is_behind(blob, ring):
     ask = lambda **x: select(blob, candidates, train, blocks=blocks, prior=Prior(1e-2), **x).scores  # noqa: E731
     assert ask(masks=[left])[0] > 10 * ask()[0]
     assert ask(masks=[left], empty_outside=True) == ask()
+    cache = Cache()
+    for empty in (True, False):  # two answers about one view, which a cache keeps apart
+        want = pytest.approx(ask(masks=[left], empty_outside=empty), rel=1e-6)
+        assert ask(masks=[left], empty_outside=empty, cache=cache) == want
 
 
 def test_z_scores_know_the_backdrop(blob, ring):

@@ -240,6 +240,23 @@ def test_fits_begin_again_where_views_show_more(tmp_path, rng):
     assert starts("never") == starts("always", "all") == ([None] * 3,) * 3
 
 
+def test_a_sure_start_asks_for_no_guesses(tmp_path, rng, monkeypatch):
+    """Where the answer is to go on, only the count that is recorded is found, the same as ever."""
+    views, config = plane_views(tmp_path, rng, count=4), FitConfig(max_pixels=10**6, max_gaussians=3000, max_steps=10)
+
+    def told(restart, began):
+        plan = ActiveViews(ActiveConfig(initial=2, add=2, every=1, restart=restart), views, config)
+        plan.chosen, plan.picks, plan._began = [0, 1, 2], [{"index": 2}], began
+        return plan.new_start() is not None, plan.picks[0]
+
+    again, record = told("auto", 999)
+    assert again
+    assert record["restarted"]
+    assert record["triangulated"] > 100
+    monkeypatch.setattr("drgs.data.points.points_beside", None)
+    assert told("auto", 1000) == (False, record | {"restarted": False})
+
+
 def test_triangulation_stays_inside_the_masks(tmp_path, rng):
     """Features outside the masks are dropped."""
 

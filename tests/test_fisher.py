@@ -14,6 +14,7 @@ from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
 from drgs.cameras import Camera
+from drgs.gain import Prior, variances
 from drgs.settings import RenderSettings
 
 Preset = RenderSettings.preset
@@ -74,6 +75,24 @@ def test_small_entries_are_as_right_as_large_ones():
     found = fisher.diagonal(g, cam, settings)["means"]
     seen = truth[:, 2] > 1e-6 * truth[:, 2].max()
     assert float(((found - truth) / truth)[seen].abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize(("response", "order", "traversal"), [kind[:3] for kind in KINDS[:6]])
+def test_rotations_of_spheres(response, order, traversal):
+    """They change nothing, to the last bit, which an H + lambda of 0 would divide by; those of what is 1 % off a sphere
+    do, by their own relative accuracy.
+    """
+    settings = _settings(response, order, traversal)
+    g, cam, _ = dense.scene(np.random.default_rng(3), settings, K=1)
+    sphere = g.detach().replace(log_scales=g.log_scales.detach()[:, :1].expand(-1, 3).contiguous())
+    assert not fisher.diagonal(sphere, cam, settings)["rotations"].any()
+    assert not fisher.blocks(sphere, cam, settings)[:, 3:6].any()
+    nearly = sphere.replace(log_scales=sphere.log_scales + torch.tensor([0.0, 0.005, 0.01]))
+    for x in nearly.parameters().values():
+        x.requires_grad_()
+    truth = dense.squares(dense.jacobian(nearly, reference.render(nearly, cam, settings)))["rotations"]
+    assert 0 < float(truth.max()) < 1e-3
+    assert error(fisher.diagonal(nearly, cam, settings)["rotations"], truth) <= 1e-4
 
 
 def _one(K=4, seed=5, direction="gaussian", **options):
@@ -145,6 +164,20 @@ def test_fisherrf_is_its_formula(direction):
         assert error(found[name], x) <= 1e-4, name
 
 
+@pytest.mark.parametrize("logit", [2.0, 30.0, 38.0, 42.0])
+def test_fisherrf_of_opaque_gaussians(logit):
+    """Divided by alpha (1 - alpha) also where alpha rounds to 1: of gray, 9 times one channel's square over that."""
+    g, cam, _, _, _ = _one(K=1)
+    gray = g.detach().replace(logit_opacities=torch.full((len(g),), logit))
+    gray = gray.replace(sh=gray.sh[..., :1].abs().expand(-1, -1, 3).contiguous())
+    settings = Preset("fast", alpha_max=1.0)
+    theirs = fisher.diagonal(gray, cam, settings, "fisherrf")["logit_opacities"]
+    red = fisher.diagonal(gray, cam, settings, channel_weights=(1.0, 0.0, 0.0))["logit_opacities"]
+    slope = math.exp(-logit) / (1 + math.exp(-logit)) ** 2
+    assert float(red.max()) > 0
+    torch.testing.assert_close(theirs, 9 * red / slope, rtol=1e-4, atol=1e-4 * 9 * float(red.max()) / slope)
+
+
 def test_fisherrf_loses_what_cancels_between_channels():
     """Red above and blue below the background by as much: the sum over channels does not move, the image does."""
     settings = Preset("exact", background=(0.5, 0.5, 0.5))
@@ -204,6 +237,25 @@ def test_variance_map(direction):
     inverse = {name: torch.where(x > 1e-8, 1 / x, 0) for name, x in exact.items()}
     seen = sum(int((x > 1e-8).sum()) for x in exact.values())
     assert abs(float(fisher.variance_map(g, cam, inverse, settings).double().sum()) / seen - 1) < 1e-4
+
+
+@pytest.mark.parametrize("direction", ["gaussian", "ray"])
+def test_variance_without_lambda(direction):
+    """Of what is all but transparent H is 1e-38 and 1 / H beyond float32: the map is finite all the same, its sum at
+    most the number of parameters seen, and infinite weights are refused, those of SH along rays, too.
+    """
+    g, cam, settings, _, _ = _one(direction=direction)
+    settings = Preset("fast", sh_direction=direction, alpha_min=0.0)
+    for logit in (-30.0, -42.0, -44.0):
+        faint = g.detach().replace(logit_opacities=torch.full((len(g),), logit))
+        weights = variances(fisher.diagonal(faint, cam, settings), Prior(0.0))
+        found = fisher.variance_map(faint, cam, weights, settings)
+        assert bool(torch.isfinite(found).all())
+        assert float(found.sum()) <= 1.01 * sum(int((x > 0).sum()) for x in weights.values())
+    assert float(max(x.max() for x in weights.values())) > 1e38
+    weights["sh"][0, 0, 0] = math.inf
+    with pytest.raises(ValueError, match="weights must be finite, got NaN or Inf; raise lambda above 0"):
+        fisher.variance_map(faint, cam, weights, settings)
 
 
 def test_channel_weights():
@@ -266,6 +318,18 @@ def test_nothing_to_see():
         (lambda g, c: fisher.diagonal(g, c, channel_weights=(1, -1, 1)), "channel_weights must be 3"),
         (lambda g, c: fisher.blocks(g, c, channel_weights=(1, -1, 1)), "channel_weights must be 3"),
         (lambda g, c: fisher.diagonal(g, c, method="probes", probes=0), "probes must be >= 1"),
+        (lambda g, c: fisher.diagonal(g, c, method="probes", probes=2.5), "probes must be >= 1 and whole, got 2.5"),
+        (lambda g, c: fisher.blocks(g, []), "fisher.blocks: there must be at least one camera, got none; pass one"),
+        (lambda g, c: fisher.backdrop(g, c, channel_weights=(1,)), r"fisher.backdrop: channel_weights must .*; e.g. "),
+        (
+            lambda g, c: fisher.diagonal(g, c, method="fisherrf", groups=["rotations"]),
+            "fisherrf must have more than rot",
+        ),
+        (
+            lambda g, c: fisher.jacobian_columns(g, c, {"means": [(0, 1.9)]}),
+            r"rows of 2 integers below .*\[\(0, 1.9\)\]",
+        ),
+        (lambda g, c: fisher.jacobian_columns(g, c, {"means": [(0, 1), (2,)]}), r"got \[\(0, 1\), \(2,\)\]; use whole"),
         (lambda g, c: fisher.variance_map(g, c, {"features": torch.ones(5)}), "weights must be of backdrop, means"),
         (lambda g, c: fisher.jacobian_columns(g, c, {"means": [(9, 0)]}), "index of means must be rows of 2"),
         (lambda g, c: fisher.jacobian_columns(g, c, {"scales": [(0, 0)]}), "must be one of means"),

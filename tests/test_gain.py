@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scenes_random import camera, gaussians
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from drgs import reference
 from drgs.gain import (
@@ -100,6 +101,8 @@ def test_prior():
     H = {"means": torch.tensor([0.0, 1.0, 3.0, 100.0]).double(), "sh": torch.zeros(3).double()}
     assert Prior(0.5, groups={"sh": 2}).per_group(H) == {"means": 0.5, "sh": 2.0}
     assert Prior(0.5, relative=True).per_group(H) == {"means": 1.5, "sh": 0.0}
+    assert Prior(np.float32(0.5)).to_json() == {"value": 0.5, "relative": False} == Prior(0.5).to_json()
+    assert type(Prior(np.float32(0.5)).value) is float
     found = variances(H, Prior(0.5, relative=True))
     assert found["means"].tolist() == pytest.approx([1 / 1.5, 1 / 2.5, 1 / 4.5, 1 / 101.5])
     assert found["sh"].tolist() == [0, 0, 0]
@@ -223,6 +226,32 @@ def test_singular_blocks(rng):
         block_gain(Hc, 2 * torch.ones(30, 13, 13) - torch.eye(13), Prior(1e-6))
 
 
+class _Largest(TorchDispatchMode):
+    """Bytes of the largest tensor that is made."""
+
+    bytes = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        for x in made if isinstance(made, tuple) else (made,):
+            if isinstance(x, torch.Tensor) and not x._is_view():
+                self.bytes = max(self.bytes, x.nbytes)
+        return made
+
+
+def test_blocks_are_scored_some_at_a_time(rng):
+    """In memory that does not grow with their number, to the bits of each alone; a bad one is named by its place."""
+    few = 100
+    H, Hc = (random_blocks(rng, few).float().repeat(100, 1, 1) for _ in range(2))
+    with _Largest() as largest:
+        gain = block_gain(Hc, H, Prior(1e-3))
+    assert largest.bytes < 8 * 169 * len(H) / 2
+    assert gain.total == pytest.approx(100 * block_gain(Hc[:few], H[:few], Prior(1e-3)).total, rel=1e-12)
+    H[-3] = 2 - torch.eye(13)
+    with pytest.raises(ValueError, match=f"is not for Gaussian {len(H) - 3}; raise lambda"):
+        block_gain(Hc, H, Prior(1e-6))
+
+
 def test_empty():
     """No Gaussians: nothing to gain."""
     none = {"means": torch.zeros(0, 3).double(), "sh": torch.zeros(0, 1, 3).double()}
@@ -281,6 +310,29 @@ def test_errors(rng):
         block_gain(random_blocks(rng, 19), random_blocks(rng))
     with pytest.raises(ValueError, match=r"train must have shape \(N, B, B\), got \(3, 4\)"):
         block_gain(torch.zeros(3, 4), torch.zeros(3, 4))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -5.0])
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_what_is_broken_is_not_known(rng, criterion, value):
+    """Nobody has checked before: NaN, inf or a negative entry of H is no perfectly known parameter, and NaN or inf of a
+    candidate no gain.
+    """
+    if criterion == "block_logdet":
+        H, name, place = {"blocks": random_blocks(rng)}, "blocks", (3, 4, 4)
+    else:
+        H, name, place = random_information(rng), "means", (3, 2)
+    bad = {**H, name: H[name].clone()}
+    bad[name][place] = value
+    pool = H if criterion == "v_opt" else None
+    with pytest.raises(ValueError, match=r"must be (finite|positive definite)"):
+        scorer(bad, criterion, pool=pool)(H)
+    if math.isinf(value) or math.isnan(value):
+        with pytest.raises(ValueError, match=r"must be (finite|positive definite)"):
+            scorer(H, criterion, pool=pool)(bad)
+    if name == "means":
+        with pytest.raises(ValueError, match=rf"must be finite and >= 0, got {value:g} in means at \(3, 2\)"):
+            variances(bad)
 
 
 # -------------------------------------------------- the chain

@@ -68,6 +68,17 @@ def test_halves_add_up(what, rng):
         torch.testing.assert_close(one[name] + other[name], x, rtol=1e-5, atol=1e-6 * float(x.abs().max()))
 
 
+@pytest.mark.parametrize("method", ["exact", "columns", "probes"])
+def test_masks_in_a_graph(method, rng):
+    """Information is a number on the CPU, also where a mask is something that is learned."""
+    g, cam = gaussians(rng, 3, 1, scale=0.25).detach(), camera(rng, (6, 5))
+    mask = soft(rng, cam)
+    ask = lambda x: fisher.diagonal(g, cam, method=method, probes=2, groups=["means"], masks=[x])["means"]  # noqa: E731
+    found = ask(mask.clone().requires_grad_())
+    assert (found.requires_grad, found.device.type) == (False, "cpu")
+    torch.testing.assert_close(found, ask(mask))
+
+
 def test_probes_know_masks(rng):
     """One channel of one pixel, or half of its light, is one row of J, of which random signs lose nothing."""
     g, cam = gaussians(rng, 6, 1, scale=0.25).detach(), camera(rng, (12, 10))

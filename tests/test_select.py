@@ -490,6 +490,40 @@ def test_cache_computes_what_it_cannot_recognize(kind):
         assert select(moving, line(range(3)), line([5.0]), cache=cache, information=counter).computed == 4
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policy": "moments"}, "select: information must be None with policy moments, got some; use fisher"),
+        ({"policy": "random"}, "information must be None with policy random"),
+        ({"combine": "zscore"}, "combine and network must be left out with information, got zscore"),
+        ({"network": "trace"}, "combine and network must be left out with information, got trace"),
+    ],
+)
+def test_what_means_nothing_beside_information_is_refused(options, message):
+    """It was dropped in silence."""
+    with pytest.raises(ValueError, match=message):
+        select(scene(), line(range(3)), line([5.0]), information=_Counter(), **options)
+
+
+class _Here:
+    """Workers that answer in this process, as they are asked."""
+
+    def each(self, scene, views):
+        return (question(scene, camera, mask) for question, camera, mask in views)
+
+
+@pytest.mark.parametrize("kind", [_Fresh, _Plain, lambda g: g])
+def test_workers_answer_each_view_of_what_a_cache_does_not_recognize(world, kind):
+    """Also one that comes twice: no view gets the answer of the next one."""
+    g, *views, _ = world
+    train, (a, b, c, *_) = ([dataclasses.replace(camera, time=0.0) for camera in some] for some in views)
+    ask = {"settings": RenderSettings.preset("fast"), "criterion": "eig", "blocks": ("geometry",)}
+    wanted = select(g, [a, a, b, c], train, **ask).scores
+    found = select(kind(g), [a, a, b, c], train, cache=Cache(), workers=_Here(), **ask)
+    assert found.scores == pytest.approx(wanted, rel=1e-6)
+    assert found.scores[0] != found.scores[2]
+
+
 def test_cache_does_not_keep_the_gaussians():
     """A cache outlives the state it was made for; the tensors must not."""
     g, cache = scene(), Cache()

@@ -13,7 +13,7 @@ from drgs.data.guesses import scene_extent
 from drgs.data.llff import load_llff
 from drgs.data.multicamera import find_camera_folders, frame_folders, load_cameras
 from drgs.data.neu3d import POSES_BOUNDS, find_posed_frames, find_videos, load_neu3d
-from drgs.data.points import added_points, initial_points, triangulated_points
+from drgs.data.points import added_points, initial_points, triangulated_count, triangulated_points
 from drgs.data.replica import POSES, load_replica
 from drgs.data.semantics import Semantics, attach
 from drgs.data.train_meta import META, load_train_meta
@@ -31,6 +31,7 @@ __all__ = [
     "initial_points",
     "load",
     "scene_extent",
+    "triangulated_count",
     "triangulated_points",
 ]
 

@@ -23,7 +23,7 @@ from drgs.display.progress import Bar
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.ply_lists import ply_source
 
-__all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_points"]
+__all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_count", "triangulated_points"]
 
 _MIN_TRIANGULATED = 50
 _ENOUGH = 2_000  # triangulated points that need no others beside them
@@ -122,6 +122,13 @@ def triangulated_points(
     keep = subset(found, max_points - guesses, rng)
     more, more_colors = points_beside(views, points, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
+
+
+def triangulated_count(
+    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
+) -> int:
+    """The third value of `triangulated_points` alone."""
+    return len(_triangulated(views, matches, progress)[0])
 
 
 def _all_at_first(data: Dataset) -> list[View]:

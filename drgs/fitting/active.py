@@ -191,7 +191,7 @@ class ActiveViews:
         What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. But to
         begin again loses what was learned. So `auto` does it until a start has had enough triangulated points.
         """
-        from drgs.data import triangulated_points
+        from drgs.data import triangulated_count, triangulated_points
 
         seen, restart = [self.views[i] for i in self.chosen], self.active.restart
         dense = any(view.depth_path is not None for view in seen)
@@ -202,10 +202,13 @@ class ActiveViews:
         with Bar("points of all views") as bar:
             if began is None:  # the first call: what is matched here is kept for the next one
                 start = seen[: len(self.timetable.start)]
-                began = triangulated_points(start, seed, room, self._matches, bar.stage)[2] if len(start) > 1 else 0
-                self._began = began
+                began = self._began = triangulated_count(start, self._matches, bar.stage) if len(start) > 1 else 0
+            if restart == "auto" and began >= _SURE:  # it goes on: nobody needs the points
+                found = triangulated_count(seen, self._matches, bar.stage)
+                self.picks[-1] |= {"triangulated": found, "restarted": False}
+                return None
             points, colors, found = triangulated_points(seen, seed, room, self._matches, bar.stage)
-        again = len(points) > 0 and (restart == "always" or began < _SURE)
+        again = len(points) > 0
         self.picks[-1] |= {"triangulated": found, "restarted": again}
         return (torch.from_numpy(points), torch.from_numpy(colors)) if again else None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ __all__ = [
     "check_view",
     "gaussians_at",
     "mask_list",
+    "some_cameras",
+    "three_weights",
 ]
 
 Masks = Sequence[torch.Tensor | None] | None
@@ -81,6 +84,27 @@ def camera_list(where: str, name: str, cameras: Any) -> list[Camera]:
     for index, camera in enumerate(cameras):
         must_be(where, f"{name}[{index}]", camera, Camera, _CAMERA)
     return cameras
+
+
+def some_cameras(where: str, cameras: Any) -> list[Camera]:
+    """The same, at least one."""
+    found = camera_list(where, "cameras", cameras)
+    if not found:
+        raise ValueError(f"{where}: there must be at least one camera, got none; pass one or more")
+    return found
+
+
+def three_weights(where: str, channel_weights: Any) -> list[float]:
+    """Those of R, G and B, finite and >= 0."""
+    try:
+        weights = [float(x) for x in channel_weights]
+    except (TypeError, ValueError):
+        weights = []
+    if len(weights) != 3 or not all(math.isfinite(x) and x >= 0 for x in weights):
+        raise ValueError(
+            f"{where}: channel_weights must be 3 finite numbers >= 0, got {channel_weights}; e.g. (1, 1, 1)"
+        )
+    return weights
 
 
 def mask_list(where: str, masks: Any, cameras: Sequence[Camera]) -> list[torch.Tensor | None]:

@@ -82,7 +82,8 @@ def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) ->
     from drgs.integrator import render
 
     with torch.no_grad():
-        plain, small = colors_only(scene, camera.time), at_most(camera, _PIXELS)
+        # Without its lens, which tiles do not know: what is wanted is how far away things are, about.
+        plain, small = colors_only(scene, camera.time), at_most(camera.undistorted(), _PIXELS)
         # `fast` measures depth along the ray, `ewa` along the axis of the camera.
         out = render(plain, small, RenderSettings.preset("fast"), outputs=("median_depth",))
     assert out.median_depth is not None

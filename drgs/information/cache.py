@@ -45,6 +45,10 @@ class Cache:
         self._views.clear()
         self._scene = None
 
+    def recognizes(self, scene: Scene) -> bool:
+        """Whether a scene is taken for itself when it comes again, so that what is stored for it is found."""
+        return _State(scene).is_still(scene)
+
     def has(self, scene: Scene, key: Hashable) -> bool:
         """Whether `get` would find something stored."""
         return self._scene is not None and self._scene.is_still(scene) and key in self._views

@@ -51,8 +51,7 @@ def jacobian_columns(
     chosen = []
     for name, rows in index.items():
         shape = _tangent_shape(seen, name, gaussians)
-        rows = np.asarray(rows, np.int64)
-        rows = rows[:, None] if rows.ndim == 1 else rows
+        rows = _whole(name, rows, shape)
         if rows.ndim != 2 or rows.shape[1] != len(shape) or (rows < 0).any() or (rows >= shape).any():
             raise ValueError(
                 f"fisher.jacobian_columns: index of {name} must be rows of {len(shape)} integers below {shape}, got "
@@ -96,14 +95,13 @@ def by_columns(
     """
     result = {}
     scale = torch.tensor(weights, dtype=torch.float64)
-    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.double()
+    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
     for name, group in wanted.items():
         shape, squares = group.tangent(gaussians), []
         rows = np.argwhere(np.ones(shape))
         for start in range(0, len(rows), _BATCH):
             index = {name: rows[start : start + _BATCH]}
-            columns = jacobian_columns(scene or gaussians, camera, index, settings).double()
-            columns = columns * factor.to(columns.device)[..., None]
+            columns = jacobian_columns(scene or gaussians, camera, index, settings).cpu().double() * factor[..., None]
             told = torch.zeros(len(columns), dtype=torch.float64)
             if group.outputs == (0, 3):
                 told += (columns[..., :3].square() * scale).sum((1, 2, 3))
@@ -112,8 +110,23 @@ def by_columns(
             elif group.outputs != (0, 3):
                 told += columns[..., 3:].square().sum((1, 2, 3))
             squares.append(told)
-        result[name] = group.merge(torch.cat(squares).reshape(shape).cpu())
+        result[name] = group.merge(torch.cat(squares).reshape(shape))
     return result
+
+
+def _whole(name: str, rows: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Rows of integers as an array; a single axis are rows of one."""
+    try:
+        found = np.asarray(rows)
+    except ValueError:  # rows of several lengths
+        found = np.empty(0, object)
+    if found.dtype.kind not in "iu" and (found.size or found.dtype == object):
+        raise ValueError(
+            f"fisher.jacobian_columns: index of {name} must be rows of {len(shape)} integers below {shape}, got "
+            f"{rows!r:.60}; use whole numbers, as many in each row"
+        )
+    found = found.astype(np.int64)
+    return found[:, None] if found.ndim == 1 else found
 
 
 def _tangent_shape(gaussians: Gaussians, name: str, scene: Scene) -> tuple[int, ...]:

@@ -232,7 +232,7 @@ def asked_of(
 
     Args:
         scoring: As `drgs.select` takes it.
-        blocks: `scoring.blocks_of` the scene; empty where it is unknown what the information is about.
+        blocks: `scoring.blocks_of` the scene, at least one.
         metric: Of the block `semantic`.
         sphere: Of the block `backdrop`.
     Raises:

@@ -61,9 +61,12 @@ class ViewInformation:
         pool, wanted, seen = self.pool, [], set()
         if pool.workers is None:
             return
+        cache = pool.cache
+        if cache is not None and not cache.recognizes(pool.scene):
+            cache = None  # which finds nothing then, not even of a view that comes twice
         for camera, is_known, mask in views:
             question, key = self._key(camera, is_known, mask)
-            if pool.cache is None or not (key in seen or pool.cache.has(pool.scene, key)):
+            if cache is None or not (key in seen or cache.has(pool.scene, key)):
                 wanted.append((question, camera, mask))
             seen.add(key)
         self._coming = pool.workers.each(pool.scene, wanted)

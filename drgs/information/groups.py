@@ -79,8 +79,9 @@ def _turned(slope: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
 
 
 def _opacity_slope(inputs: dict) -> torch.Tensor:
-    opacity = inputs["logit_opacities"].cpu().double().sigmoid()
-    return (opacity * (1 - opacity)).clamp_min(1e-300)  # divided by: 0 where the sigmoid rounds to 1
+    # opacity (1 - opacity), without the cancellation by which it is 0 from a logit of 37 on, where squares are not.
+    e = (-inputs["logit_opacities"].cpu().double().abs()).exp()
+    return (e / (1 + e).square()).clamp_min(1e-300)  # divided by: 0 beyond a logit of 745
 
 
 # Colors are linear: dC_c / d sh_kc = w Y_k, 0 where the color is clamped.

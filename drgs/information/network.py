@@ -26,7 +26,6 @@ References:
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -35,7 +34,15 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import Masks, camera_list, check_any_scene, check_view, gaussians_at, mask_list
+from drgs.guards.doors import (
+    Masks,
+    check_any_scene,
+    check_view,
+    gaussians_at,
+    mask_list,
+    some_cameras,
+    three_weights,
+)
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.probes import Pullback
@@ -94,7 +101,7 @@ def network(
     moving, groups = _checked(where, scene, estimate, mode, probes)
     total = {name: torch.zeros(_size(own) if estimate == "diagonal" else (), dtype=torch.float64)
              for name, own in groups.items()}  # fmt: skip
-    views = _cameras(where, cameras)
+    views = some_cameras(where, cameras)
     for camera, mask in zip(views, mask_list(where, masks, views), strict=True):
         view = _View.of(where, moving, camera, settings, channel_weights, semantics, mask)
         if view is None:
@@ -187,7 +194,7 @@ class _View:
         check_view(where, seen, camera, settings)
         if not len(seen) or not camera.width * camera.height:
             return None
-        scales = _channel_scales(where, channel_weights)
+        scales = torch.tensor(three_weights(where, channel_weights), dtype=torch.float64).sqrt()
         deformed: DeformableScene = scene
         if semantics is None:
             seen = seen.replace(features=None)
@@ -335,21 +342,3 @@ def _checked(
             "Gaussians and of other networks"
         )
     return scene, groups
-
-
-def _cameras(where: str, cameras: object) -> list[Camera]:
-    found = camera_list(where, "cameras", cameras)
-    if not found:
-        raise ValueError(f"{where}: there must be at least one camera, got none; pass one or more")
-    return found
-
-
-def _channel_scales(where: str, weights: Sequence[float]) -> torch.Tensor:
-    """(3,) float64 square roots of the weights."""
-    try:
-        values = [float(x) for x in weights]
-    except (TypeError, ValueError):
-        values = []
-    if len(values) != 3 or not all(math.isfinite(x) and x >= 0 for x in values):
-        raise ValueError(f"{where}: channel_weights must be 3 finite numbers >= 0, got {weights}; e.g. (1, 1, 1)")
-    return torch.tensor(values, dtype=torch.float64).sqrt()

@@ -43,8 +43,8 @@ def by_probes(
         scene: Where the Gaussians come from: all groups are of this scene then.
         mask: (H, W) what the image is multiplied by; None: 1.
     """
-    if probes < 1:
-        raise ValueError(f"fisher.diagonal: probes must be >= 1, got {probes}")
+    if not (isinstance(probes, int) and probes >= 1):
+        raise ValueError(f"fisher.diagonal: probes must be >= 1 and whole, got {probes!r}; try 16")
     other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
     groups = {name: group for name, group in groups.items() if name not in other}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}

@@ -31,6 +31,8 @@ __all__ = ["Replay"]
 
 _TABLED = 4  # channels whose tables are worth their memory
 _BESIDE = 16  # semantic channels of one traversal, beside the colors
+_FLOAT_MAX = torch.finfo(torch.float32).max
+_MOST = 1e-6 * _FLOAT_MAX  # of a weight, so that what few of them add up to is no inf, which times 0 were NaN
 
 
 class Walk(NamedTuple):
@@ -149,11 +151,14 @@ class Replay:
             return None
         lib, call, inputs, moved = self.lib, self.call, self.inputs, []
         axes = [("means", _unit(k)) for k in range(3)] + [("quats", _unit(k)) for k in range(3)]
+        sizes = call.inputs["log_scales"]
+        sphere = (sizes == sizes[:, :1]).all(1)
         for name, axis in [*axes, *(("log_scales", _unit(k)) for k in range(3))]:
             x = call.inputs[name]
             tangent = torch.tensor(axis, dtype=torch.float64, device=x.device).expand(self.count, 3)
             if name == "quats":
-                tangent = 0.5 * quaternion_product(tangent, x.double())
+                # A sphere's rotation changes nothing, not even by rounding.
+                tangent = 0.5 * quaternion_product(tangent, x.double()) * ~sphere[:, None]
             dr.enable_grad(inputs[name])
             dr.set_grad(inputs[name], to_drjit(lib, tangent.to(x.dtype)))
             _, arguments = call.prepare(inputs)
@@ -252,11 +257,9 @@ class Replay:
             # Squared weights w^2 are of one color each, then of all other channels.
             first = GEOMETRY + 3 if name == "features" else group.entries[0]
             table[:, first : first + spread.shape[1]] = spread
-        if not torch.isfinite(table).all():
-            raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
-        buffer = to_drjit(lib, table.float().reshape(-1).to(self.call.home)).array
+        buffer = self._weights(table)
         image = dr.zeros(lib.Float, self.call.pixels)
-        light = None if self.light is None else to_drjit(lib, self.light.float().reshape(-1).to(self.call.home)).array
+        light = None if self.light is None else self._weights(self.light)
         for walk in self._walks(weights):
             sink = Variance(
                 buffer, walk.weights, light if walk.first else None, walk.first and "features" in information
@@ -264,7 +267,13 @@ class Replay:
             for state, at, inside in zip(self._replay(walk, sink), walk.part.flat, walk.part.inside, strict=True):
                 dr.scatter_add(image, state["variance"], at, inside)
             dr.eval(image)
-        return image.torch().cpu().reshape(self.call.shape)
+        return image.torch().cpu().clamp_max(_FLOAT_MAX).reshape(self.call.shape)
+
+    def _weights(self, weights: torch.Tensor) -> Float:
+        """Weights of `variance` on the device."""
+        if not torch.isfinite(weights).all():
+            raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
+        return to_drjit(self.lib, weights.clamp_max(_MOST).float().reshape(-1).to(self.call.home)).array
 
     def sh_information(self, squares: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2, times (3,) weights; call after `sums`."""

@@ -85,7 +85,9 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
     settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
 
     def by(asked: Sequence[Asked]) -> InformationSource:
-        return Questions(settings, tuple(asked), pool.empty_outside), (settings, *asked)
+        # The key is all of the question: what is empty outside of a mask is another answer.
+        question = Questions(settings, tuple(asked), pool.empty_outside)
+        return question, question
 
     if own := pool.information:
         source: InformationSource = (lambda scene, camera, mask: own(camera)), (own, settings)

@@ -17,7 +17,7 @@ import drjit as dr
 
 from drgs.tracing import records as layout
 from drgs.tracing.protocols import Float
-from drgs.tracing.records import cross, dot
+from drgs.tracing.records import dot
 from drgs.tracing.responses.peak import Peak, approach, times
 
 if TYPE_CHECKING:
@@ -71,11 +71,11 @@ class Integral(Peak):
         passed = 0.5 + 0.5 * dr.erf(u * _ROOT_HALF)
         left = strength * gauss * dr.exp(-strength * gauss * passed)
         along, across = left * passed, left * dr.exp(-0.5 * u * u) * _BELL
-        n, v, local = (times(extra, k, p) for k in range(3))
-        ne, ve, le = (times(extra, k, e) for k in range(3))
-        turn = [a + b - u * c for a, b, c in zip(cross(v, ne), cross(ve, n), cross(ve, ne), strict=True)]
+        local, ne, le = times(extra, 1, p), times(extra, 0, e), times(extra, 1, e)
+        pairs = [((i + 1) % 3, (i + 2) % 3) for i in range(3)]
+        products = [local[j] * le[k] + local[k] * le[j] - u * le[j] * le[k] for j, k in pairs]
         scales = [2 * x * y - u * y * y for x, y in zip(local, le, strict=True)]
-        du = [*ne, *turn, *scales]
+        du = [*ne, *times(extra, 2, products), *scales]
         return [*(dr.fma(across, x, along * y) for x, y in zip(du, approach(extra, p), strict=True)), along]
 
     def least_strength(self, alpha_min: float) -> float:

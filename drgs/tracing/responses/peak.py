@@ -17,7 +17,9 @@ e = d' / |d'|. As p minimizes the distance, moving along the ray changes nothing
 
     d(-rho^2 / 2) = (p / s) . R^T dmu  +  p_k^2 dlog s_k  +  w . R (S p x S^-1 p)
 
-for a move dmu of the mean and a world-frame rotation R <- exp([w]x) R; integral.py has du.
+for a move dmu of the mean and a world-frame rotation R <- exp([w]x) R; integral.py has du. Of the product component i,
+with j and k the axes after it, is p_j p_k (s_j / s_k - s_k / s_j). That bracket is of the Gaussian, in float64: as a
+cross product in float32, the rotation of a sphere, which changes nothing, would have a derivative of 1e-7.
 """
 
 from __future__ import annotations
@@ -63,7 +65,8 @@ class Peak(AlphaStrength):
     name = "peak"
     front_only = True
     at_most_alpha = True
-    # The plane (u, v) of o' x d' in the axes that directions are stored along (6), R S^-1, R S and those axes (27).
+    # The plane (u, v) of o' x d' in the axes that directions are stored along (6), R S^-1 and those axes (18), R times
+    # the brackets of rotations (9).
     extra = 33
     by_tangents = False
 
@@ -112,11 +115,14 @@ class Peak(AlphaStrength):
         axes = axes or [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
         columns = [F(dot(f, x)) for x in plane for f in axes] if plane else [F(0)] * 6
         local = list(zip(*axes, strict=True))  # rows: local axes; columns: f
-        for weight in ([dr.rcp(s) for s in scale], scale):
-            columns += [
-                F(sum(rotation[r][k] * weight[k] * local[k][i] for k in range(3))) for r in range(3) for i in range(3)
-            ]
-        return columns + [F(local[k][i]) for k in range(3) for i in range(3)]
+        thin = [dr.rcp(s) for s in scale]
+        columns += [
+            F(sum(rotation[r][k] * thin[k] * local[k][i] for k in range(3))) for r in range(3) for i in range(3)
+        ]
+        columns += [F(local[k][i]) for k in range(3) for i in range(3)]
+        pairs = [(scale[(i + 1) % 3], scale[(i + 2) % 3]) for i in range(3)]
+        brackets = [a / b - b / a for a, b in pairs]  # exactly 0 where two scales are the same
+        return columns + [F(rotation[r][i] * brackets[i]) for r in range(3) for i in range(3)]
 
     # -- once a hit --------------------------------------------------------------------------------------------------
 
@@ -201,12 +207,15 @@ def deviation(r: list[Float], dx: Float, dy: Float, half: float) -> Float:
 
 def approach(extra: list[Float], p: list[Float]) -> list[Float]:
     """d(-rho^2 / 2) by mean, rotation and log-scale: (p / s) R^T, R (S p x S^-1 p), p_k^2."""
-    n, v, local = times(extra, 0, p), times(extra, 1, p), times(extra, 2, p)
-    return [*n, *cross(v, n), *[x * x for x in local]]
+    n, local = times(extra, 0, p), times(extra, 1, p)
+    squares, products = [x * x for x in local], [local[1] * local[2], local[2] * local[0], local[0] * local[1]]
+    return [*n, *times(extra, 2, products), *squares]
 
 
 def times(extra: list[Float], which: int, x: list[Float]) -> list[Float]:
-    """R S^-1 (0), R S (1) or 1 (2) times a vector in the stored axes: in world axes, world axes and local axes."""
+    """In world axes R S^-1 (0) times a vector in the stored axes; in local axes 1 (1) times one; in world axes R (S x x
+    S^-1 y) (2), from (x_2 y_3, x_3 y_1, x_1 y_2) in local axes, y = x or the sum of it both ways round.
+    """
     m = extra[6 + 9 * which : 15 + 9 * which]
     return [m[3 * r] * x[0] + m[3 * r + 1] * x[1] + m[3 * r + 2] * x[2] for r in range(3)]
 
