@@ -92,8 +92,7 @@ class ActiveViews:
                     f"{count}; drop it (with all views the end of the fit is measured)"
                 )
         self.chosen = list(self.timetable.start)
-        self.picks: list[dict] = []
-        self.measured: list[dict] = []
+        self.picks, self.measured = list[dict](), list[dict]()
         self.pool_leak = config.init_points == "all"
         # Photographs of another time do not say where things are at this one.
         wanted = not self.pool_leak and self.timetable.schedule == "views"
@@ -111,10 +110,8 @@ class ActiveViews:
             fitted: Block -> whether there is what it tells about.
         """
         wanted = self.active.blocks or () if self.active.policy == "fisher" else ()
-        lacks: dict[Block, str] = {
-            "semantic": "a fit without a teacher's maps",
-            "deformation": "a fit of what is still",
-        }
+        lacks: dict[Block, str] = {"semantic": "a fit without a teacher's maps"}
+        lacks["deformation"] = "a fit of what is still"
         for name, why in lacks.items():
             if name in wanted and not fitted[name]:
                 raise ValueError(f"active: blocks must be of what is fitted, got {name} for {why}; use geometry")

@@ -1,5 +1,5 @@
-"""The picture of a study: a metric against the number of views, a panel for each scene, a line for each policy; black is what
-the study compares with others.
+"""The picture of a study: a metric against the number of views, a panel for each scene, a line for each policy; black
+is what the study compares with others.
 """
 
 from __future__ import annotations
