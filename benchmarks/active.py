@@ -115,7 +115,16 @@ def study_of(scale: str, runs: Path) -> Study:
         reference="random",
         comparisons=tuple(
             (WINNER, other)
-            for other in ("farthest", "uniform", "fisherrf", "eig", "block_logdet", "v_opt", "eig, with backdrop")
+            for other in (
+                "farthest",
+                "uniform",
+                "fisherrf",
+                "eig",
+                "logdet",
+                "block_logdet",
+                "v_opt",
+                "eig, with backdrop",
+            )
         ),
     )
 

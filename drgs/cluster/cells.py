@@ -157,7 +157,7 @@ class _Round:
         return self.taken, self.failed
 
     def hand_out(self, number: int, cell: Cell, workers: list[str] | None = None) -> None:
-        """To the next worker that is free; rather to one of some, as long as these are there."""
+        """To the next worker that is free; preferably to one of `workers`, if they are named."""
         where = {"workers": workers, "allow_other_workers": True} if workers else {}
         arguments = (self.cluster.ours, self.parcel, cell, str(self.runs), str(self.token), self.topic, number)
         # An earlier cell first, also where it comes again because its worker has gone.

@@ -110,9 +110,8 @@ class ActiveViews:
             fitted: Block -> whether there is what it tells about.
         """
         wanted = self.active.blocks or () if self.active.policy == "fisher" else ()
-        lacks: dict[Block, str] = {"semantic": "a fit without a teacher's maps"}
-        lacks["deformation"] = "a fit of what is still"
-        for name, why in lacks.items():
+        lack: dict[Block, str] = {"semantic": "a fit without a teacher's maps", "deformation": "a fit of what is still"}
+        for name, why in lack.items():
             if name in wanted and not fitted[name]:
                 raise ValueError(f"active: blocks must be of what is fitted, got {name} for {why}; use geometry")
 
