@@ -64,7 +64,7 @@ SHARED = {
     "sh_basis": "the truth has its own, so that it cannot borrow from what it checks",
 }
 
-LINES = 400  # what is read in one go
+LINES = 600  # one subject, unpacked; above it a file is about two things
 
 
 @functools.cache
