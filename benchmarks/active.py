@@ -100,7 +100,7 @@ def study_of(scale: str, runs: Path) -> Study:
         name, _, seed = scene.partition("-")
         if not seed:
             return studies.DATA / scene
-        from scenes import room, still_life
+        from drgs.scenes import room, still_life
 
         made, views = {"room": (room.generate, 84), "still": (still_life.generate, 96)}[name]
         return made(runs / f"active-{scale}-{scene}", views=views, width=width, height=height, seed=int(seed))

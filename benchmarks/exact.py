@@ -50,7 +50,7 @@ LIMITS = (8, 10, 5)  # targets for `exact`, in multiples of `fast`
 def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None:
     """The Gaussians and a view of a fit, made where it is not there yet; None without its photographs."""
     if name == "still life":
-        from scenes import still_life
+        from drgs.scenes import still_life
 
         print("still life: 48 views are rendered where they are not there yet", file=sys.stderr, flush=True)
         source = still_life.generate(folder / "still-life-data", views=48, width=320, height=240, seed=1)

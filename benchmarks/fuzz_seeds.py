@@ -169,7 +169,7 @@ TRANSFORMS = (_transforms, _blender)
 
 
 def _rows() -> np.ndarray:
-    from scenes.videos import llff_rows
+    from drgs.scenes.videos import llff_rows
 
     return llff_rows(_K, np.linalg.inv(np.array(_poses())), _W, _H, np.tile([0.5, 9.0], (_VIEWS, 1)))
 
@@ -343,7 +343,7 @@ def _fit(kind: str) -> Any:
 
         scene, size, options = _FITS[kind]
         kept = _ROOT / "runs" / "fuzz" / "fits"
-        data = importlib.import_module(f"scenes.{scene}").generate(kept / scene, **_SIZE, **size)
+        data = importlib.import_module(f"drgs.scenes.{scene}").generate(kept / scene, **_SIZE, **size)
         line = [sys.executable, "-m", "drgs", "fit", str(data), "-o", str(kept / kind), *_FIT.split(), *options.split()]
         if not (kept / kind / "metrics.json").is_file():
             subprocess.run([*line, "--resume"], check=True, env={**os.environ, "PYTHONPATH": str(_ROOT)}, timeout=600)

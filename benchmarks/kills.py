@@ -30,8 +30,8 @@ from where import ran  # noqa: E402
 
 from drgs.files import Run, load_ply, load_state  # noqa: E402
 from drgs.guards import unfinished  # noqa: E402
+from drgs.scenes import kitchen, room, still_life  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
-from scenes import kitchen, room, still_life  # noqa: E402
 
 SIZE = {"width": 48, "height": 36, "spp": 2, "seed": 1}
 MAPS = {"teacher_width": 12, "teacher_height": 9}

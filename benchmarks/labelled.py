@@ -8,7 +8,7 @@ The captures are in $DRGS_DATA (../shared/data). FOLDER gets, for `drgs.data.loa
   `--offset` on, is for testing;
 - images/ (copies), semantic_class/ (0 none, k class k of classes.json), of all photographs;
 - rgb_feature_langseg/: a teacher's maps of the training photographs alone, made from their labels with the errors of
-  `scenes.teacher`; nothing is known about space, so that none of its errors are tied to places. Text embeddings;
+  `drgs.scenes.teacher`; nothing is known about space, so that none of its errors are tied to places. Text embeddings;
 - labelled.json: what was counted; and with `--mask-moving`, masks/ without the classes that move by themselves, for
   `drgs fit --mask valid`: neither colors nor features of theirs are fitted then.
 
@@ -36,7 +36,7 @@ from drgs.data import Dataset, View, load  # noqa: E402
 from drgs.data.semantics import plain_labels  # noqa: E402
 from drgs.display.progress import Bar  # noqa: E402
 from drgs.features.segmentation import scores  # noqa: E402
-from scenes import output, teacher  # noqa: E402
+from drgs.scenes import output, teacher  # noqa: E402
 
 __all__ = ["CAPTURES", "Capture", "generate"]
 

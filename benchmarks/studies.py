@@ -57,7 +57,7 @@ def folder(name: str, runs: Path) -> Path:
     """A scene's data set; the still life is made where it is not there yet."""
     if name != "still_life":
         return DATA / name
-    from scenes import still_life
+    from drgs.scenes import still_life
 
     return still_life.generate(runs / "still_life", views=40, width=240, height=180)
 

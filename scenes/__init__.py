@@ -11,7 +11,7 @@ import json
 
 import numpy as np
 
-from scenes.output import DEPTH_UNIT, write_depth, write_png
+from drgs.scenes.output import DEPTH_UNIT, write_depth, write_png
 
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes import mix, noise, ramp
+from drgs.scenes import mix, noise, ramp
 
 __all__ = ["art", "cloth", "leaf", "outdoors", "panel", "planks", "plaster", "rug", "spines", "wood"]
 

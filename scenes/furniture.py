@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes import box, fabrics, grid, join, ramp, revolve, spline, tube, turned
+from drgs.scenes import box, fabrics, grid, join, ramp, revolve, spline, tube, turned
 
 __all__ = [
     "bookcase", "cabinet", "chair", "coffee_table", "curtain", "door", "flat", "floor_lamp", "moved", "pendant",

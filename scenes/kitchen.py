@@ -11,7 +11,7 @@ Files, in the layout of Neu3D:
   length in pixels; nearest and farthest depth in frame 0,
 - semantic_class/camNN/semantic_class_TTTT.png: class of the surface at the pixel's center, 8-bit, no anti-aliasing;
   classes.json names them, 0 is unlabelled; moving_classes.json lists the names of those that move,
-- rgb_feature_langseg/camNN_TTTT_fmap_CxHxW.pt: the teacher's features (512, h, w) float16, `scenes.teacher`, with
+- rgb_feature_langseg/camNN_TTTT_fmap_CxHxW.pt: the teacher's features (512, h, w) float16, `drgs.scenes.teacher`, with
   text_embeddings.npy, (classes, 512), and how often the teacher is right in teacher.json,
 - frame0/: a COLMAP data set of frame 0: images/camNN.png, sparse/0 (model, text; points: `scenes.colmap`; cam00 has a
   pose, but no point comes from it nor is observed by it),
@@ -28,11 +28,10 @@ from pathlib import Path
 
 import numpy as np
 
-import scenes
-from drgs import runtime
-from scenes import fabrics, labelled, moving, output, tabletop, teacher, videos
-from scenes.colmap import SparsePoints, back_project, sparse_points, write_model
-from scenes.moving import MOVING, Mover
+from drgs import runtime, scenes
+from drgs.scenes import fabrics, labelled, moving, output, tabletop, teacher, videos
+from drgs.scenes.colmap import SparsePoints, back_project, sparse_points, write_model
+from drgs.scenes.moving import MOVING, Mover
 
 __all__ = ["CLASSES", "CONFUSIONS", "MOVING", "Stage", "arc", "generate", "intrinsics", "parts"]
 
@@ -316,7 +315,7 @@ def generate(
     Raises:
         ValueError: If a number is out of range or `out_dir` holds something else.
     """
-    where = "scenes.kitchen"
+    where = "drgs.scenes.kitchen"
     values = {"cameras": cameras, "times": times, "width": width, "height": height, "spp": spp, "seed": seed}
     values |= {"teacher_width": teacher_width, "teacher_height": teacher_height}
     output.check_numbers(values, where)

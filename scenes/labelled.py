@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-import scenes
-from drgs import runtime
+from drgs import runtime, scenes
 
 __all__ = ["build", "class_file", "intrinsics"]
 

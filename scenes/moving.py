@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from scenes import fabrics, grid, mix, noise, ramp, revolve, spline, tube
-from scenes.furniture import GLAZE, MATTE, METAL, SATIN
+from drgs.scenes import fabrics, grid, mix, noise, ramp, revolve, spline, tube
+from drgs.scenes.furniture import GLAZE, MATTE, METAL, SATIN
 
 __all__ = ["MOVING", "Mover", "jelly", "mug", "orange", "tongs", "towel"]
 

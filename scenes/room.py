@@ -10,7 +10,7 @@ Files, in COLMAP's layout as Feature 3DGS reads it:
 - semantic_class/semantic_class_NNN.png: class of the surface at the pixel's center, 8-bit, no anti-aliasing;
   classes.json names them, 0 is unlabelled,
 - depth/depth_NNN.png: 16-bit z-depth in tenths of a millimeter,
-- rgb_feature_langseg/rgb_NNN_fmap_CxHxW.pt: the teacher's features (512, h, w) float16, `scenes.teacher`, with
+- rgb_feature_langseg/rgb_NNN_fmap_CxHxW.pt: the teacher's features (512, h, w) float16, `drgs.scenes.teacher`, with
   text_embeddings.npy, (classes, 512), and how often the teacher is right in teacher.json,
 - test_views.txt: names of the test views, those that `drgs fit --test-every 5` holds out (or the N of
   `drgs scene room --test-every N`); params.json.
@@ -23,10 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
-import scenes
-from scenes import fabrics, furniture, labelled, output, teacher
-from scenes.colmap import back_project, sparse_points, write_model
-from scenes.furniture import MATTE, SATIN, moved, moved_parts, slab
+from drgs import scenes
+from drgs.scenes import fabrics, furniture, labelled, output, teacher
+from drgs.scenes.colmap import back_project, sparse_points, write_model
+from drgs.scenes.furniture import MATTE, SATIN, moved, moved_parts, slab
 
 __all__ = ["CLASSES", "TEST_EVERY", "Layout", "generate", "parts", "scene", "trajectory"]
 
@@ -206,7 +206,7 @@ def _clear(built, poses):
                 break
             pose[:2, 3] *= 0.85
         else:
-            raise RuntimeError("scenes.room: the middle of the room must be free, it is not; choose another seed")
+            raise RuntimeError("drgs.scenes.room: the middle of the room must be free, it is not; choose another seed")
     return out
 
 
@@ -314,7 +314,7 @@ def generate(
     Raises:
         ValueError: If a number is out of range or `out_dir` holds something else.
     """
-    where = "scenes.room"
+    where = "drgs.scenes.room"
     values = {"views": views, "width": width, "height": height, "spp": spp, "seed": seed}
     values |= {"teacher_width": teacher_width, "teacher_height": teacher_height}
     output.check_numbers(values | {"test_every": test_every}, where)

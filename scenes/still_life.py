@@ -19,10 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-import scenes
-from drgs import runtime
+from drgs import runtime, scenes
 from drgs.display.progress import Bar
-from scenes import box, grid, join, mix, noise, output, ramp, revolve, spline, tube, turned
+from drgs.scenes import box, grid, join, mix, noise, output, ramp, revolve, spline, tube, turned
 
 __all__ = ["generate", "main"]
 
@@ -353,7 +352,7 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
     Raises:
         ValueError: If a number is out of range or `out_dir` holds something else.
     """
-    where = "scenes.still_life"
+    where = "drgs.scenes.still_life"
     values = {"views": views, "width": width, "height": height, "spp": spp, "seed": seed}
     output.check_numbers(values, where)
     parameters = {"scene": "still_life", "version": _VERSION, **values}
@@ -368,8 +367,8 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
 
 
 def main(argv=None) -> int:
-    """The command line: `python -m scenes.still_life OUT`."""
-    parser = argparse.ArgumentParser("scenes.still_life", description=__doc__.splitlines()[0])
+    """The command line: `python -m drgs.scenes.still_life OUT`."""
+    parser = argparse.ArgumentParser("drgs.scenes.still_life", description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, help="folder to make")
     for name, default in (("views", 32), ("width", 320), ("height", 240), ("spp", 30), ("seed", 0)):
         parser.add_argument(f"--{name}", type=int, default=default, help="default: %(default)s")

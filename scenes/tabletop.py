@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes import fabrics, grid, join, mix, noise, ramp, revolve, spline, tube
-from scenes.furniture import GLAZE, MATTE, METAL, SATIN, moved, moved_parts, slab
-from scenes.moving import LEMON
+from drgs.scenes import fabrics, grid, join, mix, noise, ramp, revolve, spline, tube
+from drgs.scenes.furniture import GLAZE, MATTE, METAL, SATIN, moved, moved_parts, slab
+from drgs.scenes.moving import LEMON
 
 __all__ = ["WALL", "board", "bottle", "bowl", "canister", "herbs", "lemon", "plate", "rail", "shell"]
 

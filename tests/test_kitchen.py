@@ -9,10 +9,9 @@ import json
 import numpy as np
 import pytest
 
-import scenes
-from drgs import cli
-from scenes import kitchen, moving, tabletop, teacher, videos
-from scenes.colmap import project
+from drgs import cli, scenes
+from drgs.scenes import kitchen, moving, tabletop, teacher, videos
+from drgs.scenes.colmap import project
 
 WIDTH, HEIGHT, CAMERAS, TIMES = 32, 24, 3, 3
 SMALL = {"cameras": CAMERAS, "times": TIMES, "width": WIDTH, "height": HEIGHT, "spp": 1}

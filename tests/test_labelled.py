@@ -10,7 +10,7 @@ from test_data import HEIGHT, WIDTH, poses, write_colmap, write_image, write_llf
 
 from benchmarks import labelled
 from drgs.data import load
-from scenes import teacher
+from drgs.scenes import teacher
 
 
 def write_captures(folder, count=6):

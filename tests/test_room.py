@@ -8,10 +8,9 @@ import json
 import numpy as np
 import pytest
 
-import scenes
-from drgs import cli, data
-from scenes import output, room, teacher
-from scenes.colmap import back_project, project, sparse_points
+from drgs import cli, data, scenes
+from drgs.scenes import output, room, teacher
+from drgs.scenes.colmap import back_project, project, sparse_points
 
 WIDTH, HEIGHT, VIEWS = 32, 24, 6
 SMALL = {"views": VIEWS, "width": WIDTH, "height": HEIGHT, "spp": 2}

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-import scenes
-from scenes import output, still_life
+from drgs import scenes
+from drgs.scenes import output, still_life
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 3
 

@@ -215,7 +215,7 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
 
 def _still_life() -> ModuleType:
     try:
-        from scenes import still_life
+        from drgs.scenes import still_life
     except ImportError:
         raise FileNotFoundError(
             "demo: the package `scenes` must be installed, it is not; run `pip install -e .` in a checkout"

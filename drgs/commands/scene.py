@@ -45,7 +45,7 @@ def run(args: Scene) -> None:
     if args.teacher_size is not None:
         numbers |= _pair("--teacher-size", args.teacher_size, "teacher_width", "teacher_height")
     try:
-        maker = importlib.import_module(f"scenes.{args.name}")
+        maker = importlib.import_module(f"drgs.scenes.{args.name}")
     except ImportError:
         raise FileNotFoundError(
             "scene: the package `scenes` must be installed, it is not; run `pip install -e .` in a checkout"

@@ -59,7 +59,7 @@ def _made(
     """The room `room-N` or the kitchen `kitchen-N`, of seed N."""
     if scene in given:
         return given[scene]
-    from scenes import kitchen, room
+    from drgs.scenes import kitchen, room
 
     (width, height), (w, h) = sizes.image, sizes.teacher
     size = {"width": width, "height": height, "teacher_width": w, "teacher_height": h, "seed": _number(scene)}
