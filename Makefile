@@ -1,7 +1,8 @@
-# make demo    environment, then a still life made, fitted, rendered and compared: pictures in out/demo
-# make test    environment, then the tests
-# make browser Chromium by apt, for tests of the report and the viewer that are skipped without one
-# make docs    environment, then the documentation as a site: out/site/index.html
+# make demo      environment, then a still life made, fitted, rendered and compared: pictures in out/demo
+# make test      environment, then the tests
+# make numerics  the tests of images, gradients, information and extremes once more, compiled for other processors
+# make browser   Chromium by apt, for tests of the report and the viewer that are skipped without one
+# make docs      environment, then the documentation as a site: out/site/index.html
 #
 # PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
 # PIP_FLAGS   more options for pip. On Linux, plain PyPI has torch with CUDA (gigabytes); for the CPU build:
@@ -11,11 +12,16 @@
 PYTHON ?= python3
 PIP_FLAGS ?=
 PYTEST_FLAGS ?= -q -n 2 --dist loadfile
+# CPU/LANES[/FEATURES] as DRGS_LLVM_TARGET takes them: packets of 4, 8 and 16 lanes, without AVX2, with it, with AVX-512,
+# as far as this machine has the instructions.
+TARGETS ?= $(shell grep -qsw fma /proc/cpuinfo && echo x86-64-v2/4/+fma; grep -qsw avx2 /proc/cpuinfo && echo haswell/8; \
+             grep -qsw avx512vl /proc/cpuinfo && echo x86-64-v4/16)
+NUMERICS := integrator extremes order tiles features fisher gain backdrop mitsuba_preset
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed
 
-.PHONY: setup demo test browser smoke docs lint llvm clean
+.PHONY: setup demo test numerics browser smoke docs lint llvm clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP) llvm
@@ -25,6 +31,13 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+# Each target in processes of its own: Dr.Jit compiles for one.
+numerics: setup
+	@set -e; for target in $(TARGETS); do \
+	  echo "numerics compiled for $$target"; \
+	  DRGS_LLVM_TARGET=$$target $(BIN)/python -m pytest $(PYTEST_FLAGS) $(NUMERICS:%=tests/test_%.py); \
+	done
 
 browser:
 	command -v chromium || command -v google-chrome || { apt-get update && apt-get install -y --no-install-recommends chromium; }

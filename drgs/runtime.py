@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from drgs import machine
 from drgs.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
+from drgs.llvm_target import compile_for, compiled_for, missing_features
 
 if TYPE_CHECKING:
     import torch
@@ -165,6 +166,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         version = None
     else:
         version = _loaded_llvm(dr)
+        _refuse_processor()
         import drjit.llvm.ad as types  # type: ignore[no-redef]  # the two have the same names
 
     # Left alone, both size their pools by the machine, which oversubscribes a container.
@@ -284,10 +286,12 @@ def info() -> dict:
         error = str(problem)
     report["backend"] = {"variant": chosen.variant if chosen else None, "error": error}
     llvm = chosen.llvm_version if chosen else None
+    target = compiled_for() if llvm else None
     environ = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
     report["llvm"] = {
         "path": chosen.llvm_path if chosen else None,
         "version": dotted(llvm) if llvm else None,
+        "target": {"cpu": target.cpu, "lanes": target.lanes} if target else None,
         "found": [{"path": x.path, "version": dotted(x.version)} for x in find_libraries(environ)],
     }
     if chosen:
@@ -349,6 +353,19 @@ def _loaded_llvm(dr: ModuleType) -> tuple[int, ...]:
         f"{dotted(version) if version else 'none'}; import drgs before drjit and mitsuba, or set "
         "DRJIT_LIBLLVM_PATH to a newer one."
     )
+
+
+def _refuse_processor() -> None:
+    """Choose the target that DRGS_LLVM_TARGET names; refuse one on which the first kernel would end the process."""
+    if wanted := os.environ.get("DRGS_LLVM_TARGET"):
+        compile_for(wanted, "drgs: DRGS_LLVM_TARGET")
+    target = compiled_for()
+    if target and (missing := missing_features(target)):
+        raise ValueError(
+            f"drgs: the processor must have {' and '.join(missing).upper()}, as Intel's have since Haswell (2013) and "
+            f"AMD's since Piledriver (2012), got {target.cpu} without; use another machine, in a virtual one the "
+            "host's processor (qemu: -cpu host), or a CUDA device (DRGS_VARIANT=cuda_ad_rgb)."
+        )
 
 
 def _loaded_path() -> str | None:

@@ -14,7 +14,15 @@ PACKAGE = Path(__file__).parents[1] / "drgs"
 # and below, never what is above.
 FLOORS: list[tuple[set[str], str]] = [
     (
-        {"libllvm", "machine", "lenses", "information.choices", "information.chain", "information.determinants"},
+        {
+            "libllvm",
+            "llvm_target",
+            "machine",
+            "lenses",
+            "information.choices",
+            "information.chain",
+            "information.determinants",
+        },
         "know nothing of the rest: plain data, or math",
     ),
     ({"guards", "display.progress", "display.tables"}, "refuse bad input, show progress: needed from everywhere"),

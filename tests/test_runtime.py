@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from drgs import libllvm, machine, runtime
+from drgs import libllvm, llvm_target, machine, runtime
 
 ROOT = Path(__file__).resolve().parent.parent
 MULTIARCH = libllvm._MULTIARCH
@@ -383,3 +384,37 @@ def test_commit_is_dirty_by_code_alone(tmp_path, monkeypatch):
     (tmp_path / "drgs/machine.py").write_text("x = 1")
     assert machine.commit() == f"{clean}-dirty"
     assert re.fullmatch("[0-9a-f]{7,}", clean)
+
+
+RENDER = """
+import torch, drgs
+from drgs.cameras import orbit
+zeros, ones = torch.zeros(1, 3), torch.ones(1, 3)
+g = drgs.Gaussians.from_arrays(zeros, torch.eye(4)[:1], ones, ones[:, 0] / 2, zeros[:, None])
+print(drgs.render(g, orbit((0, 0, 0), 3.0, 1, width=8, height=8)[0]).rgb.isfinite().all().item())
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
+def test_a_processor_without_fma_is_refused():
+    """Dr.Jit would print the code of the first kernel, two thousand lines, and abort."""
+    done = _python(RENDER, DRGS_LLVM_TARGET="nehalem/4/+sse4.2,-avx,-fma", DRGS_VARIANT="llvm_ad_rgb")
+    assert done.returncode == 1, done.stderr[-500:]
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ValueError: drgs: the processor must have FMA, ")
+    assert "got nehalem without; use another machine" in last
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
+def test_compiled_for_another_processor():
+    """Fewer lanes and older instructions render, too; `info` says what kernels are compiled for."""
+    code = RENDER + "from drgs import runtime\nprint(runtime.info()['llvm']['target'])"
+    done = _python(code, DRGS_LLVM_TARGET="x86-64-v2/4/+fma", DRGS_VARIANT="llvm_ad_rgb")
+    assert done.stdout.splitlines() == ["True", "{'cpu': 'x86-64-v2', 'lanes': 4}"], done.stderr[-500:]
+
+
+@pytest.mark.parametrize("text", ["haswell", "haswell/3", "haswell/8/fma", "/8", "haswell/eight"])
+def test_targets_are_written_in_one_way(text):
+    with pytest.raises(ValueError, match=r"DRGS_LLVM_TARGET must be CPU/LANES or CPU/LANES/FEATURES .* got") as refused:
+        llvm_target.compile_for(text, "drgs: DRGS_LLVM_TARGET")
+    assert repr(text) in str(refused.value)

@@ -28,7 +28,7 @@ def run(args: Info) -> None:
 def _plain(report: dict) -> str:
     """The report of `runtime.info()` as aligned lines."""
     llvm, cuda, optix = report["llvm"], report["cuda"], report["optix"]
-    cores = report["cores"]
+    cores, target = report["cores"], llvm["target"]
     others = [x["path"] for x in llvm["found"] if x["path"] != llvm["path"]]
     rows = {
         "drgs": f"{report['drgs']} (commit {report['commit'] or 'unknown'})",
@@ -36,6 +36,7 @@ def _plain(report: dict) -> str:
         "cpu": f"{report['cpu']}, {cores['usable']} of {cores['machine']} cores",
         "backend": report["backend"]["variant"] or "none",
         "libLLVM": f"{llvm['version']} ({llvm['path']})" if llvm["version"] else "not in use",
+        "compiled for": f"{target['cpu']}, {target['lanes']} lanes" if target else "unknown",
         "also found": ", ".join(others) or "no other libLLVM",
         "threads": ", ".join(f"{name} {count}" for name, count in report["threads"].items()),
         "CUDA": cuda["device"] or "yes" if cuda["available"] else f"no: {cuda['reason']}",
