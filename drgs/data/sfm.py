@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
+from drgs.data.readable import readable_photos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -140,9 +141,10 @@ def _reconstruct(
     shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
     with quiet():
+        readable = readable_photos(image_dir, names, partial / "readable", report)
         extract(
             database,
-            image_dir,
+            readable,
             names,
             camera_model=camera_model,
             shared_camera=shared,
@@ -164,7 +166,7 @@ def _reconstruct(
         report("mapping", 0, len(names))
         models = pycolmap.incremental_mapping(
             database,
-            image_dir,
+            readable,
             partial / "models",
             options=options,
             initial_image_pair_callback=lambda: report("mapping", min(2 * next(done), len(names)), len(names)),
