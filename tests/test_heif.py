@@ -102,6 +102,17 @@ def test_damage_is_one_line(tmp_path, gradient, suffix, cut):
     assert "\n" not in str(error.value)
 
 
+def test_damaged_exif_refuses_no_photograph(tmp_path, gradient):
+    """It is not needed for the pixels."""
+    path = tmp_path / "a.heic"
+    save(path, gradient, exif=exif(6))
+    data = path.read_bytes()
+    assert data.count(b"MM\0*") == 1 or data.count(b"II*\0") == 1
+    path.write_bytes(data.replace(b"MM\0*", b"zzzz").replace(b"II*\0", b"zzzz"))
+    assert image_size(path) == (40, 64)
+    assert np.abs(read_image(path).astype(int) - np.rot90(gradient, 3)).max() <= 3
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("side", [30_000, 2**31 - 1])
 def test_a_claimed_size_is_not_allocated(tmp_path, gradient, suffix, side, monkeypatch):

@@ -23,6 +23,7 @@ __all__ = ["pixels", "size", "write_jpeg"]
 _SIDE = 1 << 15  # pixels, libheif's own limit; a compressed byte stands for any number of them
 _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy that is answered
 _QUALITY = 98  # of JPEG: the photograph has been compressed before
+_ORIENTATION, _EXIF, _MARKER = 0x0112, b"Exif\0\0", 65_533  # the tag; what begins EXIF in a JPEG, and its most bytes
 _COPY = "it is damaged, or no such photograph: copy it again, or convert it to JPEG"
 _SHOWN = 120  # characters of a library's own message
 
@@ -38,7 +39,8 @@ def size(path: Path, tell: Any) -> list[int]:
     """
     with _opened(path) as image:
         width, height = image.size
-        return [height, width] if image.getexif().get(0x0112, 1) >= 5 else [width, height]
+        is_turned = image.format == "AVIF" and image.getexif().get(_ORIENTATION, 1) >= 5  # by a quarter
+        return [height, width] if is_turned else [width, height]
 
 
 def pixels(path: Path, tell: Any) -> np.ndarray:
@@ -47,7 +49,7 @@ def pixels(path: Path, tell: Any) -> np.ndarray:
     Raises:
         ValueError: Damaged, or too large.
     """
-    return np.asarray(_decoded(path)[0])
+    return np.asarray(_shown(path))
 
 
 def write_jpeg(path: Path, target: str, tell: Any) -> None:
@@ -56,20 +58,25 @@ def write_jpeg(path: Path, target: str, tell: Any) -> None:
     Raises:
         ValueError: Damaged, or too large.
     """
-    image, exif = _decoded(path)
+    image = _shown(path)
+    exif = image.info.get("exif", b"")
+    if exif and not exif.startswith(_EXIF):
+        exif = _EXIF + exif
+    exif = exif if len(exif) <= _MARKER else b""
     image.convert("RGB").save(target, "JPEG", quality=_QUALITY, subsampling=0, exif=exif)
 
 
-def _decoded(path: Path) -> tuple[Image.Image, Image.Exif]:
-    """The photograph as it is shown, in 8 bits, and its EXIF without the orientation."""
+def _shown(path: Path) -> Image.Image:
+    """The photograph as it is shown, in 8 bits; its EXIF states no orientation, or that there is nothing to turn."""
     with _opened(path) as image:
         try:
-            shown = ImageOps.exif_transpose(image)
+            # libheif turns; for AVIF, Pillow puts what the container says in the place of EXIF's own.
+            shown = ImageOps.exif_transpose(image) if image.format == "AVIF" else image.copy()
         except Exception as error:  # decoders raise whatever the damage leads to
             raise _damaged(path, error) from None
     if shown.mode not in ("L", "RGB", "RGBA"):
         shown = shown.convert("RGBA" if shown.has_transparency_data else "RGB")
-    return shown, shown.getexif()
+    return shown
 
 
 def _opened(path: Path) -> Image.Image:
