@@ -1,20 +1,46 @@
-"""Photographs for COLMAP, whose decoder reads fewer formats than ours."""
+"""Photographs for COLMAP, whose decoder reads fewer formats than ours, and whose names are text."""
 
 from __future__ import annotations
 
+import logging
+import re
 import shutil
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from drgs.data.checks import read_image
+from drgs.data.checks import IMAGE_SUFFIXES, read_image
 from drgs.data.heif import is_heif, write_jpeg
 
-__all__ = ["readable_photos"]
+__all__ = ["check_names", "readable_photos"]
 
 _QUALITY = 98  # of JPEG, for what has been compressed before
+_SHOWN = 5
+
+_log = logging.getLogger(__name__)
+
+
+def check_names(folder: Path, names: list[str]) -> None:
+    """Refuse names that a COLMAP model cannot hold: several lines, or bytes that are not UTF-8; say which photographs
+    are hidden, and left out.
+
+    Raises:
+        ValueError: There is one.
+    """
+    for name in names:
+        if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
+            raise ValueError(
+                f"{folder}: the name of a photo must be one line of UTF-8, got {name[:80]!r}; rename this photo"
+            )
+
+    # Those of ._ are no photographs, but what macOS notes about them on other systems.
+    hidden = [p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and re.match(r"\.(?!_)", p.name)]
+    if hidden:
+        shown = ", ".join(sorted(hidden)[:_SHOWN]) + (", ..." if len(hidden) > _SHOWN else "")
+        _log.warning("%s: %d hidden photos are left out (%s); rename them to use them", folder, len(hidden), shown)
 
 
 def readable_photos(folder: Path, names: list[str], target: Path, progress: Callable[[str, int, int], None]) -> Path:

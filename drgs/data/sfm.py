@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
-from drgs.data.readable import readable_photos
+from drgs.data.readable import check_names, readable_photos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -93,11 +93,9 @@ def run_sfm(
     if not image_dir.is_dir():
         raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]
+    check_names(image_dir, names)
     if len(names) < 2:
         raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
-    spaced = next((name for name in names if any(c.isspace() for c in name)), None)
-    if spaced:
-        raise ValueError(f"{image_dir}: photo names must be without spaces for COLMAP, got {spaced!r}; rename it")
     if camera_model not in CAMERA_MODELS:
         raise ValueError(f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}")
     if matching not in MATCHING:
