@@ -109,9 +109,7 @@ def test_a_header_that_repeats_numbers(side, read, tmp_path):
     path = tmp_path / "a_fmap_CxHxW.pt"
     torch.save(torch.zeros(1, dtype=torch.float16).expand(512, side, side), path)
     assert path.stat().st_size < 2000
-    with pytest.raises(
-        ValueError, match=r"must hold every number that it claims, \(512, .* bytes, the file has"
-    ):
+    with pytest.raises(ValueError, match=r"must hold every number that it claims, \(512, .* bytes, the file has"):
         read(path)
     torch.save(FULL.as_strided((8, 6, 500), (30, 5, 0)), path)
     assert "the file has" in message(path)
