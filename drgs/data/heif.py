@@ -9,7 +9,7 @@ import numpy as np
 
 from drgs.data.children import Child
 
-__all__ = ["HEIF_SUFFIXES", "heif_size", "is_heif", "read_heif", "write_jpeg"]
+__all__ = ["HEIF_SUFFIXES", "heif_size", "is_heif", "heif_as_jpeg", "read_heif"]
 
 HEIF_SUFFIXES = (".heic", ".heif", ".hif", ".avif")
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis")
@@ -45,18 +45,18 @@ def read_heif(path: Path) -> np.ndarray:
     return _decoder.ask("pixels", path)
 
 
-def write_jpeg(path: Path, target: Path) -> None:
-    """Write the photograph as it is shown as JPEG, with its EXIF, for a library that reads nothing else.
+def heif_as_jpeg(path: Path, quality: int) -> bytes:
+    """The photograph as it is shown as JPEG, with its EXIF, for a library that reads nothing else.
 
     Args:
         path: HEIC or AVIF.
-        target: The file, whatever it is called.
+        quality: 1 to 100.
 
     Raises:
         ValueError: as `read_heif`.
     """
     _need_library(path)
-    _decoder.ask("write_jpeg", path, str(target))
+    return _decoder.ask("jpeg", path, quality).tobytes()
 
 
 def _need_library(path: Path) -> None:

@@ -7,6 +7,7 @@ alone, and its pixels are taken as they are stored.)
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,10 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from drgs.data.children import serve
 from drgs.guards import memory
 
-__all__ = ["pixels", "size", "write_jpeg"]
+__all__ = ["jpeg", "pixels", "size"]
 
 _SIDE = 1 << 15  # pixels, libheif's own limit; a compressed byte stands for any number of them
 _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy that is answered
-_QUALITY = 98  # of JPEG: the photograph has been compressed before
 _ORIENTATION, _EXIF, _MARKER = 0x0112, b"Exif\0\0", 65_533  # the tag; what begins EXIF in a JPEG, and its most bytes
 _COPY = "it is damaged, or no such photograph: copy it again, or convert it to JPEG"
 _SHOWN = 120  # characters of a library's own message
@@ -52,8 +52,8 @@ def pixels(path: Path, tell: Any) -> np.ndarray:
     return np.asarray(_shown(path))
 
 
-def write_jpeg(path: Path, target: str, tell: Any) -> None:
-    """Write the photograph, as it is shown and without alpha, with its EXIF.
+def jpeg(path: Path, quality: int, tell: Any) -> np.ndarray:
+    """The bytes of a JPEG, uint8: the photograph as it is shown and without alpha, with its EXIF.
 
     Raises:
         ValueError: Damaged, or too large.
@@ -63,7 +63,9 @@ def write_jpeg(path: Path, target: str, tell: Any) -> None:
     if exif and not exif.startswith(_EXIF):
         exif = _EXIF + exif
     exif = exif if len(exif) <= _MARKER else b""
-    image.convert("RGB").save(target, "JPEG", quality=_QUALITY, subsampling=0, exif=exif)
+    encoded = io.BytesIO()
+    image.convert("RGB").save(encoded, "JPEG", quality=quality, subsampling=0, exif=exif)
+    return np.frombuffer(encoded.getbuffer(), np.uint8)
 
 
 def _shown(path: Path) -> Image.Image:
@@ -103,4 +105,4 @@ def _damaged(path: Path, error: Exception) -> ValueError:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")  # of Pillow about EXIF
-    serve({"size": size, "pixels": pixels, "write_jpeg": write_jpeg})
+    serve({"size": size, "pixels": pixels, "jpeg": jpeg})

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, read_image
-from drgs.data.heif import is_heif, write_jpeg
+from drgs.data.heif import heif_as_jpeg, is_heif
 
 __all__ = ["check_names", "readable_photos"]
 
@@ -35,7 +35,6 @@ def check_names(folder: Path, names: list[str]) -> None:
             raise ValueError(
                 f"{folder}: the name of a photo must be one line of UTF-8, got {name[:80]!r}; rename this photo"
             )
-
     # Those of ._ are no photographs, but what macOS notes about them on other systems.
     hidden = [p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and re.match(r"\.(?!_)", p.name)]
     if hidden:
@@ -70,7 +69,7 @@ def readable_photos(folder: Path, names: list[str], target: Path, progress: Call
     for done, name in enumerate(foreign):
         progress("decoding", done, len(foreign))
         if is_heif(folder / name):
-            write_jpeg(folder / name, target / name)
+            (target / name).write_bytes(heif_as_jpeg(folder / name, _QUALITY))
         else:
             pixels = np.ascontiguousarray(read_image(folder / name)[..., 2::-1])  # without alpha, in OpenCV's order
             _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
