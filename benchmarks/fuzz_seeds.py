@@ -274,6 +274,23 @@ def _image(name: str, picture: np.ndarray, *options: int) -> Any:
     return lambda folder: _write(folder / name, picture, *options)
 
 
+def _of_a_phone(name: str) -> Any:
+    """A turned photograph with EXIF, in tiles, as HEIC or AVIF."""
+
+    def write(folder: Path) -> None:
+        import pillow_heif
+        from PIL import Image
+
+        pillow_heif.register_heif_opener()
+        exif = Image.Exif()
+        exif[0x112] = 6  # the orientation
+        picture = np.random.default_rng(1).integers(0, 255, (100, 140, 3)).astype(np.uint8)
+        tiles = {"tile_size": 64} if name.endswith(".heic") else {}
+        Image.fromarray(picture).save(folder / name, quality=30, exif=exif.tobytes(), **tiles)
+
+    return write
+
+
 IMAGES = (
     _image("a.png", _picture()),
     _image("a.png", _picture(np.uint16, 1)),
@@ -285,6 +302,8 @@ IMAGES = (
     _image("a.tiff", _picture(np.uint16)),
     _image("a.tiff", _picture(), cv2.IMWRITE_TIFF_COMPRESSION, 1),
     _image("a.bmp", _picture()),
+    _of_a_phone("a.heic"),
+    _of_a_phone("a.avif"),
 )
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 __all__ = [
+    "LOGIT_ENDS",
     "Y_00",
     "DeformableScene",
     "Gaussians",
@@ -34,6 +35,9 @@ __all__ = [
 ]
 
 Y_00 = 0.28209479177387814  # the spherical harmonic of degree 0, sqrt(1 / (4 pi))
+LOGIT_ENDS = (-151 * math.log(2), math.log(2**26 - 1))
+"""Logits, -104.7 and 18.0, that an opacity of 0 and of 1 become where a file holds these: of 2^-151 and 1 - 2^-26, the
+middle of what rounds to them in float32, so that `Gaussians.opacities` are 0 and 1."""
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
 # float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
 _FAR_RATIO = 1e5

@@ -62,11 +62,12 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
             writes them. Normals and features may be missing. What `save_ply` added (uncertainty_*, label) is left out;
             any other column, too, with a warning in the log.
     Returns:
-        float32 `Gaussians` with the file's bits.
+        float32 `Gaussians` with the file's bits; an infinite logit becomes one of `ellipsoids.LOGIT_ENDS`, and the log
+        says how many did.
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no PLY, shorter than its header claims, of another layout, or holds values that are not
-            finite (the first index is named).
+        ValueError: If it is no PLY, shorter than its header claims, of another layout, or holds other values that are
+            not finite (the first index is named).
     """
     import plyfile
     import torch
@@ -110,10 +111,27 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
     if features:
         arrays["features"] = described
-    arrays["logit_opacities"] = arrays["logit_opacities"][:, 0]
+    arrays["logit_opacities"] = _finite_logits(path, arrays["logit_opacities"][:, 0])
     made = Gaussians(**arrays, sh=sh.contiguous())
     made.validate(str(path))
     return made
+
+
+def _finite_logits(path: Path, logits: torch.Tensor) -> torch.Tensor:
+    """Logits of which the infinite ones, of opacities 0 and 1, have become `LOGIT_ENDS`; the log says how many."""
+    from drgs.ellipsoids import LOGIT_ENDS
+
+    infinite = logits.isinf()
+    if not infinite.any():
+        return logits
+    _log.warning(
+        "%s: %d of %d opacities are 0 or 1 (infinite logits), read as logits of %.1f and %.1f",
+        path,
+        int(infinite.sum()),
+        len(logits),
+        *LOGIT_ENDS,
+    )
+    return logits.where(~infinite, logits.clamp(*LOGIT_ENDS))
 
 
 def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> torch.Tensor:

@@ -16,6 +16,7 @@ from splat_samples import sog_scene, write_sample
 from test_deform import dynamic
 from test_query import decoder, embeddings, scene
 
+import drgs
 from drgs import cli
 from drgs.cameras import orbit
 from drgs.codecs import load_gaussians, save_gaussians
@@ -54,6 +55,37 @@ def test_every_pair_of_formats(tmp_path, rng, capsys):
     assert (tmp_path / "out/mine.ply").read_bytes() == b"mine"
     assert convert(tmp_path / "a.glb", tmp_path / "a.glb") == 2
     assert "must not be read and replaced, it is an input" in capsys.readouterr().err
+
+
+def test_infinite_logits_of_splat_transform(tmp_path, caplog):
+    """The PLY that it writes of an .spz, whose ends of opacity are infinite logits, becomes that .spz again; and is
+    drawn and differentiated.
+    """
+    logits = torch.tensor([9.0, 9, 9, -12, -12, *np.linspace(-3, 3, 7)])
+    n, generator = len(logits), torch.Generator().manual_seed(0)
+    made = drgs.Gaussians.from_arrays(
+        *(torch.randn(n, k, generator=generator) for k in (3, 4)),
+        torch.ones(n, 3),
+        logits.sigmoid(),
+        torch.zeros(n, 1, 3),
+    )
+    save_gaussians(made, tmp_path / "a.spz")
+    assert convert(tmp_path / "a.spz", tmp_path / "b.ply") == 0
+    written = plyfile.PlyData.read(tmp_path / "b.ply", mmap=False)
+    written["vertex"]["opacity"][:3], written["vertex"]["opacity"][3:5] = np.inf, -np.inf
+    written.write(tmp_path / "c.ply")
+    caplog.clear()
+    assert convert(tmp_path / "c.ply", tmp_path / "d.spz") == 0
+    assert [x for x in caplog.messages if "opacities" in x] == [
+        f"{tmp_path}/c.ply: 5 of 12 opacities are 0 or 1 (infinite logits), read as logits of -104.7 and 18.0"
+    ]
+    assert (tmp_path / "d.spz").read_bytes() == (tmp_path / "a.spz").read_bytes()
+    g = load_gaussians(tmp_path / "c.ply")
+    g = g.replace(logit_opacities=g.logit_opacities.requires_grad_())
+    image = drgs.render(g, orbit((0, 0, 0), 8.0, 1, width=24, height=16)[0]).rgb
+    image.sum().backward()
+    assert torch.isfinite(image).all()
+    assert torch.isfinite(g.logit_opacities.grad).all()
 
 
 @pytest.mark.parametrize(

@@ -234,6 +234,37 @@ def test_numbers_that_are_none_of_their_type(tmp_path, kind):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("kind", ["float", "double"])
+def test_infinite_logits_are_opacities_of_0_and_1(tmp_path, caplog, kind):
+    """As splat-transform writes them: read as finite logits that float32 rounds to these, and counted."""
+    values = np.ones((5, len(BASE)), "<f4" if kind == "float" else "<f8")
+    logits = [np.inf, -3.25, -np.inf, np.inf, 90.0]
+    values[:, BASE.index("opacity")] = logits
+    path = write(tmp_path / "a.ply", header(BASE, 5, kind), values.tobytes())
+    g = load_ply(path)
+    assert caplog.messages == [
+        f"{path}: 3 of 5 opacities are 0 or 1 (infinite logits), read as logits of -104.7 and 18.0"
+    ]
+    torch.testing.assert_close(g.logit_opacities, torch.tensor([18.0218, -3.25, -104.6652, 18.0218, 90.0]))
+    assert g.opacities[[0, 2, 3]].tolist() == [1, 0, 1]
+    assert g.logit_opacities[[1, 4]].tolist() == [-3.25, 90.0]  # a large one is a number
+    save_ply(g, tmp_path / "b.ply")
+    caplog.clear()
+    assert torch.equal(load_ply(tmp_path / "b.ply").logit_opacities, g.logit_opacities)
+    assert not caplog.messages
+
+
+def test_a_logit_that_is_no_number_is_refused(tmp_path, caplog):
+    """Beside infinite ones, too; so is whatever else is infinite."""
+    for column, value in (("opacity", np.nan), ("scale_1", np.inf), ("x", -np.inf)):
+        values = np.ones((3, len(BASE)), "<f4")
+        values[0, BASE.index("opacity")] = np.inf
+        values[2, BASE.index(column)] = value
+        path = write(tmp_path / "a.ply", header(BASE, 3), values.tobytes())
+        with pytest.raises(ValueError, match="must be finite, got .* at index 2 "):
+            load_ply(path)
+
+
 def test_saving_refuses_what_is_not_finite_and_keeps_the_old_file(tmp_path):
     """A bad save leaves the file that was there."""
     g = gaussians()

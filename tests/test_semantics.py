@@ -218,6 +218,19 @@ def test_headers_of_maps_are_compared_at_once(tmp_path):
         view.teacher()
 
 
+def test_a_map_that_is_far_larger_than_its_photograph(tmp_path):
+    """Named at once, or lazily when it is used; photographs may be reduced to an eighth while their maps stay."""
+    write_transforms(tmp_path)
+    write_maps(tmp_path)
+    camera = load(tmp_path).views[1].camera
+    write_maps(tmp_path, size=(8 * camera.width, 8 * camera.height), only=["1"])
+    assert load(tmp_path).views[1].teacher().shape[1] == 8 * camera.height
+    write_maps(tmp_path, size=(8 * camera.width + 1, 8 * camera.height), only=["1"])
+    refused(tmp_path, "1_fmap_CxHxW.pt: must have at most 8 cells a pixel along each side of its photograph of")
+    with pytest.raises(ValueError, match=rf"got {8 * camera.width + 1}x{8 * camera.height} cells"):
+        load(tmp_path, lazy=True).views[1].teacher()
+
+
 def test_nan_in_a_map_is_found_when_it_is_used(tmp_path):
     """Loading reads headers only; the view names file and place."""
     write_transforms(tmp_path)

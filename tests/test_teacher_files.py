@@ -102,6 +102,19 @@ def test_files_that_lie(tmp_path):
     assert teacher.read_map(named).shape == (8, 6, 6)
 
 
+@pytest.mark.parametrize("side", [2000, 5000])
+@pytest.mark.parametrize("read", [teacher.read_map, teacher.used_map, teacher.read_tensor])
+def test_a_header_that_repeats_numbers(side, read, tmp_path):
+    """A kilobyte that claims gigabytes is refused by its header: nothing of that size is read or allocated."""
+    path = tmp_path / "a_fmap_CxHxW.pt"
+    torch.save(torch.zeros(1, dtype=torch.float16).expand(512, side, side), path)
+    assert path.stat().st_size < 2000
+    with pytest.raises(ValueError, match=r"must hold every number that it claims, \(512, .* bytes, the file has"):
+        read(path)
+    torch.save(FULL.as_strided((8, 6, 500), (30, 5, 0)), path)
+    assert "the file has" in message(path)
+
+
 def test_damaged_files(tmp_path):
     """Whatever bytes are overwritten: one line, or a tensor (17,000 such files were tried once, these are 200)."""
     path = tmp_path / "a_fmap_CxHxW.pt"

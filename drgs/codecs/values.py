@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drgs.ellipsoids import Y_00, Gaussians
+from drgs.ellipsoids import LOGIT_ENDS, Y_00, Gaussians
 from drgs.guards.memory import require
 
 __all__ = [
@@ -71,12 +71,11 @@ def logits_of_bytes(opacity: np.ndarray) -> np.ndarray:
 
 
 def logits_of_opacities(opacity: np.ndarray) -> np.ndarray:
-    """Logits of float32 opacities; 0 and 1 are taken for the middle of what rounds to them, others outside are NaN."""
+    """Logits of float32 opacities; 0 and 1 become `LOGIT_ENDS`, others outside are NaN."""
     x = opacity.astype(np.float64)
-    least = float(np.finfo(np.float32).smallest_subnormal)
-    x = np.where(x == 0, least / 4, np.where(x == 1, 1 - 2.0**-26, x))
-    with np.errstate(invalid="ignore"):
-        return np.log(x) - np.log1p(-x)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        logits = np.log(x) - np.log1p(-x)
+    return np.where(x == 0, LOGIT_ENDS[0], np.where(x == 1, LOGIT_ENDS[1], logits))
 
 
 def log_of_scales(path: Path, scales: np.ndarray, least: float) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shlex
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -67,7 +68,7 @@ def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, int]) ->
         else:
             held_out = f"{len(maker.MOVING)} of them move"
         print(f"{len(maker.CLASSES)} classes, {held_out}, teacher right at {100 * right:.1f} % of the pixels")
-    print(f"next: drgs fit {folder} -o RUN{every}")
+    print(f"next: drgs fit {shlex.quote(str(folder))} -o RUN{every}")
 
 
 def _pair(option: str, text: str, *names: str) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING
 
 from drgs.data.sfm import run_sfm
@@ -35,4 +36,4 @@ def run(args: Sfm) -> None:
         print(f"without a pose: {', '.join(summary.missing)}")
     if summary.models > 1:
         print(f"the photos fell apart into {summary.models} models, the largest was kept")
-    print(f"next: drgs fit {args.output} -o RUN")
+    print(f"next: drgs fit {shlex.quote(str(args.output))} -o RUN")

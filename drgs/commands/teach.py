@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -86,7 +87,7 @@ def run(args: Teach) -> None:
             bar.advance()
     if not args.quiet:
         print(_summary(folder, len(files), len(left), encoder.channels, names))
-        print(f"next: drgs fit {args.data} -o RUN")
+        print(f"next: drgs fit {shlex.quote(str(args.data))} -o RUN")
 
 
 def _scales(text: str) -> list[float]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 from drgs.data.checks import list_images
@@ -151,7 +152,7 @@ def _nothing_found(path: Path) -> FileNotFoundError:
         if folder.is_dir() and list_images(folder):
             return FileNotFoundError(
                 f"{path}: must hold camera poses, found {len(list_images(folder))} photos without; "
-                f"run `drgs sfm {folder} -o OUT` and load OUT"
+                f"run `drgs sfm {shlex.quote(str(folder))} -o OUT` and load OUT"
             )
     if folders := frame_folders(path):
         return FileNotFoundError(

@@ -19,6 +19,7 @@ from typing import IO
 
 import numpy as np
 
+from drgs.data.heif import HEIF_SUFFIXES, heif_size, is_heif, read_heif
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
@@ -39,7 +40,7 @@ __all__ = [
     "repaired_pose",
 ]
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIF_SUFFIXES)
 _MAX_NPY_HEADER = 65536
 _DEFLATE = 1032  # bytes that one byte of deflate can become
 _MAX_NAME = 1024  # characters, folders included
@@ -219,6 +220,8 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         ValueError: not an image, of no or more than 2^31 pixels, or of more than its file can hold.
     """
+    if is_heif(path):
+        return heif_size(path)
     stated = stated_size(path)
     width, height = stated or read_image(path).shape[1::-1]
     if not 1 <= width * height <= _MAX_PIXELS or (stated and not can_hold(path, width, height)):
@@ -233,16 +236,19 @@ def read_image(path: Path) -> np.ndarray:
     """Decode an image as stored: (H,W) or (H,W,C), its own bit depth, channels in RGB order, EXIF
     rotation ignored.
 
-    Poses and intrinsics belong to the stored pixels, hence no rotation.
+    Poses and intrinsics belong to the stored pixels, hence no rotation. Of HEIC and AVIF, whose container says how
+    they are turned, these are the pixels that are shown, in 8 bits.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not an image that OpenCV decodes, or one whose data end early.
+        ValueError: not an image that can be decoded, or one whose data end early.
     """
     import cv2
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
+    if is_heif(path):
+        return read_heif(path)
     if not is_whole(path):
         raise _ends_early(path)
     if stated_size(path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +211,10 @@ def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
         ) from None
     finally:
         pycolmap.logging.minloglevel = level
+    if suffix == ".txt":
+        names = _names(model / "images.txt")
+        for image_id, image in reconstruction.images.items():
+            image.name = names[image_id]  # pycolmap ends a name at its first space
     return reconstruction
 
 
@@ -337,11 +342,7 @@ def _unsupported(path: Path, name: str) -> ValueError:
 
 def _check_text(path: Path, kind: str) -> None:
     """Every data line must have the numbers that its kind takes."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: must be a text file, got binary data; export the model again") from None
-    lines = [(number, line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
+    lines = _text_lines(path)
     if kind == "images":
         _check_image_lines(path, lines)
         return
@@ -363,22 +364,49 @@ def _check_text(path: Path, kind: str) -> None:
 
 def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
     """Pairs of lines: pose and name, then observations (which may be empty)."""
+    for number, words, observed in _image_lines(lines):
+        if len(words) < 10:
+            raise _bad_line(path, number, "ID, pose (7), CAMERA_ID and NAME", f"{len(words)} words")
+        if not words[0].isdecimal():
+            raise _bad_line(path, number, "a whole number as its ID", words[0][:40])
+        _numbers(path, number, words[:9], 9)
+        if observed:
+            observations = observed[1].split()
+            if len(observations) % 3:
+                raise _bad_line(path, observed[0], "triples X, Y, POINT3D_ID", f"{len(observations)} numbers")
+            _numbers(path, observed[0], observations, 0)
+
+
+def _image_lines(lines: list[tuple[int, str]]) -> Iterator[tuple[int, list[str], tuple[int, str] | None]]:
+    """Of each image of images.txt: the number of its first line, the 10 words of this, of which the last is the name,
+    and its line of observations; None where the file ends before.
+
+    Args:
+        lines: Their numbers and texts, without comments.
+    """
     index = 0
     while index < len(lines):
         number, line = lines[index]
-        words = line.split(maxsplit=9)
+        words = line.rstrip().split(maxsplit=9)
         if not words:
             index += 1
             continue
-        if len(words) < 10:
-            raise _bad_line(path, number, "ID, pose (7), CAMERA_ID and NAME", f"{len(words)} words")
-        _numbers(path, number, words[:9], 9)
-        if index + 1 < len(lines):
-            observations = lines[index + 1][1].split()
-            if len(observations) % 3:
-                raise _bad_line(path, lines[index + 1][0], "triples X, Y, POINT3D_ID", f"{len(observations)} numbers")
-            _numbers(path, lines[index + 1][0], observations, 0)
+        yield number, words, lines[index + 1] if index + 1 < len(lines) else None
         index += 2
+
+
+def _names(path: Path) -> dict[int, str]:
+    """ID -> name of the images of images.txt, already checked."""
+    return {int(words[0]): words[9] for _, words, _ in _image_lines(_text_lines(path))}
+
+
+def _text_lines(path: Path) -> list[tuple[int, str]]:
+    """Numbers and texts of the lines of a file, without comments."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: must be a text file, got binary data; export the model again") from None
+    return [(number, line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
 
 
 def _numbers(path: Path, line: int, words: list[str], least: int, exact: bool = False) -> None:

@@ -105,14 +105,14 @@ def match(database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progre
     options.use_gpu = False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    with temporary_folder("pairs") as folder:
+    with temporary_folder("pairs") as folder, _numbered(database) as numbers:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = folder / "pairs.txt"
         for start in range(0, len(pairs), _PAIRS_A_STEP):
             if progress:
                 progress("matching", start, len(pairs))
             step = pairs[start : start + _PAIRS_A_STEP]
-            pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in step))
+            pairing.match_list_path.write_text("".join(f"{numbers[a]} {numbers[b]}\n" for a, b in step))
             pycolmap.match_image_pairs(
                 database,
                 matching_options=options,
@@ -122,6 +122,24 @@ def match(database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progre
             )
     if progress:
         progress("matching", len(pairs), len(pairs))
+
+
+@contextlib.contextmanager
+def _numbered(database: Path) -> Iterator[dict[str, str]]:
+    """Name -> number that the images of a database are called by meanwhile: COLMAP splits a list of pairs at spaces."""
+    from drgs.data.native import pycolmap
+
+    with pycolmap.Database.open(database) as handle:
+        images = handle.read_all_images()
+        names = {image.image_id: image.name for image in images}
+        for image in images:
+            image.name = str(image.image_id)
+            handle.update_image(image)
+    yield {name: str(number) for number, name in names.items()}
+    with pycolmap.Database.open(database) as handle:
+        for image in handle.read_all_images():
+            image.name = names[image.image_id]
+            handle.update_image(image)
 
 
 def sequential_pairs(names: list[str], window: int) -> list[tuple[str, str]]:

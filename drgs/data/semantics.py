@@ -36,7 +36,8 @@ from drgs.guards.json_files import check_json, read_json
 if TYPE_CHECKING:
     import torch
 
-    from drgs.data.views import Dataset
+    from drgs.cameras import Camera
+    from drgs.data.views import Dataset, View
     from drgs.features.segmentation import Classes
 
 __all__ = ["LABEL_FOLDERS", "TEACHER_FOLDERS", "Semantics", "attach", "plain_labels"]
@@ -47,6 +48,7 @@ _SEGMENTS = "seg"  # of Dynamic 3D Gaussians: 1 is what moves
 _EMBEDDINGS = "text_embeddings.npy"
 _NUMBERS = 1 << 16  # what a pixel of a label image can say
 _SHOWN = 5
+_FINER = 8  # times: photographs are reduced so far (images_8) while their maps stay
 
 _log = logging.getLogger(__name__)
 
@@ -126,17 +128,18 @@ class Semantics:
             )
         return tuple(names)
 
-    def checked(self) -> Semantics:
-        """Itself, with the headers of all maps and the classes compared.
+    def checked(self, views: list[View]) -> Semantics:
+        """Itself, with the headers of the maps of all views and the classes compared.
 
         Raises:
-            FileNotFoundError, ValueError: A file that is none of its kind, or maps of several widths.
+            FileNotFoundError, ValueError: A file that is none of its kind, or as `check_map`.
         """
         if self.maps:
             from drgs.features.teacher import read_map
 
-            for path in self.maps:
-                self.check_channels(read_map(path), path)
+            for view in views:
+                if view.teacher_path:
+                    self.check_map(read_map(view.teacher_path), view.teacher_path, view.camera)
             _ = self.classes
         elif self.class_file:  # labels alone: without a file, their numbers would be looked for in all of them
             _ = self._numbers
@@ -144,13 +147,25 @@ class Semantics:
             _ = self.moving
         return self
 
-    def check_channels(self, values: torch.Tensor, path: Path) -> None:
-        """Raise ValueError unless a map has the channels of the others."""
+    def check_map(self, values: torch.Tensor, path: Path, camera: Camera) -> None:
+        """Raise ValueError unless a map has the channels of the others, and cells of no more than its photograph has.
+
+        Args:
+            values: (C, h, w).
+            path: Of the map, for the message.
+            camera: Of the photograph, which may have been reduced since the map was made.
+        """
         if values.shape[0] != self.channels:
             like = self.embedding_file or self.maps[0]
             raise ValueError(
                 f"{path}: must have {self.channels} channels as {like.name}, got {values.shape[0]}; "
                 "make all maps and embeddings with one teacher"
+            )
+        height, width = values.shape[1:]
+        if width > _FINER * camera.width or height > _FINER * camera.height:
+            raise ValueError(
+                f"{path}: must have at most {_FINER} cells a pixel along each side of its photograph of "
+                f"{camera.width}x{camera.height}, got {width}x{height} cells; make the map from this photograph"
             )
 
     def numbered(self, raw: np.ndarray, path: Path) -> np.ndarray:
@@ -280,7 +295,7 @@ def attach(dataset: Dataset, lazy: bool) -> None:
             )
     for view in dataset.views:
         view.semantics = semantics
-    dataset.semantics = semantics if lazy else semantics.checked()
+    dataset.semantics = semantics if lazy else semantics.checked(dataset.views)
 
 
 def plain_labels(path: Path) -> np.ndarray:

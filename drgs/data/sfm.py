@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
+from drgs.data.readable import check_names, readable_photos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -92,11 +93,9 @@ def run_sfm(
     if not image_dir.is_dir():
         raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]
+    check_names(image_dir, names)
     if len(names) < 2:
         raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
-    spaced = next((name for name in names if any(c.isspace() for c in name)), None)
-    if spaced:
-        raise ValueError(f"{image_dir}: photo names must be without spaces for COLMAP, got {spaced!r}; rename it")
     if camera_model not in CAMERA_MODELS:
         raise ValueError(f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}")
     if matching not in MATCHING:
@@ -140,9 +139,10 @@ def _reconstruct(
     shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
     with quiet():
+        readable = readable_photos(image_dir, names, partial / "readable", report)
         extract(
             database,
-            image_dir,
+            readable,
             names,
             camera_model=camera_model,
             shared_camera=shared,
@@ -164,7 +164,7 @@ def _reconstruct(
         report("mapping", 0, len(names))
         models = pycolmap.incremental_mapping(
             database,
-            image_dir,
+            readable,
             partial / "models",
             options=options,
             initial_image_pair_callback=lambda: report("mapping", min(2 * next(done), len(names)), len(names)),

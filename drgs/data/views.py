@@ -188,7 +188,7 @@ class View:
         a process looks through it for NaN.
 
         Raises:
-            FileNotFoundError, ValueError: no such map, or of other channels than the data set's.
+            FileNotFoundError, ValueError: no such map, of other channels than the data set's, or larger than the photo.
         """
         from drgs.features.teacher import used_map
 
@@ -196,7 +196,7 @@ class View:
             return None
         values = used_map(self.teacher_path)
         if self.semantics is not None:
-            self.semantics.check_channels(values, self.teacher_path)
+            self.semantics.check_map(values, self.teacher_path, self.camera)
         return undistorted_map(values, self.camera) if self.camera.is_distorted else values
 
     def _size(self, width: int | None, height: int | None) -> tuple[int, int]:

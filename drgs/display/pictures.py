@@ -40,6 +40,7 @@ _UNKNOWN = 0.25  # gray of depth where nothing is
 _NOTHING = 64  # gray of pixels whose value is 0
 _DECADES = 3.0  # at most so many are told apart by color
 _WEBM_SEGMENT, _WEBM_HEAD = bytes.fromhex("18538067"), 1024  # what holds all of a WebM file, and where it begins
+_NAME = 100  # bytes of a view's name in the name of a file
 _OPAQUE = 0.5  # depth is shown where at least this much of the light stops
 
 
@@ -50,10 +51,13 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
 
 
 def file_names(names: list[str]) -> list[str]:
-    """One file name for each view's name, which may hold folders, be empty or repeat."""
+    """One file name for each view's name, which may hold folders, be empty or repeat: of at most 100 bytes, where file
+    systems allow 255, and numbers of those that are alike.
+    """
     result: list[str] = []
     for index, name in enumerate(names):
-        clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".")[:100]
+        clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".")
+        clean = clean.encode()[:_NAME].decode(errors="ignore")
         clean = clean or f"view_{index:04d}"
         while clean in result:
             clean += f"_{index:04d}"

@@ -8,6 +8,7 @@ whose shape it need not have.
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import re
@@ -51,7 +52,7 @@ def read_map(path: str | os.PathLike) -> torch.Tensor:
     Raises:
         FileNotFoundError: No such file.
         ValueError: Not one plain tensor of three dimensions and one of these types, of another shape than the file's
-            name says, or cut short.
+            name says, cut short, or one that claims more numbers than the file has.
     """
     import torch
 
@@ -76,7 +77,7 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: Anything but one plain tensor, or cut short.
+        ValueError: Anything but one plain tensor, cut short, or one that claims more numbers than the file has.
     """
     import torch
 
@@ -108,6 +109,13 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
     if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
         kind = type(value).__name__ if not isinstance(value, torch.Tensor) else f"tensor of layout {value.layout}"
         raise ValueError(f"{path}: must hold one plain tensor, got a {kind}; save the tensor alone")
+    # Of a tensor that repeats its numbers (a stride of 0), a kilobyte would be read for minutes.
+    claimed = math.prod(value.shape) * value.element_size()
+    if claimed > path.stat().st_size:
+        raise ValueError(
+            f"{path}: must hold every number that it claims, {tuple(value.shape)} takes {claimed} bytes, the file has "
+            f"{path.stat().st_size}; save tensor.contiguous()"
+        )
     return value.detach()
 
 

@@ -5,6 +5,7 @@ Known by their first bytes, and by their extension where a format has no mark of
 
 from __future__ import annotations
 
+import shlex
 import zipfile
 import zlib
 from pathlib import Path
@@ -53,12 +54,11 @@ def _conversion(path: Path, suffix: str) -> str:
     target = path.with_name(f"{name}.ply")
     if target == path:
         target = path.with_name(f"{name}_3dgs.ply")
+    source, made = shlex.quote(str(path.parent if path.name == "meta.json" else path)), shlex.quote(str(target))
     if suffix != ".lcc":
-        if path.name == "meta.json":
-            path = path.parent
-        return f"convert it with `drgs convert {path} {target}`, or read it with drgs.load_gaussians"
+        return f"convert it with `drgs convert {source} {made}`, or read it with drgs.load_gaussians"
     return (
-        f"convert it with `npx @playcanvas/splat-transform {path} {target}`, "
+        f"convert it with `npx @playcanvas/splat-transform {source} {made}`, "
         "or open it in SuperSplat (superspl.at/editor) and export a PLY that is not compressed"
     )
 
@@ -101,8 +101,8 @@ def _other(head: bytes, path: Path) -> tuple[str, str] | None:
         return "an HEIC or AVIF photograph", "convert it to JPEG or PNG"
     if brand or head.startswith(b"\x1aE\xdf\xa3") or head[8:12] == b"AVI ":
         return "a video", (
-            f"take photographs out of it first, e.g. `mkdir photos; ffmpeg -i {path} -vf fps=2 photos/%04d.jpg`, "
-            "and run `drgs sfm photos -o scene`"
+            f"take photographs out of it first, e.g. `mkdir photos; ffmpeg -i {shlex.quote(str(path))} -vf fps=2 "
+            "photos/%04d.jpg`, and run `drgs sfm photos -o scene`"
         )
     if head.startswith(b"PK\x03\x04") and path.suffix.lower() != ".npz":
         return "a zip archive", "unpack it first"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -307,7 +308,7 @@ def _metrics(run: Run) -> dict:
     if metrics.get("split") != "test":
         raise ValueError(
             f"{run.path / 'metrics.json'}: must be of the test views, is of {metrics.get('split')!r}; "
-            f"run `drgs eval {run.path}`"
+            f"run `drgs eval {shlex.quote(str(run.path))}`"
         )
     return metrics
 
