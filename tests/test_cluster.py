@@ -165,6 +165,20 @@ def test_a_cache_asks_workers_for_what_it_lacks(cluster, moving):
     assert (cache.hits, cache.misses) == (cluster_cache.hits, cluster_cache.misses)
 
 
+@pytest.mark.parametrize("size", [0, 20_000])
+def test_a_cache_that_is_too_small_asks_workers_again(cluster, moving, size):
+    """What it had when a call began may be pushed out before its turn: each view still gets its own answer."""
+    _, still, cams = moving
+    cache = Cache(max_bytes=size)
+    for order in ([0, 1, 2, 3, 4], [4, 2, 2, 0, 3], [3, 1, 0, 4, 2]):
+        views = [cams[2 + i] for i in order]
+        found = select(still, views, cams[:2], settings=FAST, cache=cache, workers=cluster)
+        alone = select(still, views, cams[:2], settings=FAST)
+        assert (found.scores, found.parts) == (alone.scores, alone.parts)
+        assert cache.bytes <= size
+    assert (cache.hits > 5) == (size > 0)
+
+
 def test_memory_that_is_short_asks_twice(cluster, moving, monkeypatch):
     """Where not all views fit into memory at once, v_opt asks for candidates again, of workers as of this process."""
     from drgs.information import greedy
