@@ -40,7 +40,7 @@ from drgs.guards.doors import (
     some_cameras,
     three_weights,
 )
-from drgs.information.backdrop import CELLS, Sphere, backdrop_information, backdrop_sphere, backdrop_variance
+from drgs.information.backdrop import CELLS, Sphere, backdrop_sphere, backdrop_variance, opacity_of, painted_opacity
 from drgs.information.columns import by_columns, jacobian_columns
 from drgs.information.groups import GROUPS, Group, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
@@ -304,7 +304,8 @@ def backdrop(
     total = torch.zeros(CELLS, 3, dtype=torch.float64)
     known: Sequence[torch.Tensor | None] = seen_opacity or [None] * len(cameras)
     for camera, mask, opacity in zip(cameras, mask_list("fisher.backdrop", masks, cameras), known, strict=True):
-        total += backdrop_information(gaussians, camera, settings, weights, mask, sphere, opacity)
+        seen = opacity_of(gaussians, camera, settings) if opacity is None else opacity
+        total += painted_opacity(seen, camera, weights, mask, sphere)
     return total
 
 

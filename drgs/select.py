@@ -19,12 +19,13 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information
-from drgs.guards.arguments import must_be
+from drgs.guards.arguments import kind_of, must_be
 from drgs.guards.doors import Masks, camera_list, check_any_scene, mask_list
 from drgs.guards.imports import imported_function
 from drgs.information.cache import Cache
@@ -70,7 +71,7 @@ def select(
         candidates: Cameras to choose from, at least k.
         train: Cameras whose views are known; may be empty if lambda is absolute and > 0.
         k: How many.
-        policy: A name in `POLICIES`, or `package.module:function` of a function like those.
+        policy: A name in `POLICIES`, or `package.module:function` of a function like those: `Pool` to `Selection`.
         scoring: How views are scored; default `Scoring()`.
         rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
         masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside was not learned from.
@@ -88,8 +89,8 @@ def select(
         **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
-        ValueError: If there are no candidates or fewer than k, an argument is unknown, or information is negative, NaN
-            or infinite.
+        ValueError: If there are no candidates or fewer than k, an argument is unknown, information is negative, NaN
+            or infinite, or a policy returns something else than a choice of k candidates.
     """
     started = time.perf_counter()
     check_any_scene("select", gaussians)
@@ -123,9 +124,38 @@ def select(
         information=information,
         workers=workers,
     )
-    selection = chosen(pool)
+    selection = _returned(policy, pool, chosen(pool))
     selection.seconds = time.perf_counter() - started
     return selection
+
+
+def _returned(policy: str, pool: Pool, found: object) -> Selection:
+    """What a policy has returned, if it is a choice from the pool."""
+    where, advice = f"select: policy {policy}", "make picks with pool.pick(index, score)"
+    must_be(where, "what it returns", found, Selection, f"e.g. Selection(picks, scores); {advice}")
+    assert isinstance(found, Selection)
+    picks, scores, count = found.picks, found.scores, len(pool.candidates)
+    if not isinstance(picks, list | tuple) or any(not isinstance(pick, Pick) for pick in picks):
+        raise ValueError(f"{where}: picks must be a list of Pick, got {kind_of(picks)}; {advice}")
+    indices = [pick.index for pick in picks]
+    possible = all(isinstance(i, int) and 0 <= i < count for i in indices)
+    if not possible or len(indices) != pool.k or len(set(indices)) != pool.k:
+        raise ValueError(
+            f"{where}: picks must be k = {pool.k} different ones of {count} candidates, got indices {indices}; {advice}"
+        )
+    if np.shape(scores) != (count,) or not np.issubdtype(np.asarray(scores).dtype, np.number):
+        raise ValueError(
+            f"{where}: scores must be a number for each of {count} candidates, got {kind_of(scores)}; "
+            "before the first pick, in their order"
+        )
+    found.scores = [float(x) for x in scores]  # plain, as files hold them
+    for name, one in (("parts", found.parts), ("unseen", found.unseen)):
+        if not isinstance(one, list) or len(one) not in (0, count):
+            raise ValueError(
+                f"{where}: {name} must be a list for each of {count} candidates, or empty, got {kind_of(one)}; "
+                "leave them out"
+            )
+    return found
 
 
 def _check_beside(policy: str, scoring: Scoring) -> None:

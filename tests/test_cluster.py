@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib.util
 import json
 import logging
 import os
@@ -33,8 +32,9 @@ from drgs.cameras import orbit
 from drgs.cluster import connect, parcels
 from drgs.cluster.agreement import Disagreement, check_agreement, statement
 from drgs.cluster.cells import run_cells_on
-from drgs.cluster.connect import check_address, opened
+from drgs.cluster.connect import opened
 from drgs.cluster.parcels import Missing, Parcel, keep, opened_parcel
+from drgs.cluster.wanted import check_address
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
 from drgs.fitting.config import ActiveConfig, FitConfig
@@ -163,6 +163,20 @@ def test_a_cache_asks_workers_for_what_it_lacks(cluster, moving):
         one = select(still, [cams[3], cams[3], cams[5]], train, cache=cache, **fields)
         same(one, select(still, [cams[3], cams[3], cams[5]], train, cache=cluster_cache, workers=cluster, **fields))
     assert (cache.hits, cache.misses) == (cluster_cache.hits, cluster_cache.misses)
+
+
+@pytest.mark.parametrize("size", [0, 20_000])
+def test_a_cache_that_is_too_small_asks_workers_again(cluster, moving, size):
+    """What it had when a call began may be pushed out before its turn: each view still gets its own answer."""
+    _, still, cams = moving
+    cache = Cache(max_bytes=size)
+    for order in ([0, 1, 2, 3, 4], [4, 2, 2, 0, 3], [3, 1, 0, 4, 2]):
+        views = [cams[2 + i] for i in order]
+        found = select(still, views, cams[:2], settings=FAST, cache=cache, workers=cluster)
+        alone = select(still, views, cams[:2], settings=FAST)
+        assert (found.scores, found.parts) == (alone.scores, alone.parts)
+        assert cache.bytes <= size
+    assert (cache.hits > 5) == (size > 0)
 
 
 def test_memory_that_is_short_asks_twice(cluster, moving, monkeypatch):
@@ -417,13 +431,59 @@ def test_bad_options(tmp_path, capsys, options, line):
     assert "--scheduler and --workers must have --views active, got --views all" in capsys.readouterr().err
 
 
-def test_without_dask(monkeypatch, capsys):
-    """One line that names the extra."""
-    real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "dask" else real(name, *rest))
-    assert cli.main(["select", "no.ply", "--candidates", "orbit", "--workers", "2"]) == 2
-    said = capsys.readouterr().err
-    assert said == "drgs select: cluster: dask must be installed, is not; pip install 'drgs[cluster]'\n"
+@pytest.mark.parametrize(
+    "command", ["select no.ply --candidates orbit", "fit no -o r --views active", "reproduce static -o r"]
+)
+def test_without_dask(tmp_path, command):
+    """One line that names the extra, before anything is loaded: torch alone takes seconds."""
+    script = (
+        "import sys\n"
+        "sys.modules['dask'] = None  # as if it were not installed\n"
+        "from drgs import cli\n"
+        "code = cli.main(sys.argv[1:])\n"
+        "print(code, 'torch' in sys.modules, 'drjit' in sys.modules)\n"
+    )
+    line = [sys.executable, "-c", script, *command.split(), "--workers", "2"]
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(line, env=environ, cwd=tmp_path, text=True, capture_output=True, timeout=LIMIT)
+    name = command.split()[0]
+    assert done.stderr == f"drgs {name}: cluster: dask must be installed, is not; pip install 'drgs[cluster]'\n"
+    assert done.stdout == "2 False False\n"
+    assert not [*tmp_path.iterdir()]
+
+
+# ---- workers that do not start
+
+_STARTS = "    with opened(workers=1) as c:\n        print('started', flush=True)\n"
+
+
+@pytest.mark.parametrize(
+    ("what", "told"),
+    [
+        ("SIGKILL", "one was killed (SIGKILL), as systems do that have no memory left; "),
+        ("SIGTERM", "one was ended by SIGTERM; look at what it printed before"),
+        ("exit", "one ended with exit code 3; look at what it printed before"),
+        ("unguarded", "each runs the script that starts it once more, which must do so below `if __name__ == "),
+    ],
+)
+def test_a_worker_that_does_not_start(tmp_path, what, told):
+    """Real processes that are killed, end, or run their parent's script as they start: one line says which it was."""
+    end = {"exit": "os._exit(3)", "unguarded": "pass"}.get(what, f"os.kill(os.getpid(), signal.{what})")
+    # Python runs this module in each process as it starts; workers are those that multiprocessing has spawned.
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import os, signal, sys\nif any('spawn_main' in word for word in sys.orig_argv):\n    {end}\n"
+    )
+    guard = "if True:\n" if what == "unguarded" else "if __name__ == '__main__':\n"
+    (tmp_path / "script.py").write_text(f"from drgs.cluster.connect import opened\n{guard}{_STARTS}")
+    environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    line = [sys.executable, str(tmp_path / "script.py")]
+    done = subprocess.run(line, env=environ, text=True, capture_output=True, timeout=LIMIT)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.count("Traceback") == 1, "of the script alone"
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"ConnectionError: cluster: --workers 1 must all start, did not: {told}")
+    assert ("__main__" in last) == (what == "unguarded")
 
 
 # ---- commands

@@ -219,7 +219,7 @@ def test_lens(scene, gaussians, tmp_path, capsys):
         ("{scene} --cameras {nan}", "camera 0: position[0] must be a finite number, got NaN"),
         ("{scene} --cameras {text}", "broken.json: must be valid JSON"),
         ("{scene} --split test", "an orbit has no split"),
-        ("{scene} --cameras {good} --split test", "a cameras.json has no split"),
+        ("{scene} --cameras {good} --split test", "a list of cameras has no split"),
         ("{scene} --width 0", "--width must be in [1, 16384], got 0"),
         ("{scene} --frames 0", "--frames must be in [1, 100000], got 0"),
         ("{scene} --limit 0", "--limit must be in"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -255,3 +256,40 @@ def test_data_set_with_absent_images(place, tmp_path, monkeypatch, capsys, caplo
         assert "all must be there: restore them" in capsys.readouterr().err
     assert cli.main(fitting) == 0
     assert Run(tmp_path / "run").config()["absent"] == [gone.name]
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (
+            "[0]",
+            "what it returns must be a Selection, got a list of 1 (int); e.g. Selection(picks, scores); make picks",
+        ),
+        ("None", "what it returns must be a Selection, got None"),
+        ("Selection([0], scores)", "picks must be a list of Pick, got a list of 1 (int); make picks with pool.pick("),
+        ("Selection([pool.pick(0, 1)] * 2, scores)", "picks must be k = 1 different ones of 5 candidates, got indices"),
+        ("Selection([Pick(7, '', 1.0, {}, None)], scores)", "of 5 candidates, got indices [7]"),
+        ("Selection([pool.pick(0, 1)], [1.0])", "scores must be a number for each of 5 candidates, got a list of 1"),
+        ("Selection([pool.pick(0, 1)], [None] * 5)", "scores must be a number for each of 5 candidates, got a list"),
+        ("Selection([pool.pick(0, 1)], scores, parts=[{}])", "parts must be a list for each of 5 candidates, or empty"),
+    ],
+)
+def test_a_policy_that_returns_something_else(place, tmp_path, monkeypatch, capsys, returned, message):
+    """One line that names the policy and says what it must return; a table of NumPy's numbers is as good as a list."""
+    (tmp_path / "odd_policy.py").write_text(
+        "import numpy as np\nfrom drgs.select import Pick, Selection\n\n\n"
+        f"def chosen(pool):\n    scores = np.arange(len(pool.candidates))\n    return {returned}\n\n\n"
+        "def good(pool):\n    scores = np.arange(len(pool.candidates))\n"
+        "    return Selection([pool.pick(scores.argmax(), scores.max())], scores)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "odd_policy", raising=False)
+    line = ["select", f"{place}/run", "--candidates", f"{place}/data", "-o", f"{tmp_path}/out.json", "--policy"]
+    assert cli.main([*line, "odd_policy:chosen"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("drgs select: policy odd_policy:chosen: ")
+    assert message in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "out.json").exists()
+    assert cli.main([*line, "odd_policy:good"]) == 0
+    assert json.loads((tmp_path / "out.json").read_text())["candidates"][4]["score"] == 4

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib.util
 import logging
+import multiprocessing
 import os
 import platform
-import re
 import signal
 import threading
 import time
@@ -29,7 +28,9 @@ from drgs import runtime
 from drgs.cluster.agreement import Disagreement, check_agreement, statement, worker_name, worker_statement
 from drgs.cluster.parcels import Parcel, keep
 from drgs.cluster.views import answers
+from drgs.cluster.wanted import check_wanted
 from drgs.display.progress import Bar
+from drgs.guards.memory import available, is_out_of_memory
 from drgs.guards.unfinished import temporary_folder
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from drgs.gain import Information
     from drgs.information.pool import Question
 
-__all__ = ["CONNECT_SECONDS", "WORKER_SECONDS", "Cluster", "check_address", "check_wanted", "opened"]
+__all__ = ["CONNECT_SECONDS", "WORKER_SECONDS", "Cluster", "opened"]
 
 CONNECT_SECONDS = 10.0
 """Within which a scheduler must answer."""
@@ -49,44 +50,9 @@ WORKER_SECONDS = 60.0
 """That a cluster may be without any worker."""
 
 _START_SECONDS = 300  # for a local worker to come up, on a busy machine
+_RUN_AGAIN = 64  # exit code of a worker that has found itself running its parent's script (EX_USAGE)
 _LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
-_MOST = 1024  # local workers
-_ADDRESS = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):(\d{1,5})")
 _log = logging.getLogger(__name__)
-
-
-def check_address(scheduler: str) -> str:
-    """`HOST:PORT` as Dask has it.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    found = _ADDRESS.fullmatch(scheduler)
-    if not found or not 1 <= int(found[2]) <= 65535:
-        raise ValueError(
-            f"cluster: --scheduler must be HOST:PORT, got {scheduler!r}; `dask scheduler` says both, its port is 8786 "
-            "unless it was told another"
-        )
-    return f"tcp://{found[1]}:{int(found[2])}"
-
-
-def check_wanted(scheduler: str | None, workers: int | None) -> str | None:
-    """Refuse what `opened` would, but for what only a connection shows.
-
-    Returns:
-        The scheduler's address as Dask has it.
-    Raises:
-        ValueError: If an argument is bad, both are given, or Dask is not installed.
-    """
-    if scheduler is not None and workers is not None:
-        raise ValueError("cluster: --scheduler must be without --workers, got both; join a cluster, or start one here")
-    address = None if scheduler is None else check_address(scheduler)
-    if workers is not None and not 1 <= workers <= _MOST:
-        raise ValueError(f"cluster: --workers must be in [1, {_MOST}], got {workers}; one for each core is most useful")
-    for package in ("dask", "distributed"):
-        if importlib.util.find_spec(package) is None:
-            raise ValueError(f"cluster: {package} must be installed, is not; pip install 'drgs[cluster]'")
-    return address
 
 
 @contextlib.contextmanager
@@ -100,11 +66,13 @@ def opened(scheduler: str | None = None, workers: int | None = None) -> Iterator
     Raises:
         ValueError: If an argument is bad, Dask is not installed, or a worker computes with something else than this
             process (`Disagreement`).
-        ConnectionError: If no scheduler answers, or there are no workers.
+        ConnectionError: If no scheduler answers, there are no workers, or one does not start, and why.
     """
     if scheduler is None and workers is None:
         yield None
         return
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # as multiprocessing asks itself
+        raise SystemExit(_RUN_AGAIN)  # a worker to be, which runs the script of its parent; that says so
     address = check_wanted(scheduler, workers)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silent())
@@ -174,9 +142,11 @@ def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
         "distributed.nanny.pre-spawn-environ": {},  # it would be written into the environment of this process
     }
     environ = {**one, "DRGS_VARIANT": variant, "OMP_WAIT_POLICY": "PASSIVE"}
+    ended: list[int] = []
     with dask.config.set(config):
         try:
             local = LocalCluster(
+                worker_class=_watched(ended),
                 n_workers=count,
                 threads_per_worker=1,
                 processes=True,
@@ -190,11 +160,45 @@ def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
                 death_timeout=_START_SECONDS,
             )
         except (OSError, TimeoutError, RuntimeError) as error:
-            raise ConnectionError(
-                f"cluster: {count} workers must start, did not: {error}; a script must do it below "
-                '`if __name__ == "__main__":`'
-            ) from error
+            raise ConnectionError(f"cluster: --workers {count} must all start, did not: {_why(ended, error)}") from None
         return Client(local, timeout=_START_SECONDS, set_as_default=False, name="drgs", direct_to_workers=True), local
+
+
+def _watched(ended: list[int]) -> type:
+    """Dask's keeper of a worker process, which also notes the exit code of one that ends."""
+    from distributed import Nanny
+
+    class Watched(Nanny):
+        def _on_worker_exit_sync(self, exitcode: int) -> None:
+            ended.append(exitcode)
+            super()._on_worker_exit_sync(exitcode)
+
+    return Watched
+
+
+def _why(ended: Sequence[int], error: BaseException) -> str:
+    """Why workers did not start, and what to do.
+
+    Args:
+        ended: Exit codes of those that have ended; of a signal, its negative number.
+        error: What Dask has raised.
+    """
+    if _RUN_AGAIN in ended:
+        return 'each runs the script that starts it once more, which must do so below `if __name__ == "__main__":`'
+    while error.__cause__ is not None:
+        error = error.__cause__
+    if -signal.SIGKILL in ended or is_out_of_memory(error):
+        there = available()
+        left = "" if there is None else f"; {there / 1e9:.1f} GB are left now"
+        what = "one was killed (SIGKILL), as systems do that" if -signal.SIGKILL in ended else "they"
+        return f"{what} have no memory left{left}; free some, or start fewer"
+    if codes := [code for code in ended if code]:
+        code = codes[0]
+        how = f"one was ended by {signal.Signals(-code).name}" if code < 0 else f"one ended with exit code {code}"
+        return f"{how}; look at what it printed before"
+    if isinstance(error, TimeoutError):
+        return f"they were not ready in {_START_SECONDS} s; start fewer, or try again when the machine is less busy"
+    return f"{error or type(error).__name__}; try again, or without them"
 
 
 @contextlib.contextmanager

@@ -10,19 +10,7 @@ if TYPE_CHECKING:
     from drgs.cluster.connect import Cluster
     from drgs.commands.option_groups import Clustered
 
-__all__ = ["check_workers", "workers_of"]
-
-
-def check_workers(args: Clustered) -> None:
-    """Refuse what cannot be, before anything is read.
-
-    Raises:
-        ValueError: If an option is bad, both are given, or Dask is not installed.
-    """
-    if args.scheduler is not None or args.workers is not None:
-        from drgs.cluster.connect import check_wanted
-
-        check_wanted(args.scheduler, args.workers)
+__all__ = ["workers_of"]
 
 
 def workers_of(args: Clustered) -> AbstractContextManager[Cluster | None]:

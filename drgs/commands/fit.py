@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from drgs.commands.clustered import check_workers, workers_of
+from drgs.commands.clustered import workers_of
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
 from drgs.files import Run
@@ -26,7 +26,6 @@ def run(args: Fit) -> None:
     names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
     config = FitConfig(settings=settings, **{n: getattr(args, n) for n in names if hasattr(args, n)})
     active = args.active()
-    check_workers(args)
     # Before minutes of reading images and triangulating points.
     claim_run(Run(args.output), "fit", args.resume, [args.data])
     dataset = load_dataset(

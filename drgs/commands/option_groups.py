@@ -151,7 +151,8 @@ class Seen(Settings, Around, Views):
 
     scene: SceneFile
     cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
+    """A data set, a run (its photographs' cameras), a cameras.json or selection.json, or orbit; default a run's own,
+    else orbit."""
     split: Split = "all"
     """Which views of a data set."""
     limit: int = 2
@@ -188,7 +189,7 @@ class Comparing(Informed, Around, Views):
 
     scene: SceneFile
     train: str | None = None
-    """Views that are known: a data set, a run, or a cameras.json; default the run's."""
+    """Views that are known: a data set, a run, a cameras.json or a selection.json; default the run's."""
     split: Split = "all"
     """Which of the other views, where they are a data set's."""
     count: int = 40

@@ -76,7 +76,8 @@ class Render(Settings, Around, Views, Moments):
 
     scene: SceneFile
     cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default orbit, or with --view the run."""
+    """A data set, a run (its photographs' cameras), a cameras.json or selection.json, or orbit; default orbit, or with
+    --view the run."""
     output: OutputPath = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None
@@ -195,7 +196,7 @@ class Select(Choosing, Clustered, Comparing):
     """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
     candidates: str
-    """A data set or a run (those of its views that are not known), a cameras.json, orbit, or dome."""
+    """A data set or a run (those of its views that are not known), a cameras.json or selection.json, orbit, or dome."""
     k: Annotated[int, arg(aliases=["-k"])] = 1
     """Views to pick, each given the ones before."""
     output: OutputPath = Path("out/select.json")
@@ -209,7 +210,8 @@ class Fisher(Comparing):
     """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
 
     cameras: str | None = None
-    """Views to draw maps for: a data set, a run, a cameras.json, orbit, or dome; default the known ones."""
+    """Views to draw maps for: a data set, a run, a cameras.json or selection.json, orbit, or dome; default the known
+    ones."""
     output: OutputPath = Path("out/fisher")
     """Folder for information.safetensors, fisher.json and the maps."""
     limit: int = 4
@@ -273,7 +275,8 @@ class Query(Settings, Around, Views):
     preset: Preset = "fast"
     """Render settings of a named system."""
     cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json, or orbit; default a run's own, else orbit."""
+    """A data set, a run (its photographs' cameras), a cameras.json or selection.json, or orbit; default a run's own,
+    else orbit."""
     split: Split = "all"
     """Which views of a data set."""
     limit: int = 4

@@ -99,7 +99,10 @@ def run(args: Render) -> None:
     if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
         save_cameras_json(args.output / "cameras.json", cameras)
     else:
-        _say(args, "no cameras.json: its layout has no lens and no skew; render.json holds the cameras")
+        _say(
+            args,
+            "no cameras.json: its layout has no lens and no skew; render.json holds the cameras, --cameras reads it",
+        )
     write_json(args.output / "render.json", {"schema": SCHEMA, "command": "render"} | report)
     _say(args, _summary(report, args.output))
 

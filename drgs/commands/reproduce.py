@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.commands import fisher
-from drgs.commands.clustered import check_workers, workers_of
+from drgs.commands.clustered import workers_of
 from drgs.commands.options import Fisher
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -36,7 +36,6 @@ _FIGURE = "all views"  # is given what the others choose from: no row of the she
 
 def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
-    check_workers(args)
     out: Path = args.output
     claim(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
     known = _same_data(out, args.data)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.commands.clustered import check_workers, workers_of
+from drgs.commands.clustered import workers_of
 from drgs.commands.given import Given
 from drgs.commands.viewpoints import check_counts, known_views, other_views, timed
 from drgs.data.camera_lists import described
@@ -35,7 +35,6 @@ _SHORT = {
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
     check_counts(args)
-    check_workers(args)
     args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior.given(args.prior, args.relative_prior)

@@ -1,7 +1,8 @@
 """Which views an option names: --cameras, --candidates and --train, the same for every command.
 
     orbit, dome     cameras made around what there is to see (orbits.py)
-    a cameras.json  its list; a model folder of INRIA's stands for the one in it
+    a cameras.json  its list; a model folder of INRIA's stands for the one in it; a selection.json or another file of a
+                    command, its picks or views
     a run           the views of its data set, split as for its fit; as known views, those that it was fitted to
     a data set      its views, split as for the fit of the run that is looked at, if it is one
 
@@ -50,7 +51,7 @@ __all__ = [
 MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
 _PIXELS = 130_000  # of a view where there is no fit that says
 _MAX_COUNT = 10_000
-_NOUNS = {"orbit": "an orbit", "dome": "a dome", "list": "a cameras.json"}
+_NOUNS = {"orbit": "an orbit", "dome": "a dome", "list": "a list of cameras"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Source:
     Attributes:
         option: Its name, for messages.
         text: Its value.
-        kind: `orbit`, `dome`, `list` (a cameras.json), `run` or `data`.
+        kind: `orbit`, `dome`, `list` (of cameras, in JSON), `run` or `data`.
     """
 
     option: str
@@ -93,7 +94,7 @@ class Source:
             raise ValueError(f"--split {split} must have {self.option} DATA, {noun} has no split; drop it")
 
     def listed(self) -> list[Camera]:
-        """The cameras of a cameras.json."""
+        """The cameras of a list."""
         return load_cameras_json(Path(self.text))
 
     def dataset(self, args: Views, given: Given, lazy: bool = True) -> Dataset:
@@ -262,7 +263,7 @@ def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
     pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
-        return Known([at_most(camera, pixels) for camera in source.listed()], where, pixels)
+        return Known([at_most(camera.undistorted(), pixels) for camera in source.listed()], where, pixels)
     views = source.dataset(args, given).views
     if source.kind == "data":
         cameras = [_camera(view, {}, pixels) for view in views]
@@ -306,7 +307,7 @@ def other_views(
         circle = dataclasses.replace(Wish.of(args), elevation=0.0, span=360.0)
         return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
     if source.kind == "list":
-        return [at_most(camera, known.pixels) for camera in source.listed()], text
+        return [at_most(camera.undistorted(), known.pixels) for camera in source.listed()], text
     views = source.split(source.dataset(args, given), args.split, given)
     same = (source.record.data if source.kind == "run" else Path(text)).resolve() == known.data
     used = {camera.name for camera in known.cameras} if same and fresh else set()

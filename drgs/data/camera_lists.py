@@ -1,16 +1,24 @@
-"""Lists of cameras as INRIA's `cameras.json` has them: pinhole, no skew, position and rotation of c2w."""
+"""Lists of cameras in JSON.
+
+What is read is one form, wherever cameras are named: a list of cameras, or an object with such a list, as commands
+write it (`cameras`, else the `camera` of each of its `picks`, else of its `views`). A camera is what `described` makes,
+of any lens, or as INRIA's `cameras.json` has it: pinhole, no skew, position and rotation of c2w.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import inverse_pose
 from drgs.files import atomic_write
+from drgs.guards.arguments import kind_of
 from drgs.guards.json_files import check_json, read_json
 
 __all__ = ["camera_described", "described", "is_camera_list", "load_cameras_json", "save_cameras_json"]
@@ -24,6 +32,8 @@ _DESCRIBED = {
     "model": str,
     "distortion": [float],
 }
+_LISTS = ("cameras", "picks", "views")
+_OURS = re.compile(rb'\{\s*("schema"\s*:\s*\d+\s*,\s*)?"(command|cameras)"\s*:')  # how such an object begins
 _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position": [float], "rotation": [[float]]}
 
 
@@ -62,45 +72,71 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
 
 
 def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
-    """Read cameras in INRIA's layout: a list of id, img_name, width, height, position, rotation
-    (c2w), fx, fy[, cx, cy, time].
+    """Read cameras, in their order; of what a command wrote (selection.json, render.json, ...), those of its picks or
+    views.
+
+    A camera is of `described`, or in INRIA's layout: id, img_name, width, height, position, rotation (c2w), fx, fy[,
+    cx, cy, time].
 
     Raises:
         FileNotFoundError: no such file.
         ValueError: not that layout, or a camera that cannot be; names the first one.
     """
     path = Path(path)
-    entries = read_json(path, "a cameras.json file")
-    if not isinstance(entries, list) or not entries:
-        raise ValueError(
-            f"{path}: must be a list of at least one camera, got {type(entries).__name__}; see INRIA's layout"
-        )
     cameras = []
-    for index, entry in enumerate(entries):
-        where = f"{path}: camera {index}"
-        check_json(where, entry, _ENTRY, "see INRIA's layout")
-        w, h = entry["width"], entry["height"]
-        center = {"cx": entry.get("cx", w / 2), "cy": entry.get("cy", h / 2)}
-        check_json(where, center, {"cx": float, "cy": float}, "see INRIA's layout")
-        sizes = len(entry["position"]), [len(row) for row in entry["rotation"]]
-        if sizes != (3, [3, 3, 3]):
-            raise ValueError(f"{where}: position must hold 3 numbers and rotation 3x3, got other sizes; correct them")
-        w2c = inverse_pose(where, np.column_stack([entry["rotation"], entry["position"]]))
-        name = str(entry.get("img_name", entry.get("id", index)))
-        try:
-            K = intrinsics(entry["fx"], entry["fy"], center["cx"], center["cy"])
-            cameras.append(Camera(K=K, w2c=w2c, width=w, height=h, name=name, time=entry.get("time")))
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
+    for where, entry in _entries(path, read_json(path, "a cameras.json file")):
+        if isinstance(entry, dict) and "c2w" in entry:
+            cameras.append(camera_described(where, entry))
+        else:
+            cameras.append(_of_inria(where, entry))
     return cameras
 
 
+def _entries(path: Path, found: object) -> list[tuple[str, Any]]:
+    """(where it stands, camera as parsed) of each camera of a file."""
+    if isinstance(found, dict):
+        lists = {key: found[key] for key in _LISTS if isinstance(found.get(key), list)}
+        key = next(iter(lists), "")
+        rows = [row.get("camera", row) if isinstance(row, dict) else row for row in lists.get(key, ())]
+        if not rows or any(not isinstance(row, dict) for row in rows):
+            raise ValueError(
+                f"{path}: must be a list of at least one camera, or have `cameras`, or poses in `picks` or `views`, "
+                "got none; name a cameras.json, or a selection.json of drgs"
+            )
+        return [(f"{path}: {key} {i}", row) for i, row in enumerate(rows)]
+    if not isinstance(found, list) or not found:
+        raise ValueError(f"{path}: must be a list of at least one camera, got {kind_of(found)}; see INRIA's layout")
+    return [(f"{path}: camera {i}", row) for i, row in enumerate(found)]
+
+
+def _of_inria(where: str, entry: Any) -> Camera:
+    """A camera in INRIA's layout."""
+    check_json(where, entry, _ENTRY, "see INRIA's layout")
+    w, h = entry["width"], entry["height"]
+    center = {"cx": entry.get("cx", w / 2), "cy": entry.get("cy", h / 2)}
+    check_json(where, center, {"cx": float, "cy": float}, "see INRIA's layout")
+    sizes = len(entry["position"]), [len(row) for row in entry["rotation"]]
+    if sizes != (3, [3, 3, 3]):
+        raise ValueError(f"{where}: position must hold 3 numbers and rotation 3x3, got other sizes; correct them")
+    w2c = inverse_pose(where, np.column_stack([entry["rotation"], entry["position"]]))
+    name = str(entry.get("img_name", entry.get("id", where.rpartition(" ")[2])))
+    try:
+        K = intrinsics(entry["fx"], entry["fy"], center["cx"], center["cy"])
+        return Camera(K=K, w2c=w2c, width=w, height=h, name=name, time=entry.get("time"))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
 def is_camera_list(path: Path) -> bool:
-    """Whether a JSON file is a list, as INRIA's cameras.json is, and not a transforms.json."""
+    """Whether a JSON file holds cameras (`load_cameras_json`), and is not a transforms.json.
+
+    A command's file may turn out to have none: then it is refused as what it is, not as a data set.
+    """
     if path.suffix != ".json" or not path.is_file():
         return path.name == "cameras.json"
     with path.open("rb") as file:
-        return file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
+        start = file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
+    return start.startswith(b"[") or _OURS.match(start) is not None
 
 
 def described(camera: Camera) -> dict:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.data.camera_lists import described
 from drgs.data.guided import Matches
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
@@ -321,6 +322,7 @@ class ActiveViews:
             "pool_leak": self.pool_leak,
             "pool": [view.name for view in self.views],
             "start": [{"index": i, "name": self.views[i].name, **self._where(i)} for i in initial],
+            "cameras": [described(self._camera(i)) for i in self.chosen],
             "picks": self.picks,
             "measured": self.measured,
         }

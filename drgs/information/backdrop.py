@@ -15,6 +15,7 @@ Cells are those of a cube around its center whose faces have 16x16 of them, spac
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,15 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
 
-__all__ = ["CELLS", "Sphere", "backdrop_cells", "backdrop_information", "backdrop_sphere", "backdrop_variance"]
+__all__ = [
+    "CELLS",
+    "Sphere",
+    "backdrop_cells",
+    "backdrop_sphere",
+    "backdrop_variance",
+    "opacity_of",
+    "painted_opacity",
+]
 
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
@@ -60,6 +69,9 @@ def backdrop_sphere(
     """Around all cameras, as far away as nearly all surfaces that they show, each at its time; None: infinitely far
     away, where they show none.
 
+    It depends on the scene and on all of these cameras, in whatever order. So it moves as candidates come and go, with
+    the bits that a single call would find; `drgs.select.Cache` keeps what views tell apart from it.
+
     Args:
         scene, cameras: What is seen, by whom.
         answers: Asks the scene's views, in place of one after another here (`Pool.answers`).
@@ -67,7 +79,8 @@ def backdrop_sphere(
     if not cameras:
         raise ValueError("fisher.backdrop_sphere: there must be at least one camera, got none")
     centers = np.stack([camera.center for camera in cameras])
-    center = centers.mean(0)
+    # Of the cameras, not of their order, which the last bits of a running sum depend on.
+    center = np.array([math.fsum(along) / len(cameras) for along in centers.T.tolist()])
     found = answers(_surfaces, cameras) if answers else (_surfaces(scene, camera) for camera in cameras)
     solid = np.concatenate([one["depths"].numpy() for one in found])
     if not len(solid):
@@ -109,30 +122,30 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
     return torch.from_numpy(found.reshape(camera.height, camera.width))
 
 
-def _open(scene: Scene, camera: Camera, settings: RenderSettings, alpha: torch.Tensor | None = None) -> torch.Tensor:
-    """(H, W) float64: (1 - alpha)^2."""
+def opacity_of(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tensor:
+    """(H, W) float32 opacity alpha of a view."""
     from drgs.integrator import render
 
-    if alpha is None:
-        with torch.no_grad():
-            alpha = render(colors_only(scene, camera.time), camera, settings, outputs=()).alpha
-    return (1 - alpha.double().cpu()).clamp(min=0).square()
+    with torch.no_grad():
+        return render(colors_only(scene, camera.time), camera, settings, outputs=()).alpha.cpu()
 
 
-def backdrop_information(
-    scene: Scene,
+def _open(opacity: torch.Tensor) -> torch.Tensor:
+    """(H, W) float64: (1 - alpha)^2."""
+    return (1 - opacity.double().cpu()).clamp(min=0).square()
+
+
+def painted_opacity(
+    opacity: torch.Tensor,
     camera: Camera,
-    settings: RenderSettings,
     channel_weights: Sequence[float],
     mask: torch.Tensor | None = None,
     sphere: Sphere | None = None,
-    opacity: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """(1536, 3) float64 H_c of a view in each channel, times the channel's weight; with a mask (H, W) of its square.
-
-    `opacity` (H, W) is that of the view, where it is known already.
+    """(1536, 3) float64 H_c of a view of a known opacity (H, W), in each channel, times the channel's weight; with a
+    mask (H, W) of its square.
     """
-    total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(scene, camera, settings, opacity)
+    total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(opacity)
     if mask is not None:
         open_ = open_ * mask.detach().double().cpu().square()
     total.index_add_(0, backdrop_cells(camera, sphere).flatten(), open_.flatten())
@@ -149,4 +162,4 @@ def backdrop_variance(
 ) -> torch.Tensor:
     """(H, W) float64 (1 - alpha)^2 times the weights (1536, 3) of the pixel's cell, summed over weighted channels."""
     each = weights.double().cpu() @ torch.tensor(channel_weights, dtype=torch.float64)
-    return _open(scene, camera, settings) * each[backdrop_cells(camera, sphere)]
+    return _open(opacity_of(scene, camera, settings)) * each[backdrop_cells(camera, sphere)]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.gain import Gain, Information, scorer
+from drgs.information.backdrop import opacity_of, painted_opacity
 from drgs.information.network_groups import NETWORK_GROUPS
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ class Asked:
 
 
 _OF_SCENES = ("columns", "probes")
+_OPACITY = "opacity"  # the name under which a view's opacity travels as an Information
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,20 +101,44 @@ class Questions:
         settings: Of the renderer.
         asked: In the order of asking.
         empty_outside: Whether it is known that nothing is outside of masks, so that the view has shown it.
+        is_painted: Whether what is told about the backdrop is about the cells of its sphere; else it is the view's
+            opacity, by which this is known wherever the sphere is (`painted`).
     """
 
     settings: RenderSettings
     asked: tuple[Asked, ...]
     empty_outside: bool = False
+    is_painted: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
         """What one view says, in float32, as it is kept."""
         found: dict[str, torch.Tensor] = {}
         opacity: list[torch.Tensor] = []
         for one in self.asked:
-            empty = one.function == "backdrop" and self.empty_outside
-            found |= one(scene, camera, self.settings, None if empty else mask, opacity)
+            if one.function != "backdrop":
+                found |= one(scene, camera, self.settings, mask, opacity)
+            elif self.is_painted:
+                found |= one(scene, camera, self.settings, None if self.empty_outside else mask, opacity)
+            else:
+                found[_OPACITY] = opacity[0] if opacity else opacity_of(scene, camera, self.settings)
         return {name: x.to(torch.float32) for name, x in found.items()}
+
+    def lasting(self) -> Questions:
+        """Questions whose answers depend on a view alone, not on the others of its pool, around which the sphere is."""
+        asked = tuple(dataclasses.replace(one, options=()) if one.function == "backdrop" else one for one in self.asked)
+        return Questions(self.settings, asked, is_painted=False)
+
+    def painted(self, answer: Information, camera: Camera, mask: torch.Tensor | None) -> Information:
+        """What a view says to these questions, of its answer to the `lasting` ones: the same bits."""
+        found = dict(answer)
+        if (opacity := found.pop(_OPACITY, None)) is None:
+            return found
+        one = next(one for one in self.asked if one.function == "backdrop")
+        options: dict[str, Any] = dict(one.options)
+        sphere, mask = options["sphere"], None if self.empty_outside else mask
+        told = painted_opacity(opacity, camera, (1.0, 1.0, 1.0), mask, sphere)
+        found[f"{one.block}.backdrop" if one.block else "backdrop"] = told.to(torch.float32)
+        return found
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ Reference:
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 
@@ -21,18 +22,53 @@ import torch
 from drgs.cameras import Camera
 from drgs.gain import Gain, Information, Prior, check
 from drgs.guards.memory import available
-from drgs.information.cache import camera_key, value_key
+from drgs.information.cache import Cache, size_of
 from drgs.information.combine import Combination
 from drgs.information.network_groups import NETWORK_GROUPS
-from drgs.information.pool import Pool, Question, Selection
+from drgs.information.pool import Pool, Question, Selection, ViewQuestion
 
-__all__ = ["InformationSource", "ViewInformation", "greedy"]
-
-InformationSource = tuple[Question, Hashable]
-"""What views are asked, and the key of the cache: what the answer depends on besides scene, camera and mask."""
+__all__ = ["AskedView", "InformationSource", "ViewInformation", "greedy"]
 
 _SHARE = 0.25  # of the memory there is, for information that could be computed again
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
+
+
+@dataclasses.dataclass(frozen=True)
+class InformationSource:
+    """What views are asked, and what becomes of the answers.
+
+    Attributes:
+        question: Its answers are what a cache keeps.
+        kept_by: What these depend on besides scene, camera and mask; None: on the question.
+        by_name: Whether they may also depend on what a camera is called.
+        finish: (answer, camera, mask) -> the view's information; None: it is the answer.
+    """
+
+    question: Question
+    kept_by: Hashable = None
+    by_name: bool = False
+    finish: Callable[[Information, Camera, torch.Tensor | None], Information] | None = None
+
+    def to(self, view: AskedView) -> ViewQuestion:
+        """The question to one view."""
+        kept_by = (self.kept_by, view.camera.name) if self.by_name else self.kept_by
+        return ViewQuestion(self.question, view.camera, view.mask, kept_by)
+
+
+@dataclasses.dataclass(frozen=True)
+class AskedView:
+    """A view whose information is wanted.
+
+    Attributes:
+        what: It is, for messages.
+        camera, mask: Its.
+        is_known: Whether it is one of the known ones.
+    """
+
+    what: str
+    camera: Camera
+    is_known: bool = False
+    mask: torch.Tensor | None = None
 
 
 class ViewInformation:
@@ -40,6 +76,7 @@ class ViewInformation:
 
     Attributes:
         computed: Views that were not in the cache.
+        bytes: Of what a cache keeps of all views so far.
         told: Group of a network -> whether any view so far says something about it.
     """
 
@@ -51,59 +88,41 @@ class ViewInformation:
             known: The same of views that are known, where less is needed of them.
         """
         self.pool, self.source, self.known = pool, source, known or source
-        self.computed = self.done = 0
+        self.computed = self.done = self.bytes = 0
         self._expected = len(pool.train) + len(pool.candidates)
         self.told: dict[str, bool] = {}
-        self._coming: Iterator[Information] | None = None
 
-    def ahead(self, views: Sequence[tuple[Camera, bool, torch.Tensor | None]]) -> None:
-        """Say which views will be asked for next, in this order: (camera, is known, mask). Workers begin with them."""
-        pool, wanted, seen = self.pool, [], set()
-        if pool.workers is None:
-            return
-        cache = pool.cache
-        if cache is not None and not cache.recognizes(pool.scene):
-            cache = None  # which finds nothing then, not even of a view that comes twice
-        for camera, is_known, mask in views:
-            question, key = self._key(camera, is_known, mask)
-            if cache is None or not (key in seen or cache.has(pool.scene, key)):
-                wanted.append((question, camera, mask))
-            seen.add(key)
-        self._coming = pool.workers.each(pool.scene, wanted)
+    def each(self, views: Sequence[AskedView]) -> Iterator[Information]:
+        """Of these views, one after another: nothing of one is held while the next one is computed."""
 
-    def _key(self, camera: Camera, is_known: bool, mask: torch.Tensor | None) -> tuple[Question, Hashable]:
-        """What a view is asked, and the key under which the cache keeps the answer."""
-        question, key = self.known if is_known else self.source
-        if self.pool.cache is None:
-            return question, None
-        return question, (key, camera_key(camera), None if mask is None else value_key(mask))
+        def accept(i: int, answer: Information) -> Information:
+            found = {name: x.to(torch.float32) for name, x in answer.items()}
+            self.computed += 1
+            check(f"select: {views[i].what}", found, self.pool.scoring.criterion)
+            return found
 
-    def __call__(
-        self, what: str, camera: Camera, is_known: bool = False, mask: torch.Tensor | None = None
-    ) -> Information:
-        """Of one view; `what` it is, for messages."""
-        pool, (question, key) = self.pool, self._key(camera, is_known, mask)
-        if pool.cache is None:
-            found = self._new(what, camera, mask, question)
-        else:
-            found = pool.cache.get(pool.scene, key, lambda: self._new(what, camera, mask, question))
-        for name, x in found.items():
-            if name.rpartition(".")[2] in NETWORK_GROUPS:
-                self.told[name] = self.told.get(name, False) or bool(x.any())
-        self.done += 1
-        if pool.progress:
-            pool.progress(self.done, self._expected)
-        return found
+        answers = self.pool.told([self._source(view).to(view) for view in views], accept)
+        for view in views:
+            yield self._finished(view, next(answers))
 
     def expect(self, more: int) -> None:
         """So many views will be asked for once more, for `progress`."""
         self._expected += more
 
-    def _new(self, what: str, camera: Camera, mask: torch.Tensor | None, question: Question) -> Information:
-        answer = question(self.pool.scene, camera, mask) if self._coming is None else next(self._coming)
-        found = {name: x.to(torch.float32) for name, x in answer.items()}
-        self.computed += 1
-        check(f"select: {what}", found, self.pool.scoring.criterion)
+    def _source(self, view: AskedView) -> InformationSource:
+        return self.known if view.is_known else self.source
+
+    def _finished(self, view: AskedView, answer: Information) -> Information:
+        """The information that an answer is, or that is made of it; counted."""
+        self.bytes += size_of(answer)
+        finish = self._source(view).finish
+        found = finish(answer, view.camera, view.mask) if finish else answer
+        for name, x in found.items():
+            if name.rpartition(".")[2] in NETWORK_GROUPS:
+                self.told[name] = self.told.get(name, False) or bool(x.any())
+        self.done += 1
+        if self.pool.progress:
+            self.pool.progress(self.done, self._expected)
         return found
 
 
@@ -128,7 +147,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         left_out=gains[0].left_out,
         evaluations=len(gains),
         computed=information.computed,
-        notes=[*_notes(gains, combination.apart), *_silent(information.told)],
+        notes=[*_notes(gains, combination.apart), *_silent(information.told), *_crowded(pool.cache, information)],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
     falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0 and combination.falls
@@ -157,21 +176,24 @@ def _first_round(
     H: dict[str, torch.Tensor] = {}
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
-    masks, candidates = pool.masks or [None] * len(pool.train), [(camera, False, None) for camera in pool.candidates]
-    information.ahead([*((x, True, mask) for x, mask in zip(pool.train, masks, strict=True)), *candidates])
-    for i, (camera, mask) in enumerate(zip(pool.train, masks, strict=True)):
-        part = information(f"training view {i} ({camera.name})", camera, is_known=True, mask=mask)
+    known = [
+        AskedView(f"training view {i} ({camera.name})", camera, True, mask)
+        for i, (camera, mask) in enumerate(zip(pool.train, pool.masks or [None] * len(pool.train), strict=True))
+    ]
+    candidates = [AskedView(f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]
+    told = information.each([*known, *candidates])
+    for _ in known:
+        part = next(told)
         H = H or _nothing(part)
         _add(H, part)
-    views = [(i, f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]
     score, everything, keeps = None, None, pool.k > 1
-    for i, what, camera in views:
-        part = information(what, camera)
+    for i in range(len(candidates)):
+        part = next(told)
         if i == 0:
             H = _nothing(part) | H  # also of what known views were not asked
             if combination.pooled:
                 everything = {name: x.clone() for name, x in H.items()}
-                keeps = keeps or _fits(part, len(views))
+                keeps = keeps or _fits(part, len(candidates))
             else:
                 score = combination.scorer(H)
         if everything is not None:
@@ -184,16 +206,16 @@ def _first_round(
     if everything is not None:
         score = combination.scorer(H, everything)
         if not keeps:
-            information.expect(len(views))
-            information.ahead(candidates)
-        gains = [score(kept[i] if keeps else information(what, camera)) for i, what, camera in views]
+            information.expect(len(candidates))
+            told = information.each(candidates)
+        gains = [score(kept[i] if keeps else next(told)) for i in range(len(candidates))]
     return H, everything, gains, kept
 
 
 def _fits(part: Information, count: int) -> bool:
     """Whether so many views' information may be held at a time: computing it twice takes longer, but no memory."""
     there = available()
-    return there is None or count * sum(x.nbytes for x in part.values()) < _SHARE * there
+    return there is None or count * size_of(part) < _SHARE * there
 
 
 def _nothing(part: Information) -> dict[str, torch.Tensor]:
@@ -225,6 +247,16 @@ def _silent(told: dict[str, bool]) -> list[str]:
         "as at its start, or no Gaussian in sight moves)"
         for name, any_view in told.items()
         if not any_view
+    ]
+
+
+def _crowded(cache: Cache | None, information: ViewInformation) -> list[str]:
+    """What is worth saying about a cache that cannot hold the views of one call."""
+    if cache is None or information.bytes <= cache.max_bytes:
+        return []
+    return [
+        f"cache: max_bytes must be at least {information.bytes} for all {information.done} views to be found by the "
+        f"next call, is {cache.max_bytes}; the others are computed again"
     ]
 
 

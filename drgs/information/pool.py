@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 import torch
@@ -12,7 +13,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.gain import CRITERIA, METHODS, Information, Prior
 from drgs.guards.arguments import must_be
-from drgs.information.cache import Cache
+from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.choices import (
     BLOCK_NAMES,
     COMBINES,
@@ -27,7 +28,7 @@ from drgs.information.network_groups import network_groups
 from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
 
-__all__ = ["Pick", "Pool", "Question", "Scoring", "Selection", "Workers"]
+__all__ = ["Pick", "Pool", "Question", "Scoring", "Selection", "ViewQuestion", "Workers"]
 
 _KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
 
@@ -198,6 +199,28 @@ Question = Callable[[Scene, Camera, torch.Tensor | None], Information]
 """What is asked of a view: scene, camera and mask -> tensors by name. Other processes can be sent it."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ViewQuestion:
+    """A question to one view.
+
+    Attributes:
+        question: What is asked.
+        camera, mask: Of the view.
+        kept_by: What the answer depends on besides scene, camera and mask; None: on the question.
+    """
+
+    question: Question
+    camera: Camera
+    mask: torch.Tensor | None = None
+    kept_by: Hashable = None
+
+    @property
+    def key(self) -> Hashable:
+        """By which a cache keeps the answer."""
+        by = self.question if self.kept_by is None else self.kept_by
+        return by, camera_key(self.camera), None if self.mask is None else value_key(self.mask)
+
+
 class Workers(Protocol):
     """Other processes that views are asked about in; `drgs.cluster.connect.Cluster` is some."""
 
@@ -242,10 +265,51 @@ class Pool:
     workers: Workers | None = None
 
     def answers(self, question: Question, cameras: Iterable[Camera]) -> Iterator[Information]:
-        """What views say, one after another: computed by the workers, if there are any."""
+        """What views say to one question, one after another; see `told`."""
+        return self.told([ViewQuestion(question, camera) for camera in cameras])
+
+    def told(
+        self,
+        views: Sequence[ViewQuestion],
+        accept: Callable[[int, Information], Information] = lambda i, answer: answer,
+    ) -> Iterator[Information]:
+        """What views say, one after another: out of the cache, else computed by the workers, if any, else here.
+
+        Args:
+            views: In their order.
+            accept: Called with the place of a view and what was computed of it; returns what is made of that, and kept.
+        """
+        cache = self.cache
+        if cache is None:
+            coming = self._computed(views)
+            for i in range(len(views)):
+                yield accept(i, next(coming))
+            return
+        keys = [view.key for view in views]
+        # What is found is held until its turn: what is computed before that may push it out of the cache.
+        held = {key: cache.find(self.scene, key) for key in dict.fromkeys(keys)}
+        first = {key: i for i, key in reversed([*enumerate(keys)])}
+        last = {key: i for i, key in enumerate(keys)}
+        coming = self._computed([views[first[key]] for key, found in held.items() if found is None])
+
+        def new(i: int) -> Information:
+            return accept(i, next(coming))
+
+        for i, key in enumerate(keys):
+            found = held.pop(key)
+            if found is None:
+                found = cache.get(self.scene, key, functools.partial(new, i))
+            elif i > first[key]:
+                cache.hits += 1  # the same view once more
+            if i < last[key]:
+                held[key] = found
+            yield found
+            del found  # not alive while the next one is computed
+
+    def _computed(self, views: Sequence[ViewQuestion]) -> Iterator[Information]:
         if self.workers is not None:
-            return self.workers.each(self.scene, [(question, camera, None) for camera in cameras])
-        return (question(self.scene, camera, None) for camera in cameras)
+            return self.workers.each(self.scene, [(view.question, view.camera, view.mask) for view in views])
+        return (view.question(self.scene, view.camera, view.mask) for view in views)
 
     def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:
         """A `Pick` with plain numbers."""

@@ -85,12 +85,13 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
     settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
 
     def by(asked: Sequence[Asked]) -> InformationSource:
-        # The key is all of the question: what is empty outside of a mask is another answer.
-        question = Questions(settings, tuple(asked), pool.empty_outside)
-        return question, question
+        questions = Questions(settings, tuple(asked), pool.empty_outside)
+        if pool.cache is None:
+            return InformationSource(questions)
+        return InformationSource(questions.lasting(), finish=questions.painted)
 
     if own := pool.information:
-        source: InformationSource = (lambda scene, camera, mask: own(camera)), (own, settings)
+        source = InformationSource(lambda scene, camera, mask: own(camera), (own, settings), by_name=True)
         return greedy(pool, ViewInformation(pool, source), combination)
     known = None if all(one.known for one in asked) else by([one for one in asked if one.known])
     return greedy(pool, ViewInformation(pool, by(asked), known), combination)

@@ -162,7 +162,7 @@ def read_ranking(path: Path) -> Ranking:
     cameras = [
         dataclasses.replace(camera_described(f"{where}: {row['name']}", row["camera"]), name=row["name"])
         for row in rows
-        if "camera" in row
+        if isinstance(row.get("camera"), dict)  # of a fit of what moves it is a name
     ]
     return Ranking(
         f"{policy}, {criterion}" if criterion else policy,
