@@ -19,7 +19,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from drgs.data.children import serve
 from drgs.guards import memory
 
-__all__ = ["jpeg", "pixels", "size"]
+__all__ = ["encoded_jpeg", "pixels", "size"]
 
 _SIDE = 1 << 15  # pixels, libheif's own limit; a compressed byte stands for any number of them
 _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy that is answered
@@ -52,7 +52,7 @@ def pixels(path: Path, tell: Any) -> np.ndarray:
     return np.asarray(_shown(path))
 
 
-def jpeg(path: Path, quality: int, tell: Any) -> np.ndarray:
+def encoded_jpeg(path: Path, quality: int, tell: Any) -> np.ndarray:
     """The bytes of a JPEG, uint8: the photograph as it is shown and without alpha, with its EXIF.
 
     Raises:
@@ -105,4 +105,4 @@ def _damaged(path: Path, error: Exception) -> ValueError:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")  # of Pillow about EXIF
-    serve({"size": size, "pixels": pixels, "jpeg": jpeg})
+    serve({"size": size, "pixels": pixels, "jpeg": encoded_jpeg})
