@@ -267,7 +267,9 @@ def test_photos_that_fall_apart(tmp_path, capsys, monkeypatch):
     assert cli.main(["sfm", str(photos), "-o", str(tmp_path / "out")]) == 0
     told = capsys.readouterr().out
     first, second = (
-        ("00.png to 06.png", "07.png to 13.png") if "7 photos: 00" in told else ("07.png to 13.png", "00.png to 06.png")
+        ("00.png to 06.png", "07.png to 13.png")
+        if "kept, with 7 photos: 00" in told
+        else ("07.png to 13.png", "00.png to 06.png")
     )
     assert "7 of 15 photos have a pose" in told
     assert f"the photos fell apart into 2 models; the largest was kept, with 7 photos: {first}" in told

@@ -18,7 +18,7 @@ from typing import Any
 
 from drgs.data.matching import Progress
 
-__all__ = ["Parts", "map_photos", "runs"]
+__all__ = ["PhotoGroups", "map_photos", "runs"]
 
 _EVERY = 0.25  # seconds between two looks at the log
 _FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
@@ -158,7 +158,7 @@ def _followed(folder: Path, told: _Told) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Parts:
+class PhotoGroups:
     """What photographs fell apart into.
 
     Attributes:
@@ -177,7 +177,7 @@ class Parts:
     featureless: tuple[tuple[str, int], ...]
 
     @staticmethod
-    def of(database: Path, names: Sequence[str], kept: set[str], others: Sequence[set[str]]) -> Parts:
+    def of(database: Path, names: Sequence[str], kept: set[str], others: Sequence[set[str]]) -> PhotoGroups:
         """The parts of all `names`, in their order, as the database's matches connect them."""
         others = sorted(others, key=len, reverse=True)
         alone = tuple(name for name in names if name not in kept.union(*others))
@@ -185,7 +185,7 @@ class Parts:
         lost = [[name for name in names if name in other - kept] for other in others] + [[name] for name in alone]
         gaps = [_gap(names, kept, group, matches) for group in lost if group]
         gaps.sort(key=lambda gap: -gap[2])
-        return Parts(
+        return PhotoGroups(
             kept=tuple(sorted(kept)),
             others=tuple(tuple(sorted(other)) for other in others),
             alone=alone,
@@ -219,6 +219,7 @@ class Parts:
         return found + [f"what would help: {advice}" for advice in self._advice(is_masked, is_sequential)]
 
     def _advice(self, is_masked: bool, is_sequential: bool) -> Iterator[str]:
+        """What would bring more photographs into the kept model, the surest first, by what the database shows."""
         dull = {name for name, _ in self.featureless}
         for ours, theirs, matches in [gap for gap in self.gaps if gap[1] not in dull][:_ADVISED]:
             why = f"{matches} matches connect them" if matches else "nothing connects them"

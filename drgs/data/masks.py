@@ -14,9 +14,9 @@ from drgs.data.checks import image_size, read_image, unit_range
 from drgs.data.view_checks import nearest_resized
 from drgs.guards.foreign import is_file
 
-__all__ = ["ALPHA", "feature_mask", "mask_file", "masked_photo", "masks_of", "read_mask"]
+__all__ = ["ALPHA_MASKS", "feature_mask", "mask_file", "masked_photo", "masks_of", "read_mask"]
 
-ALPHA = "alpha"  # in place of a folder: the photographs' own alpha channel
+ALPHA_MASKS = "alpha"  # in place of a folder: the photographs' own alpha channel
 _KEPT = 0.5  # weight from which on a pixel may hold a feature
 _SHOWN = 3  # photographs without a mask that a message names
 
@@ -47,13 +47,13 @@ def masks_of(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
         FileNotFoundError: no such folder, or a photograph has no mask there.
         ValueError: a folder without masks.
     """
-    if masks == ALPHA:
+    if masks == ALPHA_MASKS:
         return photos
     folder = Path(masks)
     if not folder.is_dir():
         kind = "a file" if folder.is_file() else "none"
         raise FileNotFoundError(
-            f"{folder}: --masks must be a folder of masks or the word {ALPHA}, found {kind}; check the path"
+            f"{folder}: --masks must be a folder of masks or the word {ALPHA_MASKS}, found {kind}; check the path"
         )
     found = [mask_file(folder, photo.name) for photo in photos]
     if folder.resolve() == photos[0].parent.resolve():  # where NAME.png may be the photograph itself
@@ -88,7 +88,7 @@ def feature_mask(photo: Path, mask: Path) -> np.ndarray:
         raw = read_image(photo)
         if raw.ndim != 3 or raw.shape[2] != 4:
             raise ValueError(
-                f"{photo}: must have an alpha channel for --masks {ALPHA}, has none; save it as a PNG with "
+                f"{photo}: must have an alpha channel for --masks {ALPHA_MASKS}, has none; save it as a PNG with "
                 "transparency, or name a folder of masks"
             )
         weights = unit_range(raw[..., 3], photo)

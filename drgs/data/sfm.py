@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
-from drgs.data.mapping import Parts, map_photos
-from drgs.data.masks import ALPHA, feature_mask, masked_photo, masks_of
+from drgs.data.mapping import PhotoGroups, map_photos
+from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -117,9 +117,9 @@ def run_sfm(
     if matching not in MATCHING:
         raise ValueError(f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one")
     mask_files = None if masks is None else masks_of([image_dir / name for name in names], masks)
-    linked = {"images": image_dir} | ({} if masks in (None, ALPHA) else {"masks": Path(masks)})
+    linked = {"images": image_dir} | ({} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)})
     with claim(out_dir, "sfm", inputs=list(linked.values())) as output:
-        _check_output(output, linked, masks == ALPHA)
+        _check_output(output, linked, masks == ALPHA_MASKS)
         with temporary_folder("sfm", output.path) as partial:
             (partial / "models").mkdir()
             report = progress or (lambda stage, done, total: None)
@@ -137,7 +137,7 @@ def run_sfm(
                 seed,
                 mask_files is not None,
             )
-            _install(partial, output, linked, masks == ALPHA)
+            _install(partial, output, linked, masks == ALPHA_MASKS)
     return summary
 
 
@@ -230,7 +230,7 @@ def _reconstruct(
     best.write_binary(partial / "sparse/0")
     found = {id(model): {model.images[i].name for i in model.reg_image_ids()} for model in models.values()}
     kept = found.pop(id(best))
-    parts = Parts.of(database, names, kept, list(found.values()))
+    parts = PhotoGroups.of(database, names, kept, list(found.values()))
     report("mapping", len(kept), len(names))
     return SfmSummary(
         registered=len(kept),

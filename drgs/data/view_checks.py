@@ -108,7 +108,7 @@ def check_cameras(views: list[View]) -> None:
     places = len(np.unique(np.round(centers / tiny), axis=0))
     if len(times) >= 2 and 2 <= places < _FEW_PLACES:
         _log.warning(
-            "the %d training views of %d times are from %d places only: seen from others, this will look far worse than "
+            "the %d training views of %d times are from %d places only: from others it will look far worse than "
             "from these; film with %d cameras or more, or hold fewer out (--test-cameras)",
             len(views),
             len(times),
