@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from drgs import metrics, runtime
-from drgs.data.view_checks import check_parallax
+from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
@@ -130,6 +130,7 @@ def _fit(
     train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
     if train:
         check_parallax(train)
+        check_cameras(train)
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     plan = ActiveViews(active, train, config, motion is not None, workers) if active else None

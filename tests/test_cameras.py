@@ -246,7 +246,7 @@ FLIPPED = np.diag([1.0, 1.0, -1.0, 1.0])
         ({"w2c": BAD_POSE}, r"the pose must be finite, got inf at \[1, 2\]"),
         ({"w2c": POSE.T}, "the last row of w2c must be 0 0 0 1"),
         ({"w2c": np.diag([1.001, 1, 1, 1])}, "orthonormal to 1e-4"),
-        ({"w2c": FLIPPED}, "got a reflection"),
+        ({"w2c": FLIPPED}, r"got a reflection.*negate the one that .* column 2 of camera-to-world.*negate one row"),
         ({"width": 0}, "width must be a whole number of pixels >= 1, got 0"),
         ({"height": 2.5}, "height must be a whole number of pixels >= 1, got 2.5"),
         ({"width": float("nan")}, "width must be a whole number of pixels >= 1, got nan"),

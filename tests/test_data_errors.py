@@ -367,3 +367,43 @@ def test_messages_stay_short(tmp_path):
     with pytest.raises(ValueError, match=r"camera_model must be one of") as error:
         load(tmp_path)
     assert len(str(error.value)) < 500
+
+
+@pytest.mark.parametrize(("column", "row"), [(2, None), (None, 1)])
+def test_a_left_handed_frame_is_named_with_both_repairs(tmp_path, column, row):
+    """Poses of a left-handed camera, or of a left-handed world, become the right ones by what the message says."""
+    data = write_transforms(tmp_path)
+    right = [view.camera.w2c for view in load(tmp_path).views]
+
+    def turn(frame) -> None:  # there and back
+        matrix = np.array(frame["transform_matrix"])
+        if row is None:
+            matrix[:, column] *= -1
+        else:
+            matrix[row] *= -1
+        frame["transform_matrix"] = matrix.tolist()
+
+    for frame in data["frames"]:
+        turn(frame)
+    save(tmp_path, data)
+    repairs = (
+        r"transforms.json: frame 0: .* got a reflection .*\(\+x right, \+y up, looking along -z\), negate .* column 3 "
+        "of transform_matrix, .* if it is the world, .* negate one row of camera-to-world, position included"
+    )
+    with pytest.raises(ValueError, match=repairs) as error:
+        load(tmp_path)
+    one_line(error)
+    for frame in data["frames"]:
+        turn(frame)
+    save(tmp_path, data)
+    np.testing.assert_allclose([view.camera.w2c for view in load(tmp_path).views], right)
+
+
+def test_a_left_handed_llff_pose_is_named_by_its_own_axes(tmp_path):
+    """Whose columns are others."""
+    rows = write_llff(tmp_path)
+    rows[:, [2, 7, 12]] *= -1
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    with pytest.raises(ValueError, match=r"reflection .*\(down, right, backward\).* column 3 of its 3x5") as error:
+        load(tmp_path)
+    one_line(error)

@@ -86,6 +86,18 @@ def config(**fields) -> FitConfig:
     return FitConfig(**{**short, **rates, **fields})
 
 
+def test_two_cameras_are_told_of_before_the_first_step(dataset, tmp_path, caplog, monkeypatch):
+    """As too few for what moves, of the training views alone; four are not."""
+    told, step = [], Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda self: [told.append("places only" in caplog.text), step(self)][1])
+    few = [view for view in dataset.views if view.name[3] in "012"]
+    for name, views, expected in (("few", few, True), ("all", dataset.views, False)):
+        caplog.clear()
+        told.clear()
+        fit(dataclasses.replace(dataset, views=views), tmp_path / name, config(max_steps=2), progress=False)
+        assert told[0] == expected
+
+
 def test_two_stages_leave_a_complete_run(dataset, tmp_path):
     """The static stage sees the first time alone, the dynamic one all; the run holds the scene that was fitted, which
     moves, and metrics say who does.

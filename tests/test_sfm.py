@@ -4,6 +4,8 @@ input.
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
@@ -27,13 +29,8 @@ def aligned_error(found: np.ndarray, true: np.ndarray) -> float:
     return np.linalg.norm(scale * a @ (u @ sign @ vt).T - b, axis=1).max() / np.abs(b).max()
 
 
-@pytest.fixture(scope="module")
-def corner(tmp_path_factory):
-    """Photos of three textured walls that meet in a corner, and their cameras."""
-    folder = tmp_path_factory.mktemp("corner")
-    rng = np.random.default_rng(5)
-    K = intrinsics(384, 384, WIDTH / 2, HEIGHT / 2)
-    # Each wall is the square z = 0 of a frame of its own: its axes and center in the world.
+def corner_walls(rng) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Three walls that meet in a corner: the frame of each in the world, whose square z = 0 it is, and its texture."""
     walls = []
     for axes, center in [
         (([1, 0, 0], [0, 1, 0], [0, 0, 1]), (0, 0, -1.5)),
@@ -43,32 +40,90 @@ def corner(tmp_path_factory):
         world = np.eye(4)
         world[:3, :3], world[:3, 3] = np.transpose(axes), center
         walls.append((world, texture(rng)))
-    cameras = []
-    for index in range(7):
-        angle = 0.3 + 0.15 * index
-        eye = (4 * np.sin(angle), 1.5 + 0.3 * (index % 3), 4 * np.cos(angle))
-        camera = Camera(K, look_at(eye, (-0.8, -0.8, -0.8), (0, 1, 0)), WIDTH, HEIGHT)
-        photo = np.zeros((HEIGHT, WIDTH, 3))
-        for world, image in walls:
-            local = Camera(K, camera.w2c @ world, WIDTH, HEIGHT)
-            color, depth = render_plane(local, image, half=1.5)
-            photo = np.where(depth[..., None] > 0, color, photo)
-        assert cv2.imwrite(str(folder / f"{index}.png"), np.round(photo * 255).astype(np.uint8))
-        cameras.append(camera)
+    return walls
+
+
+def corner_photo(camera: Camera, walls: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """(H,W,3) in [0,1], and (H,W) bool of where a wall is seen."""
+    photo, seen = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH), bool)
+    for world, image in walls:
+        local = Camera(camera.K, camera.w2c @ world, WIDTH, HEIGHT)
+        color, depth = render_plane(local, image, half=1.5)
+        photo = np.where(depth[..., None] > 0, color, photo)
+        seen |= depth > 0
+    return photo, seen
+
+
+def corner_camera(index: int, distance: float = 4.0) -> Camera:
+    """A step along an arc around the corner."""
+    angle = 0.3 + 0.15 * index
+    eye = (distance * np.sin(angle), 1.5 + 0.3 * (index % 3), distance * np.cos(angle))
+    return Camera(
+        intrinsics(384, 384, WIDTH / 2, HEIGHT / 2), look_at(eye, (-0.8, -0.8, -0.8), (0, 1, 0)), WIDTH, HEIGHT
+    )
+
+
+def write_photo(path, photo: np.ndarray) -> None:
+    """RGB or RGBA in [0,1]."""
+    order = [2, 1, 0, 3][: photo.shape[2]]
+    assert cv2.imwrite(str(path), np.round(photo[..., order] * 255).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def corner(tmp_path_factory):
+    """Photos of three textured walls that meet in a corner, and their cameras."""
+    folder = tmp_path_factory.mktemp("corner")
+    walls = corner_walls(np.random.default_rng(5))
+    cameras = [corner_camera(index) for index in range(7)]
+    for index, camera in enumerate(cameras):
+        write_photo(folder / f"{index}.png", corner_photo(camera, walls)[0])
+    return folder, cameras
+
+
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory):
+    """Photos of the corner as an object that turns before a camera that stands still, masks, and its cameras."""
+    folder = tmp_path_factory.mktemp("turntable")
+    rng = np.random.default_rng(6)
+    walls, backdrop = corner_walls(rng), cv2.resize(texture(rng), (WIDTH, HEIGHT))
+    cameras = [corner_camera(index, distance=7.0) for index in range(5)]
+    for name in ("images", "masks", "alpha"):
+        (folder / name).mkdir()
+    for index, camera in enumerate(cameras):
+        photo, seen = corner_photo(camera, walls)
+        photo = np.where(seen[..., None], photo, backdrop)
+        write_photo(folder / "images" / f"{index}.png", photo)
+        write_photo(folder / "alpha" / f"{index}.png", np.concatenate([photo, seen[..., None]], axis=-1))
+        # COLMAP's name or the short one, 0 and 255 or 0 and 1.
+        name = f"{index}.png.png" if index % 2 else f"{index}.png"
+        assert cv2.imwrite(str(folder / "masks" / name), seen.astype(np.uint8) * (255 if index % 3 else 1))
     return folder, cameras
 
 
 def test_recovers_poses_and_loads(corner, tmp_path):
     """All photos found, centers right up to a similarity, result replaceable."""
     folder, cameras = corner
-    stages = []
+    stages, doing = [], []
     out = tmp_path / "out"
-    summary = run_sfm(folder, out, progress=lambda *step: stages.append(step))
+    summary = run_sfm(folder, out, progress=lambda *step: stages.append(step), doing=doing.append)
     assert (summary.registered, summary.total, summary.missing) == (7, 7, ())
+    assert summary.explanation == ()
     assert summary.points > 100
     assert summary.reprojection_error < 1.0
     assert {stage for stage, _, _ in stages} == {"features", "matching", "mapping"}
     assert all(done <= total for _, done, total in stages)
+    # COLMAP's log is heard, whose lines another version may word in another way.
+    for what in (
+        "reading the matches",
+        "looking for two photos to begin with",
+        "triangulating from two photos",
+        "finding the pose of a photo",
+        "bundle adjustment",
+        "retriangulation and bundle adjustment",
+        "final retriangulation and bundle adjustment",
+    ):
+        assert any(text.startswith(what) for text in doing), what
+    assert [done for stage, done, _ in stages if stage == "mapping" and done > 1][-1] == 7
     assert (out / "database.db").is_file()
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     dataset = load(out)
@@ -90,6 +145,139 @@ def test_recovers_poses_and_loads(corner, tmp_path):
     with pytest.raises(ValueError, match="sparse: must not be replaced"):
         run_sfm(folder, out)
     assert (out / "sparse" / "0" / "points3D.bin").read_bytes() == b"refined"
+
+
+def test_what_was_turned_is_found_by_its_masks(turntable, tmp_path):
+    """Before a background that stands still an object that turns has poses by masks, which the data set keeps."""
+    folder, cameras = turntable
+    with pytest.raises(ValueError, match=r"no two of 5 could be connected; .* name masks of what was turned"):
+        run_sfm(folder / "images", tmp_path / "without")
+    for kind, masks in (("images", folder / "masks"), ("alpha", "alpha")):
+        out = tmp_path / kind
+        assert run_sfm(folder / kind, out, masks=masks).registered == 5
+        views = load(out).views
+        found = np.stack([view.camera.center for view in views])
+        assert aligned_error(found, np.stack([cameras[int(view.name)].center for view in views])) < 0.05
+        assert all(view.mask_path is not None for view in views)
+        assert 0.1 < views[0].mask().mean() < 0.9
+        assert (out / "masks").is_symlink() == (kind == "images")
+    # Again without: masks of an earlier result would say what no longer holds.
+    run_sfm(folder / "alpha", out, masks=folder / "masks")
+    assert (out / "masks").resolve() == folder / "masks"
+    with pytest.raises(ValueError, match="could be connected"):
+        run_sfm(folder / "alpha", out)
+    assert (out / "masks").is_symlink()  # nothing took the place of that result
+
+
+@pytest.fixture
+def masked(tmp_path, rng):
+    """Two photos, one of them with alpha, and a mask of each."""
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    plane_views(photos, rng, count=2)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    for name in ("0.png", "1.png"):
+        assert cv2.imwrite(str(masks / name), mask)
+    return photos, masks
+
+
+def _no_folder(photos, masks):
+    return masks / "gone", "gone: --masks must be a folder of masks or the word alpha, found none"
+
+
+def _file(photos, masks):
+    return masks / "0.png", "0.png: --masks must be a folder of masks or the word alpha, found a file"
+
+
+def _empty(photos, masks):
+    for file in masks.iterdir():
+        file.unlink()
+    return masks, "masks: must hold a mask of every photo, named as 0.png.png or 0.png, found none"
+
+
+def _missing(photos, masks):
+    (masks / "1.png").unlink()
+    return masks, r"masks: must hold a mask of every photo, .*, has none of 1 of 2 \(1.png\); add them"
+
+
+def _shape(photos, masks):
+    assert cv2.imwrite(str(masks / "1.png"), np.full((HEIGHT, HEIGHT), 255, np.uint8))
+    return masks, rf"1.png: must have the shape of its image \({WIDTH}x{HEIGHT}\), got {HEIGHT}x{HEIGHT}"
+
+
+def _black(photos, masks):
+    assert cv2.imwrite(str(masks / "1.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    return masks, r"1.png: must keep something of its photo \(white\), is black all over"
+
+
+def _no_alpha(photos, masks):
+    return "alpha", "0.png: must have an alpha channel for --masks alpha, has none"
+
+
+def _photos(photos, masks):
+    return photos, "photos: must hold a mask of every photo, .*, found none"
+
+
+@pytest.mark.parametrize("bad", [_no_folder, _file, _empty, _missing, _shape, _black, _no_alpha, _photos])
+def test_bad_masks(masked, tmp_path, capfd, bad):
+    """Each in a line, before any feature is looked for, and nothing is written."""
+    from drgs import cli
+
+    photos, masks = masked
+    masks, message = bad(photos, masks)
+    before = sorted(tmp_path.rglob("*"))
+    assert cli.main(["sfm", str(photos), "-o", str(tmp_path / "out"), "--masks", str(masks), "--quiet"]) == 2
+    complaint = capfd.readouterr().err
+    assert re.search(message, complaint)
+    assert complaint.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_masks_of_others_stay(masked, tmp_path):
+    """A folder of masks in the output that was not made here is refused, before any work."""
+    photos, masks = masked
+    mine = tmp_path / "out" / "masks" / "0.png"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("hours of work")
+    with pytest.raises(ValueError, match="masks.*: must not be replaced"):
+        run_sfm(photos, tmp_path / "out", masks=masks)
+    assert mine.read_text() == "hours of work"
+
+
+def test_photos_that_fall_apart(tmp_path, capsys, monkeypatch):
+    """Two places and a blank photo: which model was kept, what the other holds, what is in none, and what helps."""
+    from drgs import cli
+    from drgs.display.progress import Bar
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for start, seed, count in ((0, 5, 7), (7, 8, 7)):
+        walls = corner_walls(np.random.default_rng(seed))
+        for index in range(count):
+            write_photo(photos / f"{start + index:02d}.png", corner_photo(corner_camera(index), walls)[0])
+    write_photo(photos / "14.png", np.full((HEIGHT, WIDTH, 3), 0.5))
+    texts, update = set(), Bar.update
+
+    def updated(bar, done, total=None, label=None, text=None):
+        texts.add(text)
+        update(bar, done, total, label, text)
+
+    monkeypatch.setattr(Bar, "update", updated)
+    assert cli.main(["sfm", str(photos), "-o", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    first, second = "00.png to 06.png", "07.png to 13.png"
+    if "kept, with 7 photos: 00" not in told:
+        first, second = second, first
+    assert "7 of 15 photos have a pose" in told
+    assert f"the photos fell apart into 2 models; the largest was kept, with 7 photos: {first}" in told
+    assert f"model 2, left out, has 7 photos: {second}" in told
+    assert "in no model: 1 photos: 14.png" in told
+    assert re.search(r"what would help: photos between 0\d.png and 0\d.png \(nothing connects them\)", told)
+    assert "what would help: a sharper, brighter photo in place of 14.png (0)" in told
+    assert "what would help: --masks, if the object was turned" in told
+    assert "--matcher exhaustive" not in told  # which it was
+    assert any("model 2, retriangulation and bundle adjustment" in text for text in texts if text)
 
 
 @pytest.mark.parametrize("part", ["images", "sparse", "database.db", "database.db-wal"])

@@ -14,7 +14,7 @@ from test_data import write_transforms
 from drgs.cameras import Camera, orbit
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
-from drgs.data.view_checks import check_parallax
+from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.data.views import View
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.frames import load_frames
@@ -129,6 +129,23 @@ def test_views_of_one_pose_at_several_times_are_not_duplicates(tmp_path, caplog)
         caplog.clear()
         check_parallax(load(tmp_path).views)
         assert ("have the pose of another one" in caplog.text) == told
+
+
+@pytest.mark.parametrize(("count", "told"), [(1, False), (2, True), (3, True), (4, False), (8, False)])
+@pytest.mark.parametrize("is_moving", [True, False])
+def test_few_cameras_before_what_moves_are_told_of(caplog, count, told, is_moving):
+    """What stands still is another matter, and a fit says nothing of one place twice."""
+    around = orbit((0, 0, 0), 3.0, count, width=8, height=6)
+    views = [
+        View(dataclasses.replace(camera, time=time if is_moving else None), f"cam{index}/{time}")
+        for index, camera in enumerate(around)
+        for time in (0.0, 0.5, 1.0)
+    ]
+    check_cameras(views)
+    assert (f"the {3 * count} training views of 3 times are from {count} places only" in caplog.text) == (
+        told and is_moving
+    )
+    assert ("film with 6 cameras or more" in caplog.text) == (told and is_moving)
 
 
 def test_a_camera_that_stands_still_has_views_at_several_times(caplog):

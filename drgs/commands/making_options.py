@@ -28,6 +28,9 @@ class Sfm(Common):
     """COLMAP's name of the lens; photographs of one size share one camera."""
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match all pairs, or neighbors by name (video); auto decides by their number."""
+    masks: str | None = None
+    """Features only where the object is, which was turned or moved: a folder with NAME.png or NAME.EXT.png of every
+    photograph, white is kept, or alpha: their own alpha channel."""
     seed: int = 0
     """Seed of all random sampling."""
 

@@ -24,6 +24,8 @@ def run(args: Sfm) -> None:
             camera_model=args.camera_model,
             matching=args.matcher,
             seed=args.seed,
+            masks=args.masks,
+            doing=lambda text: bar.update(bar.done, text=text),
         )
     if args.quiet:
         return
@@ -32,8 +34,6 @@ def run(args: Sfm) -> None:
         f"{summary.registered} of {summary.total} photos have a pose, {summary.points} points, "
         f"mean reprojection error {summary.reprojection_error:.2f} px ({stages})"
     )
-    if summary.missing:
-        print(f"without a pose: {', '.join(summary.missing)}")
-    if summary.models > 1:
-        print(f"the photos fell apart into {summary.models} models, the largest was kept")
+    for line in summary.explanation:
+        print(line)
     print(f"next: drgs fit {shlex.quote(str(args.output))} -o RUN")

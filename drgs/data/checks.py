@@ -38,6 +38,7 @@ __all__ = [
     "read_npz",
     "read_text",
     "repaired_pose",
+    "unit_range",
 ]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIF_SUFFIXES)
@@ -277,6 +278,17 @@ def read_image(path: Path) -> np.ndarray:
         else:
             data = np.ascontiguousarray(data[..., order])
     return data
+
+
+def unit_range(data: np.ndarray, path: Path) -> np.ndarray:
+    """Image data as float32 in [0,1], by its bit depth."""
+    if data.dtype == np.uint8:
+        return data.astype(np.float32) / np.float32(255)
+    if data.dtype == np.uint16:
+        return data.astype(np.float32) / np.float32(65535)
+    if data.dtype.kind == "f":
+        return np.clip(data.astype(np.float32), 0.0, 1.0)
+    raise ValueError(f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it")
 
 
 def _ends_early(path: Path) -> ValueError:

@@ -11,6 +11,7 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import file_inside
+from drgs.data.masks import mask_file
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
 from drgs.data.views import Dataset, View
 from drgs.guards.foreign import is_file, refuse_foreign
@@ -83,7 +84,7 @@ def load_colmap(
             continue
         camera = model_camera(reconstruction, image, where)
         view.camera = fit_to_image(camera, view.image_path, where, lazy)
-        view.mask_path = _mask(folder, image.name)
+        view.mask_path = mask_file(folder.parent / "masks", image.name)
         view.background, view.is_checked = background, not lazy
         views.append(view)
     make_unique(listed)
@@ -113,15 +114,6 @@ def _image_folder(path: Path, model: Path) -> Path:
         f"{path}: the photos must lie in a folder named images, found none (looked at "
         f"{', '.join(dict.fromkeys(tried))}); move or link them there"
     )
-
-
-def _mask(folder: Path, name: str) -> Path | None:
-    """COLMAP's own ``masks/NAME.EXT.png``, or ``masks/NAME.png``."""
-    masks = folder.parent / "masks"
-    for candidate in (masks / f"{name}.png", (masks / name).with_suffix(".png")):
-        if is_file(candidate):
-            return candidate
-    return None
 
 
 def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:

@@ -12,6 +12,7 @@ from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import inverse_pose, list_images, read_npy
 from drgs.data.view_checks import fit_to_image, make_unique
 from drgs.data.views import Dataset, View
+from drgs.guards.camera_checks import check_handedness
 
 __all__ = ["load_llff", "pose_rows", "row_camera"]
 
@@ -71,6 +72,7 @@ def pose_rows(file: Path) -> np.ndarray:
 def row_camera(where: str, row: np.ndarray, name: str) -> Camera:
     """The camera of a row (17,), of the size that it states; ValueError if it is none."""
     matrix = row[:15].reshape(3, 5)
+    check_handedness(where, matrix[:, :3], "(down, right, backward)", "3 of its 3x5 matrix")
     height, width, focal = matrix[:, 4]
     w2c = inverse_pose(where, c2w_from_llff(matrix))
     try:

@@ -15,11 +15,12 @@ import numpy as np
 from drgs.guards import interrupts
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs"]
+__all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "state_focal_lengths"]
 
 Progress = Callable[[str, int, int], None]
 _IMAGES_A_STEP = min(8, os.cpu_count() or 1)  # one a core: all of them are busy, and progress is seen
 _PAIRS_A_STEP = 16
+_MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
 
 
 @contextlib.contextmanager
@@ -45,6 +46,7 @@ def extract(
     shared_camera: bool,
     max_image_size: int = 0,
     wide_baseline: bool = False,
+    masks: Path | None = None,
     progress: Progress | None = None,
 ) -> None:
     """SIFT features of images into a COLMAP database.
@@ -57,6 +59,7 @@ def extract(
         max_image_size: pixels on the longer side above which images are shrunk; 0 for never.
         wide_baseline: affine shapes and pooled scales: connects views further apart, at 2.5 times
             the cost.
+        masks: folder with ``NAME.EXT.png`` of every image, of its size: no features where it is 0.
         progress: called with ("features", done, total).
     """
     from drgs.data.native import pycolmap
@@ -69,6 +72,9 @@ def extract(
     options.sift.domain_size_pooling = wide_baseline
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
+    if masks is not None:
+        reader.mask_path = masks
+        options.sift.peak_threshold = _MASKED_CONTRAST
     mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
     for start in range(0, len(names), _IMAGES_A_STEP):
         if progress:
@@ -90,19 +96,47 @@ def extract(
         progress("features", len(names), len(names))
 
 
-def match(database: Path, pairs: list[tuple[str, str]], *, seed: int = 0, progress: Progress | None = None) -> None:
+def state_focal_lengths(database: Path, folder: Path) -> None:
+    """Give cameras the focal lengths that the EXIF of photographs states, where features came from copies without it.
+
+    Args:
+        database: with features of images whose names are those in the folder.
+        folder: the photographs.
+    """
+    from drgs.data.native import pycolmap
+
+    with pycolmap.Database.open(database) as handle:
+        first = {image.camera_id: image.name for image in reversed(handle.read_all_images())}
+        for camera in handle.read_all_cameras():
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = camera.model_name
+            stated = pycolmap.infer_camera_from_image(folder / first[camera.camera_id], reader)
+            stated.camera_id = camera.camera_id
+            handle.update_camera(stated)
+
+
+def match(
+    database: Path,
+    pairs: list[tuple[str, str]],
+    *,
+    seed: int = 0,
+    guided: bool = False,
+    progress: Progress | None = None,
+) -> None:
     """Match image pairs and verify them geometrically; results go to the database.
 
     Args:
         database: with features.
         pairs: image names.
         seed: of the random sampling in the verification.
+        guided: look for more matches once the epipolar geometry of a pair is known.
         progress: called with ("matching", done, total).
     """
     from drgs.data.native import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
+    options.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     with temporary_folder("pairs") as folder, _numbered(database) as numbers:

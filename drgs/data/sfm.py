@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.data.checks import image_size, list_images
+from drgs.data.mapping import PhotoGroups, map_photos
+from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.readable import check_names, readable_photos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
 
 if TYPE_CHECKING:
+    from drgs.data.matching import Progress
     from drgs.guards.outputs import Claim
 
 __all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
@@ -31,8 +34,10 @@ CAMERA_MODELS = (
     "OPENCV_FISHEYE",
 )
 MATCHING = ("auto", "exhaustive", "sequential")
-_MAX_EXHAUSTIVE = 60
+_MAX_EXHAUSTIVE, _MAX_EXHAUSTIVE_MASKED = 60, 150  # an object alone has a tenth of the features to compare
 _WINDOW = 10
+# Matches that a pose needs where an object alone is looked at, which has few: half of COLMAP's own numbers.
+_MASKED_INLIERS_FIRST, _MASKED_INLIERS = 50, 15
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,7 @@ class SfmSummary:
         points: number of 3D points.
         reprojection_error: mean, in pixels.
         models: separate models found; the largest was kept.
+        explanation: sentences about the photos without a pose: which models they are in, and what would help.
         seconds: time by stage: features, matching, mapping.
         missing: names of the photos without a pose.
     """
@@ -55,6 +61,7 @@ class SfmSummary:
     models: int
     seconds: dict[str, float]
     missing: tuple[str, ...]
+    explanation: tuple[str, ...] = ()
 
 
 def run_sfm(
@@ -65,27 +72,35 @@ def run_sfm(
     max_image_size: int = 1600,
     matching: str = "auto",
     seed: int = 0,
+    masks: str | os.PathLike | None = None,
+    doing: Callable[[str], None] | None = None,
 ) -> SfmSummary:
     """Find camera poses and points from photos; afterwards ``drgs.data.load(out_dir)`` works.
 
-    Writes ``out_dir/{database.db, sparse/0, images}``; ``images`` is a link to ``image_dir`` where
-    links work, a copy elsewhere. An earlier result of this function is replaced, and only once the
-    new one is complete; nothing else ever is.
+    Writes ``out_dir/{database.db, sparse/0, images}``, and ``masks`` if there are any, where a fit finds them;
+    ``images`` and ``masks`` are links to the folders given where links work, copies elsewhere. An earlier result of
+    this function is replaced, and only once the new one is complete; nothing else ever is.
 
     Args:
         image_dir: folder of photos.
         out_dir: made if absent.
-        progress: called with (stage, done, total); stages are features, matching and mapping.
+        progress: called with (stage, done, total); stages are masks, features, matching and mapping. Of mapping, which
+            may begin anew, `done` is the number of photos with a pose so far; it is called from another thread, too.
         camera_model: COLMAP's name of the lens. Photos of one size share one camera.
         max_image_size: pixels on the longer side that features are found at; 0 for the photos' own.
         matching: ``exhaustive``, ``sequential`` (photos in the order of a walk or video) or
-            ``auto`` (exhaustive up to 60 photos).
+            ``auto`` (exhaustive up to 60 photos, 150 with masks).
         seed: of all random sampling.
+        masks: what features are looked for in, where an object was turned or moved between photos: a folder with a mask
+            of every photo, ``NAME.EXT.png`` or ``NAME.png``, white where the object is, of the photo's shape; or
+            ``"alpha"``, the photos' own alpha channel. Weights below a half count as black.
+        doing: called with what is being done within mapping, in words; from another thread, too.
 
     Raises:
-        FileNotFoundError: no such folder.
+        FileNotFoundError: no such folder, or no mask of a photo.
         ValueError: fewer than 2 photos, an unknown option, photos that do not connect, or an
-            ``out_dir`` that holds a COLMAP project or photos that were not made here.
+            ``out_dir`` that holds a COLMAP project or photos that were not made here; a mask of another shape, one that
+            keeps nothing, or a photo without alpha.
     """
     image_dir, out_dir = Path(image_dir), Path(out_dir)
     if image_dir.is_file():
@@ -100,20 +115,58 @@ def run_sfm(
         raise ValueError(f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}")
     if matching not in MATCHING:
         raise ValueError(f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one")
-    with claim(out_dir, "sfm", inputs=[image_dir]) as output:
-        _check_output(output, image_dir)
+    mask_files = None if masks is None else masks_of([image_dir / name for name in names], masks)
+    linked = {"images": image_dir} | ({} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)})
+    with claim(out_dir, "sfm", inputs=list(linked.values())) as output:
+        _check_output(output, linked, masks == ALPHA_MASKS)
         with temporary_folder("sfm", output.path) as partial:
             (partial / "models").mkdir()
-            summary = _reconstruct(image_dir, names, partial, progress, camera_model, max_image_size, matching, seed)
-            _install(partial, output, image_dir)
+            report = progress or (lambda stage, done, total: None)
+            if mask_files is not None:
+                _write_masked(image_dir, names, mask_files, partial, report)
+            summary = _reconstruct(
+                image_dir,
+                names,
+                partial,
+                report,
+                doing or (lambda text: None),
+                camera_model,
+                max_image_size,
+                matching,
+                seed,
+                mask_files is not None,
+            )
+            _install(partial, output, linked, masks == ALPHA_MASKS)
     return summary
 
 
-def _check_output(output: Claim, image_dir: Path) -> None:
+def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
+    """What COLMAP looks for features in: ``photos`` without their surroundings, and ``masks`` of their sizes, black or
+    white, ``NAME.EXT.png``.
+    """
+    import cv2
+
+    (partial / "photos").mkdir()
+    (partial / "masks").mkdir()
+    for done, (name, mask) in enumerate(zip(names, masks, strict=True)):
+        report("masks", done, len(names))
+        kept = feature_mask(image_dir / name, mask)
+        pixels = masked_photo(image_dir / name, kept)
+        pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+        for file, image in ((partial / "masks" / f"{name}.png", kept), (partial / "photos" / name, pixels)):
+            suffix = file.suffix.lower()
+            if suffix not in (".png", ".tif", ".tiff", ".bmp"):  # COLMAP goes by the content, and decodes no WebP
+                suffix = ".jpg"
+            best = [cv2.IMWRITE_JPEG_QUALITY, 100] if suffix == ".jpg" else []
+            file.write_bytes(cv2.imencode(suffix, image, best)[1].tobytes())
+    report("masks", len(names), len(names))
+
+
+def _check_output(output: Claim, linked: dict[str, Path], makes_masks: bool) -> None:
     """Find out that what is to be replaced is an earlier result, before minutes of work."""
     places = ["sparse", *(path.name for path in output.path.glob("database.db*"))]
-    if (output.path / "images").resolve() != image_dir.resolve():
-        places.append("images")
+    places += [name for name, folder in linked.items() if (output.path / name).resolve() != folder.resolve()]
+    places += ["masks"] if makes_masks else []
     try:
         output.check(places)
     except ValueError as error:
@@ -124,17 +177,18 @@ def _reconstruct(
     image_dir: Path,
     names: list[str],
     partial: Path,
-    progress: Callable[[str, int, int], None] | None,
+    report: Progress,
+    doing: Callable[[str], None],
     camera_model: str,
     max_image_size: int,
     matching: str,
     seed: int,
+    is_masked: bool,
 ) -> SfmSummary:
     """Run the three stages; leaves ``database.db`` and ``sparse/0`` in ``partial``."""
-    from drgs.data.matching import extract, match, quiet, sequential_pairs
+    from drgs.data.matching import extract, match, quiet, sequential_pairs, state_focal_lengths
     from drgs.data.native import pycolmap
 
-    report = progress or (lambda stage, done, total: None)
     database = partial / "database.db"
     shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
@@ -142,73 +196,80 @@ def _reconstruct(
         readable = readable_photos(image_dir, names, partial / "readable", report)
         extract(
             database,
-            readable,
+            partial / "photos" if is_masked else readable,
             names,
             camera_model=camera_model,
             shared_camera=shared,
             max_image_size=max_image_size,
             wide_baseline=True,
+            masks=partial / "masks" if is_masked else None,
             progress=report,
         )
+        if is_masked:
+            state_focal_lengths(database, readable)
         marks.append(time.perf_counter())
-        if matching == "sequential" or (matching == "auto" and len(names) > _MAX_EXHAUSTIVE):
-            pairs = sequential_pairs(names, _WINDOW)
-        else:
-            pairs = list(itertools.combinations(names, 2))
-        match(database, pairs, seed=seed, progress=report)
+        most = _MAX_EXHAUSTIVE_MASKED if is_masked else _MAX_EXHAUSTIVE
+        is_sequential = matching == "sequential" or (matching == "auto" and len(names) > most)
+        pairs = sequential_pairs(names, _WINDOW) if is_sequential else list(itertools.combinations(names, 2))
+        match(database, pairs, seed=seed, guided=is_masked, progress=report)
         marks.append(time.perf_counter())
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = seed
+        if is_masked:
+            options.mapper.init_min_num_inliers = _MASKED_INLIERS_FIRST
+            options.mapper.abs_pose_min_num_inliers = _MASKED_INLIERS
         options.min_model_size = min(options.min_model_size, max(2, len(names) // 2))
-        done = itertools.count(1)
-        report("mapping", 0, len(names))
-        models = pycolmap.incremental_mapping(
-            database,
-            readable,
-            partial / "models",
-            options=options,
-            initial_image_pair_callback=lambda: report("mapping", min(2 * next(done), len(names)), len(names)),
-            next_image_callback=lambda: report("mapping", min(1 + next(done), len(names)), len(names)),
-        )
+        models = map_photos(database, readable, partial / "models", options, len(names), report, doing)
         marks.append(time.perf_counter())
     if not models:
         raise ValueError(
-            f"{image_dir}: the photos must overlap and show texture, no two of {len(names)} could "
-            "be connected; "
-            "take more photos with smaller steps, or try --camera-model OPENCV"
+            f"{image_dir}: the photos must overlap and show texture, no two of {len(names)} could be connected; take "
+            f"more photos with smaller steps, {'' if is_masked else 'name masks of what was turned (--masks), '}or try "
+            "--camera-model OPENCV"
         )
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     best.update_point_3d_errors()
     (partial / "sparse/0").mkdir(parents=True)
     best.write_binary(partial / "sparse/0")
-    found = {best.images[index].name for index in best.reg_image_ids()}
-    report("mapping", len(names), len(names))
+    found = {id(model): {model.images[i].name for i in model.reg_image_ids()} for model in models.values()}
+    kept = found.pop(id(best))
+    parts = PhotoGroups.of(database, names, kept, list(found.values()))
+    report("mapping", len(kept), len(names))
     return SfmSummary(
-        registered=len(found),
+        registered=len(kept),
         total=len(names),
         points=best.num_points3D(),
         reprojection_error=float(best.compute_mean_reprojection_error()),
         models=len(models),
         seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
-        missing=tuple(name for name in names if name not in found),
+        missing=tuple(name for name in names if name not in kept),
+        explanation=tuple(parts.lines(names, is_masked, is_sequential)),
     )
 
 
-def _install(partial: Path, output: Claim, image_dir: Path) -> None:
+def _install(partial: Path, output: Claim, linked: dict[str, Path], makes_masks: bool) -> None:
     """Move the finished result to its place; the model, which makes the folder a data set, comes
     last.
     """
-    _check_output(output, image_dir)  # minutes later
+    _check_output(output, linked, makes_masks)  # minutes later
     output.remove(output.path / "sparse")
-    images = output.path / "images"
-    if images.resolve() != image_dir.resolve():
-        output.remove(images)
-        made = partial / "images"
+    masks = output.path / "masks"
+    # Those of an earlier result; an empty folder is nobody's.
+    is_stale = output.is_made(masks, ("sfm",)) and (masks.is_symlink() or any(masks.iterdir()))
+    if makes_masks or (is_stale and "masks" not in linked):
+        output.remove(masks)
+    if makes_masks:
+        output.put(partial / "masks", "masks")
+    for name, folder in linked.items():
+        if (output.path / name).resolve() == folder.resolve():
+            continue
+        output.remove(output.path / name)
+        made = partial / f"linked_{name}"
         try:
-            made.symlink_to(image_dir.resolve(), target_is_directory=True)
+            made.symlink_to(folder.resolve(), target_is_directory=True)
         except OSError:
-            shutil.copytree(image_dir, made)
-        output.put(made, "images")
+            shutil.copytree(folder, made)
+        output.put(made, name)
     # SQLite may have left side files; they belong to the database.
     for stale in output.path.glob("database.db*"):
         output.remove(stale)

@@ -16,6 +16,7 @@ from drgs.data.points import read_point_ply
 from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
 from drgs.data.views import Dataset, View
+from drgs.guards.camera_checks import check_handedness
 from drgs.guards.foreign import is_file
 from drgs.guards.json_files import check_json, read_json
 
@@ -278,6 +279,7 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
         raise ValueError(f"{where}: transform_matrix must be finite, got NaN or Inf; drop this frame")
     pose = np.eye(4)
     pose[:3] = c2w[:3]
+    check_handedness(where, pose[:3, :3], "(+x right, +y up, looking along -z)", "3 of transform_matrix")
     pose = c2w_from_opengl(pose)
     return inverse_pose(where, repaired_pose(pose))
 

@@ -18,15 +18,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ASPECT_TOLERANCE",
+    "check_cameras",
     "check_parallax",
     "check_times",
     "fit_to_image",
     "go_on_without",
     "make_unique",
+    "nearest_resized",
     "resized_to",
 ]
 
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
+_FEW_PLACES, _ENOUGH_PLACES = 4, 6  # of cameras that film what moves (docs/dynamic.md, Data)
 _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
 _LONGEST = 400  # characters of a path in messages
@@ -89,6 +92,28 @@ def check_parallax(views: list[View]) -> None:
     if same := len(poses) - len(np.unique(np.c_[np.round(poses / tiny).reshape(len(poses), -1), times], axis=0)):
         _log.warning(
             "%d of the %d training views have the pose of another one; check the camera file", same, len(poses)
+        )
+
+
+def check_cameras(views: list[View]) -> None:
+    """Warn where something that moves is seen from few places: of two or three synchronous cameras a fit learns the
+    pictures by heart.
+
+    Args:
+        views: For training, all that there will be. Those of one place alone are `check_parallax`'s.
+    """
+    times = {view.camera.time for view in views} - {None}
+    centers = np.stack([view.camera.center for view in views])
+    tiny = 1e-6 * max(1.0, float(np.abs(centers).max()))
+    places = len(np.unique(np.round(centers / tiny), axis=0))
+    if len(times) >= 2 and 2 <= places < _FEW_PLACES:
+        _log.warning(
+            "the %d training views of %d times are from %d places only: from others it will look far worse than "
+            "from these; film with %d cameras or more, or hold fewer out (--test-cameras)",
+            len(views),
+            len(times),
+            places,
+            _ENOUGH_PLACES,
         )
 
 
@@ -169,3 +194,22 @@ def resized_to(camera: Camera, size: tuple[int, int], path: Path, where: str) ->
             f"got {width}x{height}; give this view its own intrinsics"
         )
     return camera.resized(width, height)
+
+
+def nearest_resized(data: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+    """A mask, label image or depth map (H,W) at the size (width, height) of its image, without mixing pixels.
+
+    Args:
+        path: The file that it is of, for the message.
+
+    Raises:
+        ValueError: another shape than the image's, by more than 1 %.
+    """
+    import cv2
+
+    height, width = data.shape
+    if abs(width * size[1] / (height * size[0]) - 1) > ASPECT_TOLERANCE:
+        raise ValueError(
+            f"{path}: must have the shape of its image ({size[0]}x{size[1]}), got {width}x{height}; export it again"
+        )
+    return data if (width, height) == size else cv2.resize(data, size, interpolation=cv2.INTER_NEAREST_EXACT)

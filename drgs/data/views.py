@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.checks import read_image, read_npy
+from drgs.data.checks import read_image, read_npy, unit_range
+from drgs.data.masks import read_mask
 from drgs.data.semantics import Semantics, plain_labels
 from drgs.data.splits import SplitRule
 from drgs.data.undistortion import lens_maps, undistorted_map
 from drgs.data.videos import VideoFrame
-from drgs.data.view_checks import ASPECT_TOLERANCE, fit_to_image
+from drgs.data.view_checks import fit_to_image, nearest_resized
 
 if TYPE_CHECKING:
     import torch
@@ -101,7 +102,7 @@ class View:
             data, path = read_image(self.image_path), self.image_path
         else:
             raise ValueError(f"view {self.name!r}: must have an image, has none; drop this view")
-        data = _unit_range(data, path)
+        data = unit_range(data, path)
         self._check_size(data, path)
         if data.ndim == 2:
             data = np.repeat(data[..., None], 3, axis=2)
@@ -125,12 +126,7 @@ class View:
         if self.mask_path is None:
             data = np.ones((self.camera.height, self.camera.width), dtype=np.float32)
         else:
-            raw = read_image(self.mask_path)
-            if raw.ndim == 3:
-                raw = raw[..., 3] if raw.shape[2] == 4 else raw[..., 0]
-            # Masks stored as 0 and 1 in 8 bits would otherwise be nearly black.
-            data = raw.astype(np.float32) if raw.max() <= 1 else _unit_range(raw, self.mask_path)
-            data = self._nearest(data, self.mask_path)
+            data = self._nearest(read_mask(self.mask_path), self.mask_path)
         if self.camera.is_distorted:
             unseen = lens_maps(self.camera)[2]
             if unseen is not None:
@@ -214,16 +210,7 @@ class View:
         """A mask or depth map at the camera's size and undistorted, without mixing pixels."""
         import cv2
 
-        height, width = data.shape
-        if abs(width * self.camera.height / (height * self.camera.width) - 1) > ASPECT_TOLERANCE:
-            raise ValueError(
-                f"{path}: must have the shape of its image "
-                f"({self.camera.width}x{self.camera.height}), "
-                f"got {width}x{height}; export it again"
-            )
-        size = (self.camera.width, self.camera.height)
-        if (width, height) != size:
-            data = cv2.resize(data, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        data = nearest_resized(data, (self.camera.width, self.camera.height), path)
         if self.camera.is_distorted:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
@@ -322,17 +309,6 @@ class Dataset:
 
 def _times(views: list[View]) -> tuple[float, ...]:
     return tuple(sorted({view.camera.time for view in views if view.camera and view.camera.time is not None}))
-
-
-def _unit_range(data: np.ndarray, path: Path) -> np.ndarray:
-    """Image data as float32 in [0,1], by its bit depth."""
-    if data.dtype == np.uint8:
-        return data.astype(np.float32) / np.float32(255)
-    if data.dtype == np.uint16:
-        return data.astype(np.float32) / np.float32(65535)
-    if data.dtype.kind == "f":
-        return np.clip(data.astype(np.float32), 0.0, 1.0)
-    raise ValueError(f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it")
 
 
 def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:

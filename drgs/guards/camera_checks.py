@@ -14,6 +14,7 @@ __all__ = [
     "IMAGE_MAX",
     "as_numpy",
     "check_distance",
+    "check_handedness",
     "check_proportions",
     "checked_distortion",
     "checked_intrinsics",
@@ -104,12 +105,37 @@ def checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
         raise ValueError(f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
     rotation = w2c[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        got = f"an error of {error:.2g}" if error > _ROTATION_TOLERANCE else "a reflection"
+    if error > _ROTATION_TOLERANCE:
         raise ValueError(
-            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got {got}; remove scale and flips"
+            f"{where}: the pose must hold a rotation (orthonormal to 1e-4), got an error of {error:.2g}; remove scale "
+            "and shear"
         )
+    column = "2 of camera-to-world, row 2 of world-to-camera"
+    check_handedness(where, rotation, "(+x right, +y down, +z forward)", column)
     return w2c
+
+
+def check_handedness(where: str, rotation: np.ndarray, axes: str, column: str) -> None:
+    """The axes of camera and world are both right-handed: their rotation (3, 3), or its inverse, is no reflection.
+
+    Which of the two is left-handed no pose tells: with one camera axis turned around, cameras stand where they stood;
+    with one of the world, the scene is its own mirror image. Only photographs, or points, agree with one and not with
+    the other.
+
+    Args:
+        rotation: what is closer to a reflection is refused.
+        axes: of a camera where the pose comes from, for the message.
+        column: and which of them usually points the other way.
+    """
+    check_distance(where, rotation)
+    if np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"{where}: the pose must hold a rotation, got a reflection (determinant -1): its camera or its world is "
+            f"left-handed; if it is the camera, whose axes must be {axes}, negate the one that points the other way, "
+            f"mostly column {column}, and cameras stay where they are; if it is the world, as Unity's and Unreal's, "
+            "negate one row of camera-to-world, position included, with that coordinate of all points, which mirrors "
+            "the scene; the same in all views"
+        )
 
 
 def check_distance(where: str, pose: np.ndarray) -> None:

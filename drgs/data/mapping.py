@@ -1,0 +1,282 @@
+"""Incremental mapping by COLMAP: what it is doing, told while it does it, and what became of all photographs.
+
+pycolmap calls back once a photograph has a pose, and between two of these calls minutes of bundle adjustment may pass.
+What goes on then is in COLMAP's log, which is followed here in a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drgs.data.matching import Progress
+
+__all__ = ["PhotoGroups", "map_photos", "runs"]
+
+_EVERY = 0.25  # seconds between two looks at the log
+_FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
+_ADVISED = 3  # gaps that are named
+
+# What COLMAP's log says -> what that is. Lines that are not known, of another version, change nothing.
+_DOING = {
+    "Loading database": "reading the matches",
+    "Finding good initial image pair": "looking for two photos to begin with",
+    "Registering initial image pair": "triangulating from two photos",
+    "Registering image": "finding the pose of a photo",
+    "Global bundle adjustment": "bundle adjustment",
+    "Retriangulation and Global bundle adjustment": "retriangulation and bundle adjustment",
+    "Discarding reconstruction": "dropping a model that is too small",
+}
+_LINE = re.compile(rb"^[IWEF]\d{8} \S+ +\d+ [^\]]+\] (.*)$")
+
+
+class _Told:
+    """What `map_photos` tells of: poses found in the model that is being made, and what is being done."""
+
+    def __init__(self, total: int, progress: Progress, doing: Callable[[str], None]) -> None:
+        self.total, self._progress, self._doing = total, progress, doing
+        self.registered, self._model, self._what = 0, 0, "reading the matches"
+        self._since = time.monotonic()
+        self._lock = threading.Lock()  # COLMAP's thread calls back, another one follows the log
+
+    def begun(self) -> None:
+        """A model has its first two photographs, all adjusted."""
+        with self._lock:
+            self.registered, self._model = 2, self._model + 1
+            self._tell()
+
+    def one_more(self) -> None:
+        """One photograph more has a pose, all adjusted."""
+        with self._lock:
+            self.registered += 1
+            self._tell()
+
+    def line(self, text: str) -> None:
+        """A line of COLMAP's log."""
+        what = next((what for begins, what in _DOING.items() if text.startswith(begins)), None)
+        if what is not None:
+            with self._lock:
+                self._what, self._since = what, time.monotonic()
+                self._tell()
+
+    def still(self) -> None:
+        """Time has passed."""
+        with self._lock:
+            self._tell()
+
+    def _tell(self) -> None:
+        parts = [f"model {self._model}"] if self._model > 1 else []  # the photographs have fallen apart
+        is_last = "bundle adjustment" in self._what and self.registered >= self.total
+        what = f"final {self._what}" if is_last else self._what
+        seconds = time.monotonic() - self._since
+        parts.append(f"{what} for {seconds:.0f} s" if seconds >= 2 else what)
+        self._progress("mapping", min(self.registered, self.total), self.total)
+        self._doing(", ".join(parts))
+
+
+def map_photos(
+    database: Path,
+    image_dir: Path,
+    folder: Path,
+    options: Any,
+    total: int,
+    progress: Progress,
+    doing: Callable[[str], None],
+) -> dict[int, Any]:
+    """COLMAP's incremental mapping.
+
+    Args:
+        database: with verified matches.
+        image_dir: that names in it are relative to.
+        folder: that COLMAP writes models into; must exist. Its log lies there meanwhile.
+        options: pycolmap.IncrementalPipelineOptions.
+        total: photographs.
+        progress: called with ("mapping", poses found in the current model, total), also from another thread.
+        doing: called with what is being done, in words, also from another thread.
+
+    Returns:
+        pycolmap's models by number; empty if no two photographs could be connected.
+    """
+    from drgs.data.native import pycolmap
+
+    told = _Told(total, progress, doing)
+    told.still()
+    with _followed(folder, told):
+        return pycolmap.incremental_mapping(
+            database,
+            image_dir,
+            folder,
+            options=options,
+            initial_image_pair_callback=told.begun,
+            next_image_callback=told.one_more,
+        )
+
+
+@contextlib.contextmanager
+def _followed(folder: Path, told: _Told) -> Iterator[None]:
+    """COLMAP's log goes to a file in a folder, and `told` hears of every line soon after it is written."""
+    from drgs.data.native import pycolmap
+
+    log = pycolmap.logging
+    before = log.minloglevel, log.logtostderr, log.alsologtostderr, log.stderrthreshold
+    levels = log.Level.WARNING, log.Level.ERROR, log.Level.FATAL
+    for level in levels:  # would each have a file of their own in the system's temporary folder
+        log.set_log_destination(level, "")
+    log.set_log_destination(log.Level.INFO, str(folder / "log.0."))
+    log.logtostderr, log.alsologtostderr, log.stderrthreshold, log.minloglevel = False, False, 3, 0
+    is_over = threading.Event()
+
+    def follow() -> None:
+        for number in itertools.count():
+            is_last = is_over.wait(_EVERY)
+            # The log keeps lines back for half a minute, until its file is closed: another one takes its place.
+            log.set_log_destination(log.Level.INFO, "" if is_last else str(folder / f"log.{number + 1}."))
+            for file in folder.glob(f"log.{number}.*"):
+                for found in map(_LINE.match, file.read_bytes().splitlines()):
+                    if found:
+                        told.line(found[1].decode("utf-8", "replace"))
+                file.unlink()
+            if is_last:
+                return
+            told.still()
+
+    thread = threading.Thread(target=follow, name="drgs mapping", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+        log.minloglevel, log.logtostderr, log.alsologtostderr, log.stderrthreshold = before
+
+
+@dataclass(frozen=True)
+class PhotoGroups:
+    """What photographs fell apart into.
+
+    Attributes:
+        kept: names of the photographs of the model that was kept, sorted.
+        others: names of those of each other model, the largest first. Models may share photographs.
+        alone: names of the photographs that are in no model.
+        gaps: where photographs are missing, the best first: one of the kept model, one that is not in it, and how many
+            verified matches they share, 0 where no two share any and the two are merely neighbors by name.
+        featureless: names and numbers of features of those photographs alone that have next to none.
+    """
+
+    kept: tuple[str, ...]
+    others: tuple[tuple[str, ...], ...]
+    alone: tuple[str, ...]
+    gaps: tuple[tuple[str, str, int], ...]
+    featureless: tuple[tuple[str, int], ...]
+
+    @staticmethod
+    def of(database: Path, names: Sequence[str], kept: set[str], others: Sequence[set[str]]) -> PhotoGroups:
+        """The parts of all `names`, in their order, as the database's matches connect them."""
+        others = sorted(others, key=len, reverse=True)
+        alone = tuple(name for name in names if name not in kept.union(*others))
+        features, matches = _evidence(database)
+        lost = [[name for name in names if name in other - kept] for other in others] + [[name] for name in alone]
+        gaps = [_gap(names, kept, group, matches) for group in lost if group]
+        gaps.sort(key=lambda gap: -gap[2])
+        return PhotoGroups(
+            kept=tuple(sorted(kept)),
+            others=tuple(tuple(sorted(other)) for other in others),
+            alone=alone,
+            gaps=tuple(gaps),
+            featureless=tuple((name, features[name]) for name in alone if features.get(name, 0) < _FEW_FEATURES),
+        )
+
+    def lines(self, names: Sequence[str], is_masked: bool, is_sequential: bool) -> list[str]:
+        """Whole sentences for people; none where every photograph is in the kept model.
+
+        Args:
+            names: of all photographs, in their order.
+            is_masked: whether masks said where features may lie.
+            is_sequential: whether only photographs near each other by name were compared.
+        """
+        if len(self.kept) == len(names):
+            return []
+        found = []
+        if self.others:
+            count = len(self.others) + 1
+            found.append(
+                f"the photos fell apart into {count} models; the largest was kept, with {len(self.kept)} photos: "
+                f"{runs(self.kept, names)}"
+            )
+            for number, other in enumerate(self.others, 2):
+                shared = len(set(other) & set(self.kept))
+                also = f", {shared} of them also in the kept one" if shared else ""
+                found.append(f"model {number}, left out, has {len(other)} photos{also}: {runs(other, names)}")
+        if self.alone:
+            found.append(f"in no model: {len(self.alone)} photos: {runs(self.alone, names)}")
+        return found + [f"what would help: {advice}" for advice in self._advice(is_masked, is_sequential)]
+
+    def _advice(self, is_masked: bool, is_sequential: bool) -> Iterator[str]:
+        """What would bring more photographs into the kept model, the surest first, by what the database shows."""
+        dull = {name for name, _ in self.featureless}
+        for ours, theirs, matches in [gap for gap in self.gaps if gap[1] not in dull][:_ADVISED]:
+            why = f"{matches} matches connect them" if matches else "nothing connects them"
+            yield f"photos between {ours} and {theirs} ({why}), each overlapping the one before by two thirds"
+        if self.featureless:
+            shown = ", ".join(f"{name} ({count})" for name, count in self.featureless[:_ADVISED])
+            more = f" and {len(self.featureless) - _ADVISED} more" if len(self.featureless) > _ADVISED else ""
+            where = "a larger mask, or a sharper photo" if is_masked else "a sharper, brighter photo"
+            yield f"{where} in place of {shown}{more}: too few features, their number is in brackets"
+        if is_sequential:
+            yield "--matcher exhaustive: only photos near each other by name were compared"
+        if not is_masked:
+            yield "--masks, if the object was turned or moved between photos while its background stood still"
+
+
+def _evidence(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
+    """Number of features by photograph, and of verified matches by pair."""
+    from drgs.data.native import pycolmap
+
+    with pycolmap.Database.open(database) as handle:
+        images = {image.image_id: image.name for image in handle.read_all_images()}
+        features = {name: handle.num_keypoints_for_image(number) for number, name in images.items()}
+        pairs, counts = handle.read_two_view_geometry_num_inliers()
+    matches = {}
+    for pair, count in zip(pairs, counts, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(pair)
+        if count:
+            matches[images[a], images[b]] = count
+    return features, matches
+
+
+def _gap(
+    names: Sequence[str], kept: set[str], group: Sequence[str], matches: dict[tuple[str, str], int]
+) -> tuple[str, str, int]:
+    """Where a group of photographs is nearest to the kept ones: by verified matches, else by place in the list."""
+    best = ("", "", 0)
+    for (a, b), count in matches.items():
+        if b in kept:
+            a, b = b, a
+        if a in kept and b in group and count > best[2]:
+            best = (a, b, count)
+    if best[2]:
+        return best
+    place = {name: index for index, name in enumerate(names)}
+    theirs, ours = min(((b, a) for b in group for a in kept), key=lambda pair: abs(place[pair[0]] - place[pair[1]]))
+    return ours, theirs, 0
+
+
+def runs(some: Sequence[str], names: Sequence[str]) -> str:
+    """Names in words: those that follow each other in the list of all names as first and last."""
+    place = {name: index for index, name in enumerate(names)}
+    stretches: list[list[str]] = []
+    for name in sorted(some, key=lambda name: place[name]):
+        if stretches and place[stretches[-1][-1]] + 1 == place[name]:
+            stretches[-1].append(name)
+        else:
+            stretches.append([name])
+    return ", ".join(
+        f"{stretch[0]} to {stretch[-1]}" if len(stretch) > 2 else ", ".join(stretch) for stretch in stretches
+    )
