@@ -203,14 +203,18 @@ def evaluate(
     Returns:
         JSON-serializable: `views` (a list of name, size and metrics), `mean` and `median` over them, `variants`,
         `reasons` of what is None; of a run with features `segmentation` (`Segmentation.result`), whose views have
-        `pixel_accuracy` and `miou`, too.
+        `pixel_accuracy` and `miou`, too; and `scores`, every single number that there is: the means and, of a run with
+        features, the scores of its labels.
     """
     with Bar("measuring views", len(frames)) as bar:
         result = _evaluated(g, frames, settings, lpips, pictures, segmentation, moving, bar)
+    result["scores"] = dict(result["mean"])
     if isinstance(segmentation, str):
         result["segmentation"], result["reasons"]["segmentation"] = None, segmentation
     elif segmentation is not None:
-        result["segmentation"] = segmentation.result()
+        found = result["segmentation"] = segmentation.result()
+        numbers = [name for name in found["variants"] if name != "iou"]  # a list
+        result["scores"] |= {name: found["run"] and found["run"][name] for name in numbers}
     return result
 
 
