@@ -31,11 +31,13 @@ __all__ = [
     "METRICS",
     "MOVING",
     "DEFINITIONS",
+    "VIEWERS",
     "VIEW_PICTURES",
     "Lpips",
     "evaluate",
     "flip",
     "psnr",
+    "settings_of_viewers",
     "ssim",
     "through_viewers",
     "uncovered",
@@ -53,6 +55,8 @@ DEFINITIONS = {
 METRICS = tuple(DEFINITIONS)
 MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
 """What is measured beside `METRICS` where labels say what moves: a background that stands still hides the rest."""
+VIEWERS = "gsplat"
+"""The preset that viewers of PLY files draw with."""
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
@@ -60,7 +64,6 @@ _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torch
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11
-_VIEWERS = "gsplat"  # the model that viewers of PLY files draw with
 _VIEWERS_VIEWS = 8  # enough for a mean difference, and a second at most
 
 
@@ -200,14 +203,18 @@ def evaluate(
     Returns:
         JSON-serializable: `views` (a list of name, size and metrics), `mean` and `median` over them, `variants`,
         `reasons` of what is None; of a run with features `segmentation` (`Segmentation.result`), whose views have
-        `pixel_accuracy` and `miou`, too.
+        `pixel_accuracy` and `miou`, too; and `scores`, every single number that there is: the means and, of a run with
+        features, the scores of its labels.
     """
     with Bar("measuring views", len(frames)) as bar:
         result = _evaluated(g, frames, settings, lpips, pictures, segmentation, moving, bar)
+    result["scores"] = dict(result["mean"])
     if isinstance(segmentation, str):
         result["segmentation"], result["reasons"]["segmentation"] = None, segmentation
     elif segmentation is not None:
-        result["segmentation"] = segmentation.result()
+        found = result["segmentation"] = segmentation.result()
+        numbers = [name for name in found["variants"] if name != "iou"]  # a list
+        result["scores"] |= {name: found["run"] and found["run"][name] for name in numbers}
     return result
 
 
@@ -284,6 +291,12 @@ def _moving_psnr(image: torch.Tensor, frame: Frame, moving: frozenset[int]) -> f
     return psnr(image, frame.image(), chosen) if bool((chosen > 0).any()) else None
 
 
+def settings_of_viewers(settings: RenderSettings) -> RenderSettings | None:
+    """What viewers of PLY files draw with, before the background of `settings`; None where it is `settings`."""
+    viewers = RenderSettings.preset(VIEWERS, background=settings.background)
+    return None if settings == viewers else viewers
+
+
 def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:
     """How Gaussians look in the viewers of PLY files, which draw with the rasterizers' model, not with `settings`.
 
@@ -300,8 +313,8 @@ def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, spl
         `settings`), `split`, `views` (names), `width` and `height` of the first; None if there is no view, or
         `settings` are the viewers' own.
     """
-    viewers = RenderSettings.preset(_VIEWERS, background=settings.background)
-    if settings == viewers or not frames:
+    viewers = settings_of_viewers(settings)
+    if viewers is None or not frames:
         return None
     frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
     models, values = {"psnr": viewers, "own_psnr": settings}, {}
@@ -316,7 +329,7 @@ def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, spl
                 bar.advance()
             values[name] = float(np.mean(found))
     size = {"width": frames[0].camera.width, "height": frames[0].camera.height}
-    return {"preset": _VIEWERS, **values, "split": split, "views": [frame.name for frame in frames], **size}
+    return {"preset": VIEWERS, **values, "split": split, "views": [frame.name for frame in frames], **size}
 
 
 def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields: Any) -> dict:

@@ -88,10 +88,23 @@ def test_infinite_logits_of_splat_transform(tmp_path, caplog):
     assert torch.isfinite(g.logit_opacities.grad).all()
 
 
+_ONLY_READ = r"must end with .ply, .spz, .glb, got .{}, a format that drgs reads and does not write; write b.ply, .*: "
+
+
 @pytest.mark.parametrize(
     ("words", "match"),
     [
         (("b.xyz",), r"b.xyz must end with .ply, .spz, .glb, got .xyz; rename it"),
+        (
+            ("b.splat",),
+            rf"{_ONLY_READ.format('splat')}`python convert.py b.ply --output b.splat` of github.com/antimatter15",
+        ),
+        (("b.KSPLAT",), rf"{_ONLY_READ.format('ksplat')}`node util/create-ksplat.js b.ply b.KSPLAT` of "),
+        (("b.sog",), rf"{_ONLY_READ.format('sog')}`npx @playcanvas/splat-transform -g cpu b.ply b.sog`"),
+        (
+            ("c/meta.json",),
+            r"write c/scene.ply, and make it of that: `npx @playcanvas/splat-transform -g cpu c/scene.ply c/meta",
+        ),
         (("b.spz", "--labels"), "--labels must have a .ply to write to"),
         (("b.ply", "--labels"), "--labels must have a run that was fitted with classes"),
         (("b.ply", "--time", "0"), "--time must have a scene that moves"),
@@ -109,7 +122,8 @@ def test_what_cannot_be_is_said_before_anything_is_written(tmp_path, rng, monkey
     line = capsys.readouterr().err
     assert re.search(match, line), line
     assert line.count("\n") == 1
-    assert not list(tmp_path.glob("b.*"))
+    assert "rename" not in line or words == ("b.xyz",)
+    assert not list(tmp_path.glob("[bc]*"))
 
 
 def test_as_stored_is_the_other_half_of_the_turn(tmp_path, rng):

@@ -8,6 +8,7 @@ import json
 
 import numpy as np
 import pytest
+from json_page import check
 
 from drgs import cli, scenes
 from drgs.scenes import kitchen, moving, tabletop, teacher, videos
@@ -96,6 +97,7 @@ def test_files(made):
         "params.json", "poses_bounds.npy", "rgb_feature_langseg", "semantic_class", "teacher.json",
         "text_embeddings.npy",
     }  # fmt: skip
+    check("params.json", json.loads((made / "params.json").read_text()), absent=("depth_unit", "test_every", "views"))
     assert not [path for path in made.rglob("*") if ".part" in path.name]
     maps = sorted(path.name for path in (made / "rgb_feature_langseg").iterdir())
     assert maps == [f"cam{c:02d}_{k:04d}_fmap_CxHxW.pt" for c in range(CAMERAS) for k in range(TIMES)]

@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from drgs import metrics
 from drgs.cameras import orbit
+from drgs.commands.eval import print_table
 from drgs.fitting.frames import Frame
 from drgs.settings import RenderSettings
 
@@ -139,6 +141,21 @@ def test_what_lpips_needs(rng, monkeypatch, installed, expected):
     reason = evaluate(monkeypatch, b, [frame(a)])["reasons"]["lpips"]
     assert expected in reason
     assert installed == ("--lpips-weights" in reason)
+
+
+def test_lpips_is_spoken_of_where_it_was_asked_for(rng, monkeypatch, capsys):
+    """Nothing of it is printed without weights, of held-out views or of none; with weights the reason of a null is."""
+    a, b = images(rng)
+    beside = {"split": "test", "viewers": None}
+    for frames in ([frame(a)], []):
+        result = evaluate(monkeypatch, b, frames)
+        assert "lpips" in result["reasons"]
+        print_table({**result, **beside, "count": len(frames)})
+        assert "lpips" not in capsys.readouterr().out.lower()
+    lpips = SimpleNamespace(backbone="alex")  # never called: the views are smaller than 64 pixels
+    result = evaluate(monkeypatch, b, [frame(a)], lpips=lpips)
+    print_table({**result, **beside, "count": 1}, lpips=True)
+    assert "lpips: none (view a/b 1 is smaller than 64 pixels)" in capsys.readouterr().out
 
 
 def test_masked_evaluation_ignores_what_is_outside(rng, monkeypatch):

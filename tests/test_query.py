@@ -15,6 +15,8 @@ from drgs.data.camera_lists import save_cameras_json
 from drgs.features.decoder import Decoder, save_decoder
 from drgs.features.query import TextQuery
 from drgs.features.segmentation import Classes
+from drgs.fitting.config import FitConfig
+from drgs.fitting.records import FitRecord
 
 NAMES = ("wall", "chair", "lamp")
 WIDTH, CHANNELS = 3, 8
@@ -172,6 +174,31 @@ def test_classes_of_a_run(files, monkeypatch, capsys):
     assert capsys.readouterr().err == "drgs query: class 'sofa': must be one of wall, chair, lamp; correct it\n"
     assert query(files, "--class", "chair") == 2
     assert "--decoder is for a PLY" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("step", "max_steps", "rate", "needed"),
+    [(20, 3000, 1e-3, 1000), (None, 20, 1e-3, 1000), (20, 20, 1e-2, 100), (1000, 3000, 1e-3, None), (6, 6, 0.2, None)],
+)
+def test_a_short_fit_is_told_how_many_steps_it_needs(files, monkeypatch, capsys, step, max_steps, rate, needed):
+    """Where nothing is found: features that move by their rate a step are about 1 after 1 / rate steps."""
+    g = scene().replace(features=torch.eye(WIDTH)[[0] * 10])  # all of them wall
+    config = FitConfig(max_steps=max_steps, feature_rate=rate)
+    record = FitRecord(data=files, train=(), test=(), config=config, is_active=False)
+    given = Given(g, record=record, step=step, decoder=decoder(), classes=Classes(NAMES, embeddings()))
+    monkeypatch.setattr("drgs.commands.query.Given.of", lambda args: given)
+    assert query(files, "--class", "lamp", decoder=False) == 2
+    error = capsys.readouterr().err
+    assert "a Gaussian must be selected, none of 10 is (largest cosine of 3 texts; " in error
+    assert error.count("\n") == 1
+    assert not (files / "out").exists()
+    if needed is None:
+        assert error.endswith("give a --threshold or look for something else\n")
+        return
+    assert (
+        f"need about {needed:,} steps at --feature-rate {rate:g} to tell classes apart, this run has done 20" in error
+    )
+    assert error.endswith(f"fit with --max-steps {needed} or more\n")
 
 
 def test_bad_queries_write_nothing(files, capsys):

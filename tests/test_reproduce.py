@@ -12,6 +12,7 @@ import time
 
 import numpy as np
 import pytest
+from json_page import check
 from test_active import write_still
 from test_dynamic_data import cameras, coded, write_poses, write_video
 
@@ -318,7 +319,10 @@ def test_a_study_that_is_killed_goes_on(tmp_path):
     assert all(text in page for text in ("![", "| random |", "| farthest |", ".maps.png)"))
     assert "other.maps.png" not in page
     assert f"`drgs {line[0]} static -o {out} --scale tiny --seeds 1 --protocol paper --policy random --policy" in page
-    assert [row["policy"] for row in json.loads((out / "static.json").read_text())["rows"]] == ["random", "farthest"]
+    written = json.loads((out / "static.json").read_text())
+    assert [row["policy"] for row in written["rows"]] == ["random", "farthest"]
+    check("reproduce.json", written, maps=("paper",))
+    check("rows.jsonl", *found, maps=("metrics", "medians", "curve", "curve"))
     import cv2
 
     sheet = cv2.imread(str(out / "static.png"))

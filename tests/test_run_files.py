@@ -1,21 +1,36 @@
-"""docs/run-files.md against the files that are written: every field is told, and every field that is told is there."""
+"""docs/run-files.md against the files that are written: every field is told, and every field that is told is there.
+
+demo.json, reproduce.json and teach.json are held to the page where tests make them (test_demo.py, test_reproduce.py,
+test_teach.py), a data set's where its scene is rendered (test_room.py, test_kitchen.py).
+"""
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import json
 import re
 
+import json_page
+import numpy as np
 import pytest
 from doc_pages import ROOT
+from json_page import PAGE, check, section, titles
+from json_page import names as _names
 from test_active import SIZE, config, lazily, plan, write_still
+from test_query import decoder, embeddings
+from test_query import scene as labelled
 
 from drgs import cli
 from drgs.cameras import orbit
 from drgs.data import load
 from drgs.data.camera_lists import save_cameras_json
+from drgs.features.decoder import save_decoder
+from drgs.files import save_ply
+from drgs.lab.rows import Crop
+from drgs.testing import random_scene
 from drgs.train import ActiveConfig, fit
 
-_PAGE = (ROOT / "docs" / "run-files.md").read_text(encoding="utf-8")
 _SOMETIMES = {
     "config.json": {"frames", "absent", "semantics", "times"},
     "metrics.json": {"segmentation", "motion"},
@@ -25,14 +40,7 @@ _SOMETIMES = {
 
 def _rows(title: str) -> list[tuple[set[str], set[str]]]:
     """The names in the first cell of each row of a section's tables, and those in its other cells."""
-    section = _PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]
-    cells = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("| `")]
-    assert cells
-    return [(_names(first), _names(" ".join(others))) for first, *others in cells]
-
-
-def _names(text: str) -> set[str]:
-    return set(re.findall(r"`([\w, -]+)`", text))
+    return [(_names(first), _names(" ".join(others))) for first, *others in section(title)]
 
 
 def _fields(title: str) -> set[str]:
@@ -82,10 +90,11 @@ def test_evaluating_keeps_what_the_fit_said(place):
 def test_metrics_inside(place):
     """Of views, and of what viewers show."""
     metrics = _read(place / "all/metrics.json")
-    measured = {name for name in re.findall(r"`(\w+)`", _PAGE.split("The metrics of a view are ")[1].split(".")[0])}
+    measured = {name for name in re.findall(r"`(\w+)`", PAGE.split("The metrics of a view are ")[1].split(".")[0])}
     assert set(metrics["mean"]) <= measured
     assert set(metrics["views"][0]) == _told_of("metrics.json", "views") | set(metrics["mean"])
     assert set(metrics["viewers"]) == _told_of("metrics.json", "viewers")
+    assert metrics["scores"] == metrics["mean"]  # of a run without labels
 
 
 def test_log(place):
@@ -122,3 +131,117 @@ def test_fisher(place):
     for map_name, criterion in (("variance", "eig"), ("share", "logdet")):
         assert view[map_name]["sum"] == pytest.approx(view["gain"][criterion], rel=1e-4)
     assert report["prior"]["value"] == 1
+
+
+_WRITERS = {
+    "commands/crossval.py": {"crossval.json"},
+    "commands/demo.py": {"demo.json"},
+    "commands/fisher.py": {"fisher.json"},
+    "commands/query.py": {"query.json"},
+    "commands/render.py": {"render.json"},
+    "commands/reproduce.py": {"reproduce.json"},  # and data.json, a map
+    "commands/select.py": {"selection.json"},
+    "commands/stress.py": {"stress.json"},
+    "commands/teach.py": {"teach.json", "classes.json"},
+    "commands/tradeoff.py": {"tradeoff.json"},
+    "data/camera_lists.py": {"cameras.json"},
+    "files.py": {"config.json", "env.json", "log.jsonl"},
+    "fitting/active.py": {"selection.json"},
+    "metrics.py": {"metrics.json"},
+    "studies/rows.py": {"rows.jsonl"},
+}
+"""Module that writes JSON for users -> the sections of the page that tell its fields."""
+_OTHERS = {
+    "codecs/gltf.py",  # the header of a .glb
+    "commands/info.py",  # stdout
+    "commands/repeat.py",  # options on a line of a report
+    "data/children.py",  # between processes
+    "fitting/config.py",  # plain values
+    "guards/json_files.py",  # a message
+    "guards/locks.py",  # .drgs.lock
+    "guards/outputs.py",  # .drgs.jsonl
+    "guards/writing.py",  # for log.jsonl
+    "report/page.py",  # a cell of the report
+    "studies/cells.py",  # plain values
+}
+"""Modules that make JSON which is no file of the page."""
+
+
+def test_every_writer_has_its_section():
+    """A module that calls `write_json`, or makes JSON itself, has its files on the page; the page has no others."""
+    found = set()
+    for path in (ROOT / "drgs").rglob("*.py"):
+        if any(
+            isinstance(node, ast.Call) and ast.unparse(node.func) in ("write_json", "json.dumps", "json.dump")
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        ):
+            found.add(path.relative_to(ROOT / "drgs").as_posix())
+    assert found == {*_WRITERS, *_OTHERS}
+    made = {"params.json", "teacher.json"}  # by scenes/
+    assert set().union(*_WRITERS.values()) | made == titles()
+
+
+def test_the_check_finds_what_is_missing(monkeypatch):
+    """A field that is not told, at any depth, and one that no file has."""
+    monkeypatch.setattr(
+        json_page, "PAGE", "\n## a.json\n\n| field | meaning |\n|---|---|\n| `one`, `two` | `three` |\n"
+    )
+    whole = {"schema": 1, "one": 1, "two": [{"three": 3}]}
+    check("a.json", whole)
+    check("a.json", {**whole, "two": [{"chair": {"three": 3}}]}, maps=("two",))
+    with pytest.raises(AssertionError, match=r"does not tell: \['four'\]"):
+        check("a.json", {**whole, "two": [{"three": {"four": 4}}]})
+    with pytest.raises(AssertionError, match=r"what no a.json has: \['two'\]"):
+        check("a.json", {"one": {"three": 3}})
+
+
+def test_env(place):
+    """Where a fit ran."""
+    check("env.json", _read(place / "all/env.json"), maps=("packages",))
+
+
+def test_render_and_query(place):
+    """With a film, PLY files and maps; what a text means in a PLY with its decoder."""
+    cameras = ["--cameras", str(place / "cameras.json"), "--limit", "1", "--quiet"]
+    made = ["--format", "png,webm,ply", "--depth", "-o", str(place / "rendered")]
+    assert cli.main(["render", str(place / "all"), *cameras, *made]) == 0
+    check("render.json", _read(place / "rendered/render.json"))
+    check("cameras.json", _read(place / "rendered/cameras.json"), absent=("time",))
+    save_ply(labelled(), place / "labelled.ply")
+    save_decoder(decoder(), place / "decoder.pth")
+    np.save(place / "chair.npy", embeddings()[1].numpy())
+    wanted = ["--text-embedding", str(place / "chair.npy"), "--threshold", "0.9"]
+    given = ["--decoder", str(place / "decoder.pth"), "-o", str(place / "found")]
+    assert cli.main(["query", str(place / "labelled.ply"), *cameras, *wanted, *given]) == 0
+    check("query.json", _read(place / "found/query.json"))
+
+
+def test_crossval_tradeoff_and_stress(tmp_path, monkeypatch):
+    """Of a rasterizer that is wrong forward, with its ladder, and of one with another convention; of a small scene; of
+    a case.
+    """
+    g, cameras = random_scene(0, count=20, width=16, height=12)
+    save_ply(g, tmp_path / "scene.ply")
+    save_cameras_json(tmp_path / "cameras.json", cameras)
+    (tmp_path / "dark_rasterizer.py").write_text(
+        "import torch_rasterizer\n"
+        "def dark(**arguments):\n"
+        "    image, alpha, info = torch_rasterizer.rasterization(**arguments)\n"
+        "    return 0.75 * image, alpha, info\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    seen = [str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "cameras.json"), "--quiet"]
+    made = []
+    for name, ladder in (("dark_rasterizer:dark", ()), ("torch_rasterizer:defect_channels_swapped", ("--no-ladder",))):
+        options = ["--preset", "gsplat", "--set", "background=0.3,0.6,0.2", "-o", str(tmp_path / "crossval"), *ladder]
+        assert cli.main(["crossval", *seen, "--rasterizer", name, *options]) == 0
+        made.append(_read(tmp_path / "crossval/crossval.json"))
+    crop = {"crops": [dataclasses.asdict(Crop(0, 0, 8, 8, [16, 12]))]}  # only of a large scene
+    groups = ("groups", "not_offered", "gradient", "switched")
+    check("crossval.json", *made, crop, maps=groups, elsewhere=("start", "end"))
+    assert cli.main(["tradeoff", *seen, "--repeats", "1", "--seconds", "1", "-o", str(tmp_path / "tradeoff")]) == 0
+    uses = ("full", "scatter", "times", "seconds", "ratio", "notes", "groups")
+    report = _read(tmp_path / "tradeoff/tradeoff.json")
+    check("tradeoff.json", report, maps=uses, elsewhere=("views", "fields"))
+    assert cli.main(["stress", "--match", "D = 1", "--quiet", "-o", str(tmp_path / "stress")]) == 0
+    check("stress.json", _read(tmp_path / "stress/stress.json"))

@@ -13,6 +13,7 @@ import drgs
 from drgs import cli, metrics
 from drgs.commands import render as render_command
 from drgs.commands.eval import run as run_eval
+from drgs.commands.given import Given
 from drgs.commands.options import Eval
 from drgs.data.checks import read_image
 from drgs.data.semantics import Semantics
@@ -420,6 +421,10 @@ def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, caps
     assert found["teacher"]["pixel_accuracy"] > 0.9  # a perfect teacher, but for edges that 16x16 cells blur
     assert found["run"]["pixel_accuracy"] < found["teacher"]["pixel_accuracy"]  # after 6 steps
     assert all(0 <= view["pixel_accuracy"] <= 1 for view in run.metrics["views"])
+    # All numbers are in one place, too: means of the images' metrics, and scores of the labels.
+    assert Given.at(run.run.path).step == run.metrics["step"] > 0
+    labels = {name: found["run"][name] for name in ("pixel_accuracy", "class_accuracy", "miou", "miou_top7")}
+    assert run.metrics["scores"] == {**run.metrics["mean"], **labels}
     monkeypatch.setattr("drgs.data.load", lambda path, **_: taught)
     capsys.readouterr()
     run_eval(Eval(run=run.run.path))

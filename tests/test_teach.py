@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from json_page import check
 
 transformers = pytest.importorskip("transformers", reason="needs the extra teacher: pip install 'drgs[teacher]'")
 
@@ -146,6 +147,8 @@ def test_teach_writes_what_a_fit_finds(capture, model, monkeypatch, capsys):
     before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
     assert teach(capture, model, "--classes", "chair, table") == 0
     printed = capsys.readouterr()
+    check("teach.json", json.loads((capture / "rgb_feature_langseg/teach.json").read_text()))
+    check("classes.json", json.loads((capture / "classes.json").read_text()))
     assert "maps of 3 photographs, 12 channels" in printed.out
     assert "text embeddings of 2 classes" in printed.out
     assert {path: path.read_bytes() for path in before} == before

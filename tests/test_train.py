@@ -5,13 +5,16 @@ import json
 import math
 import os
 import signal
+import sys
 
 import numpy as np
 import pytest
 import torch
+from test_active import write_still
 
 import drgs
-from drgs import metrics
+import drgs.commands.fit
+from drgs import cli, metrics
 from drgs.cameras import orbit
 from drgs.commands.eval import print_table, viewers_line
 from drgs.commands.eval import run as run_eval
@@ -146,6 +149,34 @@ def test_fit_says_how_viewers_show_it(dataset, tmp_path, preset, capsys):
     assert f"PSNR {want:.2f} dB instead of {viewers['own_psnr']:.2f} dB, mean of 2 test views" in said
     unheld = fit(dataset, tmp_path / "all", config(max_steps=2, test_every=0), progress=False).metrics["viewers"]
     assert (unheld["split"], len(unheld["views"])) == ("train", 5)  # every second of nine
+
+
+def test_a_fit_says_first_what_viewers_will_show(tmp_path, capsys, monkeypatch):
+    """`drgs fit` says which preset it trains for, what viewers draw with and how to train for them, before it reads
+    a photograph; nothing with the viewers' own preset, nor with --quiet.
+    """
+    write_still(tmp_path / "data")
+    read = drgs.commands.fit.load_dataset
+
+    def reading(*arguments, **options):
+        print("reading", file=sys.stderr)
+        return read(*arguments, **options)
+
+    monkeypatch.setattr(drgs.commands.fit, "load_dataset", reading)
+
+    def said(*options):
+        name = str(tmp_path / f"run{len(list(tmp_path.iterdir()))}")
+        words = ["fit", str(tmp_path / "data"), "-o", name, "--max-steps", "1", "--no-report", *options]
+        assert cli.main(words) == 0
+        return capsys.readouterr().err.partition("reading")[0].splitlines()
+
+    (hint,) = said()
+    assert hint.startswith("this fit trains for preset fast; viewers of PLY files draw with preset gsplat")
+    assert hint.endswith("; --preset gsplat trains for viewers")
+    (hint,) = said("--preset", "gsplat", "--set", "dilation=0.1")
+    assert hint.startswith("this fit trains for preset gsplat with --set dilation=0.1; ")
+    assert hint.endswith("; --preset gsplat alone trains for viewers")
+    assert said("--preset", "gsplat") == said("--quiet") == []
 
 
 def test_viewers_widen_what_is_small():

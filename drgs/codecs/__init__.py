@@ -38,6 +38,13 @@ __all__ = ["READ", "WRITTEN", "check_suffix", "load_gaussians", "save_gaussians"
 
 READ = ".ply, .spz, .splat, .ksplat, .sog and .glb, a SOG folder or a model folder of INRIA's"
 WRITTEN = (".ply", ".spz", ".glb")
+_MADE_BY = {
+    ".sog": "`npx @playcanvas/splat-transform -g cpu {ply} {path}`, or SuperSplat (superspl.at/editor)",
+    ".splat": "`python convert.py {ply} --output {path}` of github.com/antimatter15/splat, or SuperSplat "
+    "(superspl.at/editor)",
+    ".ksplat": "`node util/create-ksplat.js {ply} {path}` of github.com/mkkellogg/GaussianSplats3D",
+}
+"""What makes a file that is only read of a PLY."""
 _log = logging.getLogger(__name__)
 
 
@@ -128,13 +135,24 @@ def save_gaussians(
 
 
 def check_suffix(where: str, path: Path) -> str:
-    """The suffix of a file that will be written, in lower case; ValueError if there is no such format."""
+    """The suffix of a file that will be written, in lower case.
+
+    Raises:
+        ValueError: If no such format is written; of those that are only read it says which program makes one.
+    """
     suffix = path.suffix.lower()
-    if suffix not in WRITTEN:
-        raise ValueError(
-            f"{where}: {path.name} must end with {', '.join(WRITTEN)}, got {suffix or 'no suffix'}; rename it"
-        )
-    return suffix
+    if suffix in WRITTEN:
+        return suffix
+    known = f"{where}: {path.name} must end with {', '.join(WRITTEN)}, got {suffix or 'no suffix'}"
+    if path.name.lower() == "meta.json":
+        suffix = ".sog"  # the index of the same, in a folder
+    if suffix not in _MADE_BY:
+        raise ValueError(f"{known}; rename it")
+    ply = path.with_name(("scene" if path.stem == "meta" else path.stem) + ".ply")
+    raise ValueError(
+        f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
+        f"{_MADE_BY[suffix].format(ply=ply, path=path)}"
+    )
 
 
 def _plain(g: Gaussians) -> Gaussians:

@@ -27,11 +27,16 @@ def run(args: Eval) -> None:
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
     written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict)
     if not args.quiet:
-        print_table(written)
+        print_table(written, lpips=lpips is not None)
 
 
-def print_table(metrics: dict) -> None:
-    """The metrics of `write_metrics` as tables on stdout, reasons of missing ones below, and what viewers show."""
+def print_table(metrics: dict, *, lpips: bool = False) -> None:
+    """The metrics of `write_metrics` as tables on stdout, reasons of missing ones below, and what viewers show.
+
+    Args:
+        metrics: As written.
+        lpips: Whether LPIPS was asked for; otherwise nothing is said of it, as it is null for a reason that is known.
+    """
     digits = {"psnr": ".2f", "psnr_moving": ".2f"}
     names = [name for name in (*METRICS, *MOVING) if metrics["mean"].get(name) is not None]
     rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
@@ -43,6 +48,8 @@ def print_table(metrics: dict) -> None:
     if found := metrics.get("segmentation"):
         _print_segmentation(metrics, found)
     for name, reason in metrics["reasons"].items():
+        if name == "lpips" and not lpips:
+            continue
         print(f"{name}: none ({reason})")
     if metrics["viewers"]:
         print(viewers_line(metrics["viewers"]))

@@ -30,6 +30,7 @@ class Given:
         gaussians: Of the file, or of the run's last checkpoint.
         run: The run folder; None for a file.
         record: How the run was fitted; None for a file.
+        step: How many steps of the fit its checkpoint has; None for a file, and where only the PLY could be read.
         fields: Render settings that hold whatever the preset is: what --set says, over the background of the fit. A
             run was fitted over its background; over another one its edges show a halo.
         decoder, classes: Of a run that was fitted with semantics; else None.
@@ -39,6 +40,7 @@ class Given:
     gaussians: Gaussians
     run: Run | None = None
     record: FitRecord | None = None
+    step: int | None = None
     fields: dict[str, Any] = dataclasses.field(default_factory=dict)
     decoder: Decoder | None = None
     classes: Classes | None = None
@@ -76,7 +78,8 @@ class Given:
         loaded = load_run(run)
         scene = loaded.scene
         moving = None if scene is loaded.gaussians else scene
-        return cls(loaded.gaussians, run, loaded.record, decoder=loaded.decoder, classes=loaded.classes, moving=moving)
+        known = {"step": loaded.step, "decoder": loaded.decoder, "classes": loaded.classes, "moving": moving}
+        return cls(loaded.gaussians, run, loaded.record, **known)
 
     def settings(self, preset: str) -> RenderSettings:
         """How a command renders it with a preset."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +52,8 @@ def run(args: Query) -> None:
         score, selected = query.score(g.features, decoder)
     count = int(selected.sum())
     kept = g.take(~selected if args.remove else selected)
-    _refuse_nothing(len(g), count, float(score.max()) if len(g) else 0.0, query, args.remove)
+    largest = float(score.max()) if len(g) else 0.0
+    _refuse_nothing(len(g), count, largest, query, args.remove, _too_short(given))
     cameras, source = seen_views(args, given)
     pixels = args.max_pixels or (given.record.config.max_pixels if given.record else None)
     if pixels is not None:
@@ -130,12 +132,32 @@ def _query(args: Query, given: Given) -> TextQuery:
     return TextQuery.of_classes(given.classes, args.classes, args.threshold, temperature)
 
 
-def _refuse_nothing(total: int, selected: int, largest: float, query: TextQuery, remove: bool) -> None:
-    """Raise ValueError where the PLY would hold no Gaussian."""
+def _too_short(given: Given) -> str:
+    """What to do, if a run has done fewer steps than its features need to tell classes apart; else "".
+
+    They begin at 0 and move by their learning rate a step, Adam's: to about 1 in 1 / rate steps. Measured in
+    docs/semantic.md: of the made room at the rate of 1e-3 they have just begun to differ after 242 steps, and tell
+    classes apart after 1,000.
+    """
+    if given.record is None:
+        return ""
+    done = given.record.config.max_steps if given.step is None else given.step
+    rate = given.record.config.feature_rate
+    if rate <= 0 or done >= (needed := math.ceil(1 / rate)):
+        return ""
+    return (
+        f"features begin at 0 and need about {needed:,} steps at --feature-rate {rate:g} to tell classes apart, this "
+        f"run has done {done:,}: fit with --max-steps {needed} or more"
+    )
+
+
+def _refuse_nothing(total: int, selected: int, largest: float, query: TextQuery, remove: bool, too_short: str) -> None:
+    """Raise ValueError where the PLY would hold no Gaussian; `too_short`: what to do about the fit, if anything."""
     if selected == 0:
+        advice = f"{'give a' if query.threshold is None else 'lower'} --threshold or look for something else"
         raise ValueError(
             f"a Gaussian must be selected, none of {total} is ({query.rule}; the largest {query.score_name} is "
-            f"{largest:.3g}); {'give a' if query.threshold is None else 'lower'} --threshold or look for something else"
+            f"{largest:.3g}); {too_short or advice}"
         )
     if remove and selected == total:
         raise ValueError(

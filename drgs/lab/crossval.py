@@ -31,7 +31,8 @@ from drgs.lab import conventions
 from drgs.lab.channels import wide_gradients
 from drgs.lab.crops import crops
 from drgs.lab.dumps import Dump, cotangents
-from drgs.lab.judgement import Case, compared, judge
+from drgs.lab.image_errors import error_line
+from drgs.lab.judgement import Case, compared, judge, with_errors
 from drgs.lab.rasterizers import Rasterizer
 from drgs.lab.raw import COLORS, POSE, raw_of, with_pose
 from drgs.lab.reference_model import ReferenceModel
@@ -83,6 +84,8 @@ class Result:
         for finding in self.findings:
             lines.append(f"convention: {finding.name} is {finding.found}, expected {finding.expected}")
         for view in self.views:
+            if view.error is not None:
+                lines.append(f"view {view.view}: {error_line(view.error, r['size'])}")
             if abs(bias := view.alpha.bias) > _ALPHA:
                 what = "lower: hits are missing" if bias < 0 else "higher"
                 lines.append(f"view {view.view}: alpha is {abs(bias):.1e} {what} on average")
@@ -132,6 +135,7 @@ def crossval(
     starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
     background = starts[0].settings.background
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
+    cameras = [c if c.name else dataclasses.replace(c, name=str(i)) for i, c in enumerate(cameras)]
     whole, asked = len(g), len(cameras)
     places: list[Crop | None] = [None] * asked
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
@@ -164,12 +168,19 @@ def crossval(
         pictures[first], starts, lambda m: drawn_by(m, first)[0], lambda m: ties_of(m, first), _SETTLED[dtype]
     )
     model = found.model
+    claimed = next(name for name, start in zip(presets, starts, strict=True) if start == found.start)
     drawn = [drawn_by(model, view) for view in range(len(cameras))]
     if not any(bool(alpha.any()) for _, alpha in drawn):
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
     beside = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
     judge(case, model, beside)
+    if not beside.agrees:
+        say("what the error looks like")
+        models = {"the model at its conventions": model} if found.findings else {}
+        models |= {f"preset {claimed}": found.start}  # and what else may be meant
+        models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
+        beside.views = with_errors(beside, pictures, models, drawn_by)
     not_offered = {} if POSE in beside.groups else {POSE: "its image has no gradient of them"}
     if channels:
         wide, reason = wide_gradients(case, model, beside, channels, seed, functools.partial(ties_of, model))
@@ -183,7 +194,7 @@ def crossval(
     report = {
         "rasterizer": rasterizer.name,
         "verdict": worst,
-        "preset": next(n for n, s in zip(presets, starts, strict=True) if s == found.start),
+        "preset": claimed,
         "conventions": [dataclasses.asdict(finding) for finding in found.findings],
         "image": {
             "agrees": beside.agrees,

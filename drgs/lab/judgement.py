@@ -16,15 +16,15 @@ from drgs.cameras import Camera
 from drgs.lab.conventions import LEAST
 from drgs.lab.differences import Differences, central
 from drgs.lab.dumps import Dump
+from drgs.lab.image_errors import OFF, Pattern, error_row, pattern_of
 from drgs.lab.rasterizers import Rasterizer
 from drgs.lab.raw import POSE
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import AlphaRow, GroupRow, OwnRow, ViewRow, WorstGaussian, WorstPixel
 
-__all__ = ["Case", "Compared", "compared", "judge"]
+__all__ = ["Case", "Compared", "compared", "judge", "with_errors"]
 
-_PIXEL = 1e-3  # a pixel that differs by more hangs on a cut-off or on the order; if few do, they are left out
-_FEW = 0.01
+_FEW = 0.01  # of the pixels: so few that are off hang on a cut-off or on the order, and are left out
 _IMAGE = 1e-3  # RMS of images that agree
 _ENOUGH = 3  # converged differences that a verdict needs
 _OWN = 0.02  # relative difference from its own central differences that is a bug
@@ -127,10 +127,10 @@ def compared(
     while True:
         left = ties & (not counted)
         views = [_image_row(*row) for row in zip(case.cameras, pictures, alphas, drawn, ~left, strict=True)]
-        agrees = all(row.rms <= _IMAGE and row.share <= _FEW for row in views)
+        agrees = all(_is_same(row) for row in views)
         u = signs
         if not isinstance(case.rasterizer, Dump):  # whose gradients are of its own cotangents
-            off = torch.stack([(a - s).abs().amax(-1) > _PIXEL for a, (s, _) in zip(pictures, drawn, strict=True)])
+            off = torch.stack([(a - s).abs().amax(-1) > OFF for a, (s, _) in zip(pictures, drawn, strict=True)])
             u = signs * ~(left | (off & agrees))[..., None]
         case.say("gradients")
         theirs, ours = case.theirs(u), case.ours(model, u)
@@ -176,6 +176,44 @@ def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
                 row.settle("undecided", f"{share:.0%} of the pixels hang on near ties; choose other views")
 
 
+def with_errors(
+    found: Compared,
+    pictures: list[torch.Tensor],
+    models: dict[str, ReferenceModel],
+    draw: Callable[[ReferenceModel, int], tuple[torch.Tensor, torch.Tensor]],
+) -> list[ViewRow]:
+    """The rows of views, those whose image is not the model's with where it is wrong and what its error looks like.
+
+    Patterns are looked for beside every model, since what is no convention of a renderer, such as a factor, may have
+    been taken for conventions that explain a part of it. The model whose images they explain best is named.
+
+    Args:
+        found: Of these views.
+        pictures: (H, W, 3) each, the rasterizer's.
+        models: In words -> the model; the first is the one at its conventions, whose pixels are compared.
+        draw: A model and a view's index -> its (H, W, 3) image and (H, W) alpha.
+    """
+    off = [k for k, row in enumerate(found.views) if not _is_same(row)]
+    counts = {k: (~found.ties[k] | found.counted).numpy() for k in off}
+    wrong = {k: pictures[k].numpy() for k in off}
+    seen: dict[str, dict[int, Pattern]] = {}
+    for name, model in models.items():
+        drawn = {k: (x.numpy() for x in draw(model, k)) for k in off}
+        seen[name] = {k: pattern_of(wrong[k], *drawn[k], model.settings.background, counts[k]) for k in off}
+    name = max(models, key=lambda name: sum(x.explained for x in seen[name].values() if x.is_change))
+    first = next(iter(models.values()))
+    rows = list(found.views)
+    for k in off:
+        image = draw(first, k)[0].numpy()
+        rows[k] = dataclasses.replace(rows[k], error=error_row(wrong[k], image, counts[k], seen[name][k], name))
+    return rows
+
+
+def _is_same(row: ViewRow) -> bool:
+    """Whether a view's image is the model's."""
+    return row.rms <= _IMAGE and row.share <= _FEW
+
+
 def _image_row(camera: Camera, image: torch.Tensor, alpha: torch.Tensor, drawn: tuple, counts: torch.Tensor) -> ViewRow:
     """How far two images are apart, at the pixels that count."""
     same, same_alpha = drawn
@@ -186,7 +224,7 @@ def _image_row(camera: Camera, image: torch.Tensor, alpha: torch.Tensor, drawn: 
         view=camera.name,
         rms=_mean((image - same).square().mean(-1), counts) ** 0.5,
         max=float(error.max()),
-        share=_mean((error > _PIXEL).double(), counts),
+        share=_mean((error > OFF).double(), counts),
         alpha=AlphaRow(rms=_mean((alpha - same_alpha).square(), counts) ** 0.5, bias=_mean(alpha - same_alpha, counts)),
         near_ties=int((~counts).sum()),
         worst=at,

@@ -8,6 +8,8 @@ import re
 import numpy as np
 
 from drgs.display import pictures
+from drgs.lab.image_errors import error_line
+from drgs.lab.rows import ErrorRow
 
 __all__ = ["html"]
 
@@ -15,7 +17,7 @@ _MEANING = {
     "agreement": "The image and the gradients are the model's.",
     "known deviation": "Gradients differ by choices that are documented.",
     "other convention": "At the conventions found below it agrees; they are not those of the preset.",
-    "model difference": "It agrees with itself, and is another model.",
+    "model difference": "Its image is not the model's: where, and what its error looks like, is below.",
     "undecided": "Gradients differ, and nothing says who is right.",
     "gradient bug": "Its gradients are not the derivatives of its own image.",
 }
@@ -55,6 +57,8 @@ order of near ties; where they are few they are left out of the gradients.</p>
 <td>{{ "%+.1e" | format(v.alpha.bias) }}</td>
 <td class="text">{% for w in v.worst[:3] %}({{ w.x }}, {{ w.y }}): {{ num(w.difference) }}{{ ", " if not loop.last }}
 {% endfor %}</td></tr>{% endfor %}</table>
+{% for line in errors %}<p><span class="odd">view {{ line }}.</span></p>
+{% endfor %}
 {% for row in images %}<div>{% for name, data in row %}<figure><img src="data:image/png;base64,{{ data }}" alt="">
 <figcaption>{{ name }}</figcaption></figure>{% endfor %}</div>{% endfor %}
 
@@ -112,6 +116,11 @@ def html(report: dict, images: list[dict], ladder: str = "") -> str:
     return environment.from_string(_PAGE).render(
         r=report,
         images=rows,
+        errors=[
+            f"{view['view']}: {error_line(ErrorRow(**view['error']), report['size'])}"
+            for view in report["image"]["views"]
+            if view["error"]
+        ],
         ladder=Markup(_table(ladder)),
         meaning=_MEANING,
         num=lambda x: f"{x:.1e}",

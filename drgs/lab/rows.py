@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-__all__ = ["AlphaRow", "Crop", "GroupRow", "OwnRow", "ViewRow", "WorstGaussian", "WorstPixel"]
+__all__ = ["AlphaRow", "Crop", "ErrorRow", "GroupRow", "OwnRow", "ViewRow", "WorstGaussian", "WorstPixel"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,16 +25,42 @@ class AlphaRow:
 
 
 @dataclasses.dataclass(frozen=True)
+class ErrorRow:
+    """Where an image is wrong, and what its error looks like.
+
+    Attributes:
+        pixels: How many differ by more than 0.001 and count.
+        box: The smallest that holds them: x and y of its first and of its last pixel.
+        x, y: Of the worst of them.
+        rasterizer, model: Its RGB in either image.
+        pattern: One of `drgs.lab.image_errors.PATTERNS`.
+        what: The same in words, with its numbers.
+        explained: Share of the squared error that the pattern explains, or that lies where it says; null for `none`.
+    """
+
+    pixels: int
+    box: list[int]
+    x: int
+    y: int
+    rasterizer: list[float]
+    model: list[float]
+    pattern: str
+    what: str
+    explained: float | None
+
+
+@dataclasses.dataclass(frozen=True)
 class ViewRow:
     """One view's image beside the model's.
 
     Attributes:
-        view: The camera's name.
+        view: The camera's name, or its number where it has none.
         rms, max: Of the difference.
         share: Of the pixels that differ by more than 0.001.
         alpha: Of the difference of alphas.
         near_ties: Pixels that do not count.
         worst: Up to five pixels.
+        error: Where it is wrong and how; null where the image is the model's.
     """
 
     view: str
@@ -44,6 +70,7 @@ class ViewRow:
     alpha: AlphaRow
     near_ties: int
     worst: list[WorstPixel]
+    error: ErrorRow | None = None
 
 
 @dataclasses.dataclass(frozen=True)
