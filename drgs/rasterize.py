@@ -20,6 +20,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import semi_axes
 from drgs.integrator import render
+from drgs.runtime import uncompiled
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.splats import Splats, cameras_of, check_shapes, inside, inside_opacities
 
@@ -43,6 +44,7 @@ _INSTEAD = {
 }
 
 
+@uncompiled
 def rasterization(
     means: torch.Tensor,
     quats: torch.Tensor,
