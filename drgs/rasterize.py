@@ -137,6 +137,10 @@ def rasterization(
         viewmats_rs=viewmats_rs is not None,
         camera_model=camera_model != "pinhole",
     )
+    if not near_plane < far_plane:
+        raise ValueError(
+            f"rasterization: near_plane must be less than far_plane, got {near_plane:g} and {far_plane:g}; swap them"
+        )
     _one_of("render_mode", render_mode, RENDER_MODES)
     _one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     settings = _settings(preset, near_plane, eps2d, rasterize_mode)

@@ -15,10 +15,10 @@ from drgs.guards.arguments import ArgumentError
 
 __all__ = ["check_has_numbers", "check_unbatched", "first_only", "refuse_batched", "refuse_meta"]
 
-Tensors = tuple[torch.Tensor | None, ...]
+Derivatives = tuple[torch.Tensor | None, ...]
 
 
-def first_only(where: str, derivatives: Tensors, by: Sequence[torch.Tensor | None]) -> Tensors:
+def first_only(where: str, derivatives: Derivatives, by: Sequence[torch.Tensor | None]) -> Derivatives:
     """First derivatives that cannot be differentiated: asking for a second one raises NotImplementedError.
 
     Unlike `torch.autograd.function.once_differentiable`, which marks them only where the cotangents have a graph: of a
@@ -27,7 +27,7 @@ def first_only(where: str, derivatives: Tensors, by: Sequence[torch.Tensor | Non
 
     Args:
         where: The function, for the message.
-        derivatives: Tensors, None where there is none.
+        derivatives: Derivatives, None where there is none.
         by: What they depend on: the point and the cotangents, or tangents.
     """
     if not any(_watched(x) for x in by if x is not None):
@@ -50,7 +50,7 @@ class _Last(torch.autograd.Function):
     """The first `count` tensors, tied to all of them by a derivative that raises."""
 
     @staticmethod
-    def forward(where: str, count: int, *tensors: torch.Tensor) -> Tensors:
+    def forward(where: str, count: int, *tensors: torch.Tensor) -> Derivatives:
         return tuple(x.clone() for x in tensors[:count])
 
     @staticmethod
