@@ -43,6 +43,7 @@ from drgs.lenses import (
     fisheye_polynomial,
     undistort_opencv,
 )
+from drgs.runtime import uncompiled
 
 __all__ = [
     "Camera",
@@ -92,12 +93,13 @@ class Camera:
     name: str = ""
     time: float | None = None
 
+    @uncompiled
     def __post_init__(self) -> None:
         must_be("Camera", "name", self.name, str, "it becomes a file name")
         where = f"Camera {self.name[:_SHOWN]!r}" if self.name else "Camera"
         put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 (the dataclass is frozen)
         put("K", checked_intrinsics(where, self.K))
-        pose = checked_pose(where, as_numpy(self.w2c))
+        pose = checked_pose(where, self.w2c)
         if not is_tensor(self.w2c):
             if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > _ROUNDING:
                 pose = pose.copy()

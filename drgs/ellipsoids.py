@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.guards.derivatives import check_has_numbers
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -245,6 +246,7 @@ class Gaussians:
         """Raise ValueError, naming the first index, if a parameter is NaN or infinite or a quaternion is 0."""
         with torch.no_grad():  # a check, which leaves no graph
             for name, x in self.parameters().items():
+                check_has_numbers(where, name, x)
                 # One reduction decides, NaN passes through it; the index is looked for only if there is one to report.
                 if x.numel() and not all(math.isfinite(float(end)) for end in torch.aminmax(x)):
                     bad = ~torch.isfinite(x).reshape(len(x), -1).all(1)
@@ -271,6 +273,7 @@ def colors_only(scene: Scene, time: float | None) -> Scene:
 def _tensor(name: str, x: ArrayLike) -> torch.Tensor:
     """An argument of `from_arrays` as a float tensor; of arrays, only means keep float64."""
     if isinstance(x, torch.Tensor):
+        check_has_numbers("Gaussians.from_arrays", name, x)
         return x if x.is_floating_point() else x.to(torch.float32)
     try:
         array = np.asarray(x)

@@ -59,7 +59,9 @@ def render(
     Gradients:
         Of rgb, alpha, depth and features, with respect to means, quats, log_scales, logit_opacities, sh, features and
         the pose, in reverse mode (`backward`, `torch.func.grad`) and forward mode (`torch.func.jvp`,
-        `torch.autograd.forward_ad`). Order, cut-offs and the extent are constants of the derivative.
+        `torch.autograd.forward_ad`). Order, cut-offs and the extent are constants of the derivative. There are no
+        second ones: what differentiates a derivative, or calls this from `torch.func.vmap`, as `jacrev`, `jacfwd` and
+        `hessian` do, gets NotImplementedError. `torch.compile` leaves it out of its graphs.
     Reference:
         Kerbl et al. 2023 (compositing, SH); Moenne-Loccoz et al. 2024 (response at the peak of the ray).
     """
@@ -109,7 +111,7 @@ def render_jvp(
             the derivative is the scene's own, one-sided where that has a kink (`drgs.DeformationField`).
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried
-        through one traversal.
+        through one traversal. They have no graph: nothing differentiates a tangent.
     Raises:
         ValueError: If a name or shape is wrong.
     """

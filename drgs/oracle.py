@@ -83,6 +83,8 @@ def activate(g: Any, s: RenderSettings) -> SimpleNamespace:
         logits=logits,
         sh=sh,
         features=None if g.features is None else float64(g.features),
+        # World coordinates of float64 means are rounded about here, those of float32 means about 0.
+        middle=means.detach().mean(0).tolist() if n and g.means.dtype == torch.float64 else [0.0, 0.0, 0.0],
         extent=extent,
         index=torch.arange(n),
         colors=None,  # (N, 3), or None where the color depends on the ray

@@ -20,6 +20,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import semi_axes
 from drgs.integrator import render
+from drgs.runtime import uncompiled
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.splats import Splats, cameras_of, check_shapes, inside, inside_opacities
 
@@ -43,6 +44,7 @@ _INSTEAD = {
 }
 
 
+@uncompiled
 def rasterization(
     means: torch.Tensor,
     quats: torch.Tensor,
@@ -135,6 +137,10 @@ def rasterization(
         viewmats_rs=viewmats_rs is not None,
         camera_model=camera_model != "pinhole",
     )
+    if not near_plane < far_plane:
+        raise ValueError(
+            f"rasterization: near_plane must be less than far_plane, got {near_plane:g} and {far_plane:g}; swap them"
+        )
     _one_of("render_mode", render_mode, RENDER_MODES)
     _one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     settings = _settings(preset, near_plane, eps2d, rasterize_mode)

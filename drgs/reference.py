@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 __all__ = ["ReferenceOutput", "render", "render_volume", "sh_basis"]
 
 _TILE = 16  # pixels; both rasterizers' tile size
+_FLOAT32 = 2.0**-23  # of a coordinate: twice what rounding it to float32 changes
+_FLOAT64 = 2.0**-50  # as much, of the few operations that a pose takes
 _PAIRS = 1 << 19  # (ray, Gaussian) pairs held at once: about 0.3 GB of intermediates
 
 
@@ -93,7 +95,8 @@ def render(
         tolerance: A pixel is `ambiguous` when rounding could move a weight by more than `effect`:
             neighbors in the order have keys closer than `tolerance` times the distance (exact ties
             are safe, the index decides; see `exact_ties`), or a hit or T is within a relative `tolerance` of a
-            cut-off, clamp, tile border or of T = 0.5.
+            cut-off, clamp, tile border or of T = 0.5. So is a peak that float32 coordinates of the mean and of the
+            ray's origin may put before or behind it, as that of a mean at the eye.
         window: (x, y, width, height) in pixels: only these of the camera's image. Unlike a camera with a shifted
             principal point it keeps the tiles and the field-of-view clamp of the whole image. Gaussians that none of
             its rays can meet are left out first, which changes nothing but the time.
@@ -213,6 +216,7 @@ def _responses(
     o: Tensor,
     d: Tensor,
     pixels: Tensor,
+    tolerance: float,
 ) -> tuple:
     """What is known of (P, N) pairs before ordering.
 
@@ -245,7 +249,7 @@ def _responses(
             tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.screen[-1])
             cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
         if form.front_only:
-            cut(t > 0, t / distance.clamp(min=1e-300))  # no 0 / 0
+            cut(t > 0, t / torch.maximum(distance, _sway(scene, o, d) / tolerance).clamp(min=1e-300))  # no 0 / 0
         if s.alpha_min > 0:
             cut(a >= s.alpha_min, a / s.alpha_min - 1)
         if scene.near_margin is not None:
@@ -258,6 +262,18 @@ def _responses(
             key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length
     # The order is a constant of every derivative.
     return a, rest, t, key.detach().expand_as(a), exists, margin, to_max, distance
+
+
+def _sway(scene: SimpleNamespace, o: Tensor, d: Tensor) -> Tensor:
+    """(P, N) by how much a peak moves along its ray if means and origins are rounded: to float32 where they are world
+    coordinates, to float64 where they become those of the camera.
+    """
+    middle, rounding = scene.means.new_tensor(scene.middle), 0.0
+    for origin, relative in ((middle, _FLOAT32), (0 * middle, _FLOAT64)):
+        rounding = rounding + relative * ((scene.means - origin).norm(dim=-1) + (o - origin).norm(dim=-1)[:, None])
+    turned = torch.einsum("nij,pj->pni", scene.whiten, d)
+    pulled = torch.einsum("nij,pni->pnj", scene.whiten, turned)
+    return rounding * pulled.norm(dim=-1) / turned.square().sum(-1)
 
 
 class _Peak:
@@ -339,7 +355,7 @@ def _composite(
     effect: float,
 ) -> dict:
     """The fields of `ReferenceOutput` for one chunk of rays."""
-    a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels)
+    a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels, tolerance)
     # Near misses are sorted in, without effect, to see what they would have done.
     candidate = checks[0] | (checks[1] >= -tolerance)
     key, order = torch.where(candidate, key, math.inf).sort(dim=1, stable=True)

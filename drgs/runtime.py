@@ -44,12 +44,19 @@ __all__ = [
     "optix_status",
     "prepare",
     "setup",
+    "uncompiled",
     "version",
 ]
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
+# What torch.compiler.disable leaves on a function, for compiled code that meets it.
+_UNCOMPILED = {
+    "_torchdynamo_disable": True,
+    "_torchdynamo_disable_msg": "drgs: must be called outside of torch's graphs, got torch.compile(fullgraph=True); "
+    "leave fullgraph out",
+}
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 _PACKAGES = (
@@ -93,6 +100,32 @@ _computing = threading.RLock()
 _owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
 
 
+def uncompiled(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Keeps `torch.compile` out of a function: compiled code calls it as it is, and with `fullgraph=True` says why not.
+
+    `torch.compiler.disable` does so, but loads torch's compiler, which takes 2 s: here only where it is loaded already.
+    """
+
+    @functools.wraps(function)
+    def as_it_is(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        if "torch._dynamo" in sys.modules:
+            return _eagerly(function, *args, **kwargs)
+        return function(*args, **kwargs)
+
+    vars(as_it_is).update(_UNCOMPILED)
+    return as_it_is
+
+
+def _eagerly(function: Callable[_Arguments, _Result], *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+    """A call without torch's compiler, which is loaded."""
+    import torch
+
+    return torch.compiler.disable(function)(*args, **kwargs)
+
+
+vars(_eagerly).update(_UNCOMPILED)
+
+
 def alone(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Lets one Python thread at a time compute, as one computation uses all cores, and refuses in a forked child.
 
@@ -107,7 +140,7 @@ def alone(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
         with _computing:
             return function(*args, **kwargs)
 
-    return one_at_a_time
+    return uncompiled(one_at_a_time)
 
 
 def _refuse_fork() -> None:
@@ -119,9 +152,16 @@ def _refuse_fork() -> None:
 
 
 def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _Result:
-    """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph."""
+    """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph.
+
+    Raises:
+        NotImplementedError: If one of the wrappers is a batch of `torch.func.vmap`.
+    """
     import torch
 
+    from drgs.guards.derivatives import check_unbatched
+
+    check_unbatched("render", x)
     functorch = torch._C._functorch
     # Otherwise every operation wraps its result again.
     with torch._C._DisableFuncTorch():

@@ -19,6 +19,7 @@ from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Y_00, Gaussians
 from drgs.guards.arguments import ArgumentError
+from drgs.guards.derivatives import check_has_numbers
 
 __all__ = [
     "SplatScene",
@@ -195,6 +196,7 @@ def check_shapes(
     for name, x in tensors.items():
         if not isinstance(x, torch.Tensor):
             raise ValueError(f"{where}: {name} must be a torch tensor, got {type(x).__name__}; use torch.as_tensor")
+        check_has_numbers(where, name, x)
     if means.ndim < 2 or means.shape[-1] != 3:
         raise ValueError(f"{where}: means must have shape (..., N, 3), got {tuple(means.shape)}")
     if viewmats.ndim < 3:

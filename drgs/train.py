@@ -28,7 +28,7 @@ from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import ActiveConfig, FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
-from drgs.fitting.records import config_record
+from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
 from drgs.fitting.stages import moving_labels
@@ -151,7 +151,7 @@ def _fit(
     if tensors is not None and header is not None:
         made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
-        seconds, source = header["seconds"], header["point_source"]
+        seconds, source = seconds_of(run, header) or 0.0, header["point_source"]
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
         trainer, source = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
@@ -217,6 +217,7 @@ def _checkpoint(
         )
     if plan:
         plan.restore(tensors, header, str(run.path))
+        plan.picks = pick_seconds(run, plan.picks)
     check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
     return tensors, header
 
@@ -317,14 +318,14 @@ class _Loop:
             return
         tensors, header = self.trainer.state()
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
-        header |= {"seconds": self.seconds, "point_source": self.source}
+        header |= {"point_source": self.source}
         header |= {"semantics": self.taught.to_json()} if self.taught else {}
         if self.plan:
             more_tensors, more_header = self.plan.state()
             tensors, header = tensors | more_tensors, header | more_header
         keep_previous(self.run_folder)
         save_state(self.run_folder.state, tensors, header)
-        self.run_folder.log("checkpoint", step=self.trainer.step_index)
+        self.run_folder.log("checkpoint", step=self.trainer.step_index, seconds=self.seconds)
         self._saved, self._saved_at = now, time.monotonic()
 
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:

@@ -18,6 +18,8 @@ from scenes_extreme import CASES, CROWDS, crowd
 from scenes_random import camera, gaussians, gradients
 
 from drgs import reference
+from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.ellipsoids import Gaussians
 from drgs.integrator import render, render_jvp, render_rays
 from drgs.lab.refusals import REFUSALS
 from drgs.lab.stress import refused, row_of, truth_of
@@ -124,6 +126,30 @@ def test_rays_that_start_inside(rng, monkeypatch, listed, order):
     assert wanted.count.double().mean() > 5
     assert (found.rgb - wanted.rgb)[good].abs().max() < 1e-5
     assert (found.count - wanted.count)[good].abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    ("preset", "traversal"), [("exact", "tiles"), ("exact", "bvh"), ("fast", "tiles"), ("mitsuba", "bvh")]
+)
+@pytest.mark.parametrize("eye", [(0.1, -0.2, 0.3), (1.1, 2.3, -3.7), (10.3, 20.1, -5.0)])
+def test_a_mean_at_the_eye_is_ambiguous(eye, preset, traversal):
+    """Whether its peak is in front hangs on the last bit, and all of its opacity with it: the oracle says so, at the
+    eye and as near to it as float32 rounds (float64 means are re-centered); where it is farther away, all agree.
+    """
+    eye = np.float64(np.float32(eye))
+    w2c = look_at(tuple(map(float, eye)), (0.3, 0.2, 1.0), (0.0, -1.0, 0.0))
+    cam = Camera(K=intrinsics_from_fov(50.0, width=9, height=7), w2c=w2c, width=9, height=7)
+    settings = RenderSettings.preset(preset, traversal=traversal)
+    cases = [(0.0, np.float32, False), (4e-8, np.float32, False), (1e-3, np.float32, True)]
+    for ahead, dtype, known in [*cases, (0.0, np.float64, False), (4e-8, np.float64, True)]:
+        means = torch.tensor((eye + ahead * w2c[2, :3]).astype(dtype))[None]
+        g = Gaussians.from_arrays(means, np.eye(4)[:1], np.full((1, 3), 0.3), np.full(1, 0.78), np.ones((1, 1, 3)))
+        found, wanted = render(g, cam, settings), reference.render(g, cam, settings)
+        assert wanted.ambiguous.all() != known
+        assert wanted.ambiguous.any() != known
+        off = (found.alpha - wanted.alpha)[~wanted.ambiguous].abs()
+        assert off.numel() == (63 if known else 0)
+        assert (off < 1e-5).all()
 
 
 def test_negative_quaternion_is_the_same_rotation():

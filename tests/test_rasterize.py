@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import math
 
 import numpy as np
 import pytest
@@ -317,6 +318,8 @@ def test_forward_mode_is_the_transpose():
         ({"viewmats": torch.eye(4)}, ValueError, r"viewmats must have shape \(\.\.\., C, 4, 4\).*viewmat\[None\]"),
         ({"quats": torch.ones(60, 3)}, ValueError, r"quats must have shape \(60, 4\).*got \(60, 3\)"),
         ({"sh_degree": 3}, ValueError, "colors must have at least 16 coefficients for sh_degree 3, got 9"),
+        ({"near_plane": 10, "far_plane": 1}, ValueError, "near_plane must be less than far_plane, got 10 and 1; swap"),
+        ({"far_plane": math.nan}, ValueError, "near_plane must be less than far_plane, got 0.01 and nan"),
         ({"sh_degree": 4}, ValueError, "sh_degree must be None or 0 to 3, got 4"),
         ({"opacities": torch.full((60,), 1.5)}, ValueError, r"opacities must be in \[0, 1\].*got 1.5 at index \[0\]"),
         ({"scales": torch.full((60, 3), -1.0)}, ValueError, r"scales must be in \[0, inf\).*got -1 at index \[0, 0\]"),

@@ -13,7 +13,8 @@ from test_train import config, dataset  # noqa: F401 (a fixture)
 
 import drgs
 from drgs import cli
-from drgs.files import Run, load_state, save_ply
+from drgs.files import Run, load_state, save_ply, save_state
+from drgs.fitting.records import load_run
 from drgs.fitting.resume import FILES, PREVIOUS, last_checkpoint
 from drgs.guards import locks
 from drgs.train import Trainer, fit
@@ -221,3 +222,34 @@ def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
 def test_last_checkpoint_of_nothing(tmp_path):
     """`--resume` in a script works on the first start."""
     assert last_checkpoint(Run(tmp_path)) == (None, None)
+
+
+@pytest.mark.parametrize("options", ["", "--views active --policy random --add 1 --every 2"], ids=["all", "active"])
+def test_two_fits_leave_the_same_checkpoint(dataset, tmp_path, monkeypatch, capsys, two_threads, options):  # noqa: F811
+    """Byte for byte: what the clock says is in the log, from where a resumed fit and `load_run` have it."""
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    fixed = "--max-steps 6 --save-every 3 --deterministic --sh-degree 1 --max-gaussians 80 --no-report --quiet"
+    for name in ("a", "b"):
+        assert cli.main(f"fit data -o {tmp_path / name} {fixed} {options}".split()) == 0
+    files = [(tmp_path / name / "state.safetensors").read_bytes() for name in ("a", "b")]
+    assert files[0] == files[1]
+    run = Run(tmp_path / "a")
+    seconds = load_run(run).seconds
+    logged = [event for event in run.events() if event["event"] == "checkpoint"]
+    assert seconds == logged[-1]["seconds"] > 0
+    # It goes on from there, and its picks still know what they took.
+    assert cli.main(f"fit data -o {run.path} {fixed} {options} --resume".split()) == 0
+    assert json.loads((run.path / "metrics.json").read_text())["seconds"] == seconds
+    if options:
+        picks = json.loads((run.path / "selection.json").read_text())["picks"]
+        assert [pick["seconds"] for pick in picks] == [e["seconds"] for e in run.events() if e["event"] == "pick"]
+        assert picks[0]["seconds"] > 0
+
+
+def test_a_checkpoint_of_an_older_version_says_its_time_itself(dataset, run):  # noqa: F811
+    """It is believed, and a log that cannot be read is no reason to refuse a run."""
+    tensors, header = load_state(run.state)
+    (run.path / "log.jsonl").write_text("no JSON\n")
+    assert load_run(run).seconds is None
+    save_state(run.state, tensors, {name: x for name, x in header.items() if name != "schema"} | {"seconds": 12.5})
+    assert load_run(run).seconds == 12.5

@@ -131,7 +131,7 @@ class Fit(Choosing, Clustered, Data, Taught, Moving):
     sh_degree: Degree = FitConfig.sh_degree
     """Highest degree of the view-dependent color."""
     deterministic: bool = FitConfig.deterministic
-    """Same seed, same bits; slower."""
+    """Same seed, same bits; slower. (Images drawn again without gradients differ by 1e-7: docs/numerics.md.)"""
     resume: bool = False
     """Continue from the last checkpoint in the run folder."""
     save_every: int = FitConfig.save_every

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from drgs.dynamics.hexplane import HexPlane, levels
+from drgs.guards.derivatives import first_only
 
 __all__ = ["plane_smoothness", "time_l1", "time_smoothness"]
 
@@ -62,13 +63,14 @@ class _Bend(torch.autograd.Function):
             total.add_(torch.dot(d.reshape(-1), d.reshape(-1)), alpha=scale)
             for start, weight in ((0, 1.0), (1, -2.0), (2, 1.0)):
                 slope.narrow(axis, start, inner).add_(d, alpha=2 * weight * scale)
-        ctx.save_for_backward(slope)
+        ctx.save_for_backward(slope, x)
         return total
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, cotangent: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
-        return ctx.saved_tensors[0] * cotangent, None
+    def backward(ctx: Any, cotangent: torch.Tensor) -> tuple[torch.Tensor | None, None]:  # type: ignore[override]
+        slope, x = ctx.saved_tensors
+        (found,) = first_only("smoothness of a field", (slope * cotangent,), (x, cotangent))
+        return found, None
 
 
 class _FromOne(torch.autograd.Function):
@@ -80,7 +82,6 @@ class _FromOne(torch.autograd.Function):
         return (x - 1).abs_().mean()
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, slope: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
         (x,) = ctx.saved_tensors
         return (x - 1).sign_().mul_(slope / x.numel())

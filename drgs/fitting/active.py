@@ -333,7 +333,9 @@ class ActiveViews:
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header that a checkpoint adds to the trainer's."""
-        header = {"config": self.active.to_json(), "pool": [view.name for view in self.views], "picks": self.picks}
+        # Nothing that the clock says: two fits to the same bits have the same checkpoint.
+        picks = [{name: x for name, x in pick.items() if name != "seconds"} for pick in self.picks]
+        header = {"config": self.active.to_json(), "pool": [view.name for view in self.views], "picks": picks}
         header |= {"measured": self.measured}
         return {"policy_rng": self._generator.get_state()}, {"active": header}
 

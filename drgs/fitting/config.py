@@ -100,7 +100,9 @@ class FitConfig:
         times: How many synchronous frames of every camera are taken, evenly over the whole length.
         seed: Of everything random.
         sh_degree: Highest degree of the view-dependent color.
-        deterministic: One Dr.Jit thread, hence the same bits for the same seed.
+        deterministic: One Dr.Jit thread, hence the same bits for the same seed. An image that is drawn again without
+            gradients differs from the one that was fitted by 1e-7, the rounding of its sums (presets `fast`, `inria`
+            and `gsplat`; those of `exact` and `mitsuba` have the same bits).
         save_every: Steps between checkpoints.
         save_minutes: A checkpoint is written after so many minutes, too, however few steps these were.
         mask: `object` (nothing is outside), `valid` (anything may be outside), `ignore`, or `auto`: `object` where

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,8 @@ __all__ = [
     "is_fit_config",
     "is_run",
     "load_run",
+    "pick_seconds",
+    "seconds_of",
 ]
 
 _log = logging.getLogger(__name__)
@@ -55,9 +58,9 @@ _HEADER = {
     "extent": float,
     "views": [str],
     "config": dict,
-    "seconds": float,
     "point_source": str,
 }
+_TIMED = ("train", "preview", "checkpoint", "done")  # events whose `seconds` are those of all steps so far
 _ACTIVE = {"config": dict, "pool": [str], "picks": [{"number": int, "step": int, **_VIEW}]}
 
 
@@ -185,8 +188,43 @@ def load_run(run: Run) -> LoadedRun:
             run.point_cloud,
             run.state.name,
         )
-    done = {name: header[name] for name in ("step", "seconds", "bad_steps")}
+    done = {name: header[name] for name in ("step", "bad_steps")} | {"seconds": seconds_of(run, header)}
     return LoadedRun(gaussians, record, **done, networks=networks, decoder=decoder, classes=classes, moving=moving)
+
+
+def seconds_of(run: Run, header: dict) -> float | None:
+    """What the steps of a checkpoint took, by `log.jsonl`, None where that does not say: a checkpoint holds nothing of
+    the clock's, so that two fits to the same bits have the same file. Those of older versions say it themselves.
+    """
+    if "seconds" in header:
+        return header["seconds"]
+    times = [event for event in _logged(run) if event["event"] in _TIMED and _is_time(event.get("seconds"))]
+    # Steps that were done again after a resume are logged again: the last word counts.
+    known = [x["seconds"] for x in times if isinstance(x.get("step"), int) and x["step"] <= header["step"]]
+    return known[-1] if known else None
+
+
+def pick_seconds(run: Run, picks: list[dict]) -> list[dict]:
+    """The picks of a checkpoint with what choosing each took, by `log.jsonl`; 0 where that does not say."""
+    times = {
+        (event.get("number"), event.get("step"), event.get("index")): event["seconds"]
+        for event in _logged(run)
+        if event["event"] == "pick" and _is_time(event.get("seconds"))
+    }
+    known = [times.get((pick["number"], pick["step"], pick["index"]), 0.0) for pick in picks]
+    return [{"seconds": seconds, **pick} for pick, seconds in zip(picks, known, strict=True)]
+
+
+def _logged(run: Run) -> list[dict]:
+    """The events of a log that somebody may have edited: none of one that cannot be read."""
+    try:
+        return [event for event in run.events() if isinstance(event, dict) and isinstance(event.get("event"), str)]
+    except (OSError, ValueError):
+        return []
+
+
+def _is_time(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
 
 
 def _shows(path: Path, gaussians: Gaussians) -> bool:
@@ -308,10 +346,11 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     advice = "restore the file, or fit again in another folder"
     kind = _HEADER | ({"active": _ACTIVE} if header.get("active") is not None else {})
     kind |= {"networks": [str]} if "networks" in header else {}
+    kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
     check_json(str(path), header, kind, advice)
     least = {"step": 0, "bad_steps": 0, "start_count": 1, "seconds": 0}
     for name, low in least.items():
-        if header[name] < low:
+        if header.get(name, low) < low:
             raise ValueError(f"{path}: {name} must be >= {low}, got {header[name]}; {advice}")
     if not header["extent"] > 0:
         raise ValueError(f"{path}: extent must be > 0, got {header['extent']}; {advice}")

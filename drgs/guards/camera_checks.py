@@ -54,6 +54,10 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def _numbers(where: str, name: str, value: Any) -> np.ndarray:
+    if is_tensor(value):
+        from drgs.guards.derivatives import check_has_numbers
+
+        check_has_numbers(where, name, value)
     try:
         return read_only(as_numpy(value))
     except (TypeError, ValueError):
@@ -90,7 +94,7 @@ def check_proportions(where: str, K: np.ndarray, size: tuple[int, int]) -> None:
             )
 
 
-def checked_pose(where: str, w2c: np.ndarray) -> np.ndarray:
+def checked_pose(where: str, w2c: Any) -> np.ndarray:
     """(4,4) float64 w2c, read-only, finite, a rotation and a translation."""
     w2c = _numbers(where, "w2c", w2c)
     if w2c.shape != (4, 4):

@@ -13,6 +13,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.guards.derivatives import refuse_meta
 from drgs.settings import RenderSettings
 
 __all__ = [
@@ -155,6 +156,9 @@ def check_oracle(where: str, gaussians: Any, camera: Any, settings: Any) -> None
         must_be(where, "camera", camera, Camera, _CAMERA)
     if settings is not None:
         must_be(where, "settings", settings, RenderSettings, _SETTINGS)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh", "features"):
+        if isinstance(x := getattr(gaussians, name, None), torch.Tensor):
+            refuse_meta(where, name, x)
 
 
 def check_path(where: str, path: Any) -> Path:

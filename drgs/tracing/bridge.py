@@ -8,12 +8,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Iterator
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import drjit as dr
 import torch
 
 from drgs import runtime
+from drgs.guards.derivatives import first_only, refuse_batched
 
 if TYPE_CHECKING:
     from drgs.tracing.call import Call
@@ -74,7 +75,6 @@ class _Reverse(torch.autograd.Function):
         return tuple(x.torch() for x in ctx.graph[1])
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     @runtime.alone
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         values, graph = ctx.saved_tensors, ctx.graph
@@ -82,10 +82,11 @@ class _Reverse(torch.autograd.Function):
         ctx.graph = None
         inputs, images = graph or _traced(ctx.call, values, ctx.needed)
         for image, g in zip(images, cotangents, strict=True):
-            dr.set_grad(image, to_drjit(ctx.call.lib, g).array)
+            dr.set_grad(image, _plain(ctx.call.lib, g).array)
         needed = [k for k, x in enumerate(inputs) if x is not None]
         slopes: dict[int, Any] = dict(zip(needed, dr.backward_to([inputs[k] for k in needed]), strict=True))
-        return None, *(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
+        found = tuple(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
+        return None, *first_only("render", found, (*values, *cotangents))
 
 
 def _traced(call: Call, values: Iterable[torch.Tensor], needed: Iterable[bool]) -> tuple[list, list]:
@@ -122,11 +123,12 @@ class _Functional(torch.autograd.Function):
             dr.set_grad(images[name], _plain(lib, g).array)
         dr.enqueue(dr.ADMode.Backward, images)
         dr.traverse(dr.ADMode.Backward)
-        return None, *(dr.grad(x).torch().clone() for x in inputs.values())
+        found = tuple(dr.grad(x).torch().clone() for x in inputs.values())
+        return None, *first_only("render", found, (*ctx.saved_tensors, *cotangents))
 
     @staticmethod
     @runtime.alone
-    def jvp(ctx: Any, _call: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+    def jvp(ctx: Any, _call: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         call, lib = ctx.call, ctx.call.lib
         inputs = {n: _plain(lib, x) for n, x in zip(call.inputs, ctx.saved_tensors, strict=True)}
         dr.enable_grad(inputs)
@@ -136,7 +138,12 @@ class _Functional(torch.autograd.Function):
                 dr.set_grad(x, _plain(lib, v))
         dr.enqueue(dr.ADMode.Forward, inputs)
         dr.traverse(dr.ADMode.Forward)
-        return tuple(dr.grad(images[name]).torch().clone() for name in call.image_names)
+        found = tuple(dr.grad(images[name]).torch().clone() for name in call.image_names)
+        return first_only("render", found, (*ctx.saved_tensors, *tangents))
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *_: Any) -> NoReturn:
+        refuse_batched("render")
 
 
 def _plain(lib: ModuleType, x: torch.Tensor) -> Any:

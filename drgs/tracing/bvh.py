@@ -7,12 +7,13 @@ evaluated from our own records. What is done about its known faults (Mitsuba 3.9
 - its discriminant is rounded to about 6e-8 (distance / radius)^2: rays start where they enter the box of all proxies,
   proxies are not smaller than 1e-3 of their distance, and larger than their Gaussians by what rounding may take;
 - rays that start inside a proxy see nothing of it: the few that an origin can be inside of are not traced but listed,
-  and every ray is offered them first. Where entry order needs them in their place, or they are many because origins
-  lie apart, origins are moved back behind them, which costs precision: everything is that much farther away;
+  and every ray is offered them first. Where they are many because origins lie apart, origins are moved back behind
+  them, which costs precision: everything is that much farther away;
 - the restart behind a hit loses what enters within the step: the step is about one unit in
   the last place, doubled on a repeated hit;
 - of coincident proxies only one is found, of nested ones not all: Gaussians with the same center, rotation and shape
-  share one primitive, the largest, whose members the stream delivers one by one.
+  share one primitive, the largest, whose members the stream delivers one by one;
+- proxies are entered before their Gaussians, tiny ones long before: rays sort their hits by the Gaussians' own entries.
 
 Rays are taken in an order in which neighbors are alike (`_coherent`): a packet of lanes walks through the same part of
 the structure.
@@ -34,7 +35,7 @@ from drgs.tracing.projection import Projected
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.tiles import depth_order
 from drgs.tracing.walk import Part
-from drgs.tracing.words import EMPTY
+from drgs.tracing.words import EMPTY, positive
 
 __all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 
@@ -43,6 +44,7 @@ _GRAZE = 1e-7  # of (distance / radius)^2: what rounding takes from the discrimi
 _FAR = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
 _THIN = 1e-3  # smallest proxy radius, relative to the distance it is traced over
 _LISTED = 1000  # primitives that every ray is offered before it is traced, where origins differ
+_NEARLY = 6  # hits that a ray in order of entry is sorted among: proxies come in that of their own entries
 _AROUND = 1.05  # half axes of a proxy within which an origin counts as inside
 
 
@@ -77,9 +79,11 @@ class BvhTraversal:
         """All rays as one part, one a lane."""
         lib, s = self.lib, self.settings
         ray, inside = self._ray(self.order), lib.Bool(bool(self.rays))
-        stream = _ProxyStream(lib, self.proxies, ray, s.order == "ray")
-        ordered = s.order != "entry"
-        return [Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, ordered, self.center_key)]
+        stream = _ProxyStream(lib, self.proxies, ray, s.order)
+        part = Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, True, self.center_key)
+        if s.order == "entry":
+            part.buffer = _NEARLY
+        return [part]
 
     def weighed(self, share: int, size: int) -> list[Part]:
         """As `parts`: there are no lists that rays have in common."""
@@ -100,8 +104,8 @@ class BvhTraversal:
         alive = projected.alive.numpy() & np.ones(ellipsoids.shape[1], bool)
         origins = np.array([float(x[0]) for x in corners]).reshape(2, 3).T
         _warn_of_rounding(ellipsoids, alive, origins)
-        nested, tails = self.settings.order != "entry", not self.model.response.front_only
-        return proxy_scene(self.lib, ellipsoids[:3], ellipsoids[3:7], ellipsoids[7:], alive, origins, nested, tails)
+        tails = not self.model.response.front_only
+        return proxy_scene(self.lib, ellipsoids[:3], ellipsoids[3:7], ellipsoids[7:], alive, origins, tails)
 
 
 class Proxies:
@@ -142,7 +146,6 @@ def proxy_scene(
     radii: np.ndarray,
     alive: np.ndarray,
     origins: np.ndarray,
-    nested: bool = True,
     tails: bool = False,
 ) -> Proxies | None:
     """Build the proxies, or None when nothing can be hit.
@@ -151,8 +154,6 @@ def proxy_scene(
         means, quats, radii: (3, N), (4, N) wxyz, (3, N) half axes in world units, NumPy.
         alive: (N,) bool.
         origins: (3, P) ray origins: decide how far everything can be.
-        nested: Any order of delivery will do: ellipsoids that only differ in size share a proxy, and those that origins
-            are inside of are listed. Otherwise only equal ones share, and origins are moved back.
         tails: What a ray meets behind its origin counts: all that it can meet close by is listed.
     """
     mi = runtime.mitsuba()
@@ -162,9 +163,8 @@ def proxy_scene(
     means, radii, quats = (x[:, index].astype(np.float64) for x in (means, radii, quats))
     quats /= np.sqrt((quats * quats).sum(0))
     longest = radii.max(0)
-    # Rounded: the radii differ by the extents, which are multiplied in.
-    shape = np.round(radii / longest, 9) if nested else radii
-    grouped, first = _groups(np.concatenate([means, quats, shape]))
+    # Those that only differ in size share a proxy. Rounded: the radii differ by the extents, which are multiplied in.
+    grouped, first = _groups(np.concatenate([means, quats, np.round(radii / longest, 9)]))
     members, primitive = index[grouped], grouped[first[:-1]]
     growth = np.maximum.reduceat(longest[grouped], first[:-1]) / longest[primitive]
     means, quats, radii = means[:, primitive], quats[:, primitive], radii[:, primitive] * growth
@@ -175,7 +175,7 @@ def proxy_scene(
     back, proxies = 0.0, _grown(radii, means, distance)
     around = _around(to, quats, proxies, spread, distance, tails)
     # Of a single origin all are candidates of every ray, and listed they are cheaper than traced.
-    most = (_LISTED if spread > 0 else len(around)) if nested else 0
+    most = _LISTED if spread > 0 else len(around)
     if len(around) > most:
         # The largest are listed all the same: a move back behind them would cost the others their precision.
         around = around[np.argsort(radii[:, around].max(0), kind="stable")]
@@ -258,8 +258,8 @@ def _around(
 class _ProxyStream:
     """Listed Gaussians, then the proxies along rays in the order of their entry points; a `Stream`."""
 
-    def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, bounded: bool) -> None:
-        self.lib, self.proxies, self.ray, self.bounded = lib, proxies, ray, bounded
+    def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, order: str) -> None:
+        self.lib, self.proxies, self.ray, self.order = lib, proxies, ray, order
         self.mi = runtime.mitsuba()
         self.d = ray.carried[-3:]
         if proxies is not None:
@@ -301,7 +301,7 @@ class _ProxyStream:
     def of(self, lanes: UInt32) -> _ProxyStream:
         """The same for some of the rays."""
         carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]
-        return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.bounded)
+        return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.order)
 
     def next(self, s: tuple, active: Mask) -> tuple[UInt32, Mask, list, Float, tuple]:
         """One member of the current primitive, or the next primitive (whose members follow)."""
@@ -335,9 +335,10 @@ class _ProxyStream:
         valid = active & (member < end)
         index = dr.gather(lib.UInt32, p.members, member, valid)
         bound = lib.Float(EMPTY)
-        if self.bounded:
+        if self.order != "center":
             # Listed ones come first, whatever their keys. The factor is the rounding of entries.
-            bound = dr.select(last == 0xFFFFFFFF, EMPTY, dr.maximum(self.start + entry, 0) * (1 - 1e-4))
+            least = dr.maximum(self.start + entry, 0) * (1 - 1e-4)
+            bound = dr.select(last == 0xFFFFFFFF, EMPTY, positive(lib, least) if self.order == "entry" else least)
         member = dr.select(valid, member + 1, member)
         return index, valid, [count], bound, (count + 1, at, step, last, member, end, some)
 

@@ -14,6 +14,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.guards import memory
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.composite import Compositor
@@ -263,17 +264,19 @@ def _check_names(parameters: dict) -> None:
             )
 
 
-def numbers(what: str, x) -> torch.Tensor:
+def numbers(where: str, name: str, x) -> torch.Tensor:
     """A float64 tensor of anything that torch takes for an array."""
+    if isinstance(x, torch.Tensor):
+        check_has_numbers(where, name, x)
     try:
         return torch.as_tensor(x).to(torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        raise ArgumentError(f"{what} must be an array of numbers, got {kind_of(x)}") from None
+        raise ArgumentError(f"{where}: {name} must be an array of numbers, got {kind_of(x)}") from None
 
 
 def checked_rays(origins, directions, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
     """Float64 tensors of rays that can be traced."""
-    o, d = (numbers(f"render_rays: {n}", x) for n, x in (("origins", origins), ("directions", directions)))
+    o, d = (numbers("render_rays", n, x) for n, x in (("origins", origins), ("directions", directions)))
     for name, x in (("origins", o), ("directions", d)):
         if x.ndim == 0 or x.shape[-1] != 3:
             raise ValueError(f"render_rays: {name} must have shape (..., 3), got {tuple(x.shape)}")

@@ -146,8 +146,8 @@ class Primal:
     """Front-to-back compositing of `channels.outputs` channels.
 
     Args:
-        want: What to keep besides color and T: `depth`, `median`, `count`, and `replay`: sums in float64 and the place
-            of the last composited hit, for the adjoint.
+        want: What to keep besides color and T: `depth`, `median`, `count`, and `replay`: sums in float64, whatever
+            the order, and the place of the last composited hit, for the adjoint.
         emit: Told of every composited hit: `emit(Gaussian, shared ray, its place, weight, is hit)`; None without.
     """
 
@@ -157,7 +157,9 @@ class Primal:
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray; the same for each shared one."""
         lib = self.m.lib
-        Sum = lib.Float64 if "replay" in self.want else lib.Float
+        # The same bits whether the adjoint may follow or not; in the order of centers, where sums are much of the
+        # work, an image alone is summed in float32.
+        Sum = lib.Float64 if "replay" in self.want or self.m.s.order != "center" else lib.Float
         state = {
             "T": lib.Float(1),
             "alpha": Sum(0),

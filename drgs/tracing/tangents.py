@@ -43,7 +43,7 @@ def _columns(call: Call, tangents: dict) -> tuple[list[dict], bool]:
     for name, x in tangents.items():
         if name not in shapes:
             raise ValueError(f"render_jvp: tangents must be named among {', '.join(shapes)}, got {name!r}")
-        x = numbers(f"render_jvp: tangent of {name}", x).detach()  # nothing differentiates a tangent
+        x = numbers("render_jvp", f"tangent of {name}", x).detach()  # nothing differentiates a tangent
         if tuple(x.shape) == shapes[name]:
             lengths.add(None)
             x = x[None]

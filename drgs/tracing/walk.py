@@ -22,8 +22,9 @@ import drjit as dr
 from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.protocols import DividedStream, Float, Kernel, Lib, Mask, Stream, UInt32
 from drgs.tracing.records import RECORD, load_record
+from drgs.tracing.responses.peak import entry
 from drgs.tracing.weights import PIXELS, Weights
-from drgs.tracing.words import BEYOND, EMPTY, ascending, name_of, push, word_of
+from drgs.tracing.words import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 
 if TYPE_CHECKING:
     from drgs.tracing.rows import SortedHits
@@ -227,6 +228,8 @@ class Part:
         key = dr.maximum(key, 0)
         if self.center_key is not None:
             key = dr.gather(lib.Float, self.center_key, index, ok)
+        elif self.model.s.order == "entry":
+            key = positive(lib, entry(record, ray))
         return key, ok
 
     def _sorted(self, kernel: Kernel, check: bool) -> list[dict]:

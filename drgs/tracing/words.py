@@ -8,7 +8,7 @@ import numpy as np
 from drgs import runtime
 from drgs.tracing.protocols import Float, Lib, UInt32, UInt64
 
-__all__ = ["BEYOND", "EMPTY", "ascending", "name_of", "push", "word_of"]
+__all__ = ["BEYOND", "EMPTY", "ascending", "name_of", "positive", "push", "word_of"]
 
 EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
 BEYOND = 1e308  # above the word of any hit
@@ -24,6 +24,13 @@ def word_of(lib: Lib, key: Float, name: UInt32) -> Float:
     key = dr.select(key >= 0, dr.maximum(key, _LEAST), EMPTY)
     bits = lib.UInt64(dr.reinterpret_array(lib.UInt32, key)) << 32
     return dr.reinterpret_array(lib.Float64, bits | lib.UInt64(name))
+
+
+def positive(lib: Lib, x: Float) -> Float:
+    """A number >= 0 that orders like x, of either sign, up to the last bit of x."""
+    bits = dr.reinterpret_array(lib.UInt32, dr.clip(x, -1e37, 1e37))
+    sign = lib.UInt32(0x80000000)
+    return dr.reinterpret_array(lib.Float, dr.select((bits & sign) != 0, ~bits, bits | sign) >> 1)
 
 
 def name_of(lib: Lib, word: Float) -> UInt32:

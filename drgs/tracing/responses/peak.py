@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from drgs.tracing.kernels import Ray
     from drgs.tracing.projection import Activated, Projected, Screen
 
-__all__ = ["AlphaStrength", "Peak", "approach", "deviation", "times"]
+__all__ = ["AlphaStrength", "Peak", "approach", "deviation", "entry", "times"]
 
 
 class AlphaStrength:
@@ -190,6 +190,14 @@ class Peak(AlphaStrength):
             rounding = 1e-6 * sum(abs(x) for x in along)
             met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
         return met
+
+
+def entry(r: list[Float], ray: Ray) -> Float:
+    """Where a world ray enters the ellipsoid of the extent: before its origin if that is inside."""
+    t0, a, d, inverse = _local(r, ray)
+    c = cross(a, d)
+    half = dr.maximum(r[layout.W_EXT2] - dot(c, c) * inverse, 0) * inverse
+    return t0 - dot(a, d) * inverse - dr.sqrt(half)
 
 
 def deviation(r: list[Float], dx: Float, dy: Float, half: float) -> Float:
