@@ -8,10 +8,11 @@ import logging
 from collections.abc import Hashable, Iterator
 from typing import Any
 
-from drgs.viewing.gate import Gate, bound_socket, guarded
+from drgs.viewing.gate import Gate
 from drgs.viewing.layers import INFORMATION
 from drgs.viewing.session import Session
 from drgs.viewing.subject import Subject
+from drgs.viewing.wire import bound_socket, guarded
 from drgs.viewing.worker import Worker
 
 __all__ = ["Viewer"]
