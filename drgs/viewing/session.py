@@ -8,7 +8,6 @@ those that say otherwise run on viser's event loop, one after the other.
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -40,6 +39,7 @@ _PRESETS = ("exact", "fast", "gsplat")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
 _MOMENTS = 48  # at most so many times in a round of playing
+_UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
 
 
@@ -76,7 +76,7 @@ class Session:
         self._frusta: list[Any] = []
         self._near = 0.0  # a camera is in a frustum within this distance
         self.time = subject.times[0] if subject.times else None
-        self.pose, self.size = self._seen_pose()
+        self.pose, self.size = self._seen_pose() or (subject.first.pose, _UNKNOWN)
         self._build(preset)
         self._send_gaussians()
         self._show_stations()
@@ -172,7 +172,10 @@ class Session:
         self._ask_later(0.0)
 
     async def _camera_moved(self, _: Any) -> None:
-        pose, size = self._seen_pose()
+        seen = self._seen_pose()
+        if seen is None:  # not a camera: what is shown stays
+            return
+        pose, size = seen
         if pose.is_near(self.pose) and size == self.size:
             return
         self.pose, self.size = pose, size
@@ -275,8 +278,8 @@ class Session:
         with self.client.atomic():
             camera.position = pose.position
             camera.wxyz = pose.wxyz
-            camera.fov = looking(pose, camera.aspect)
-        self.pose, _ = self._seen_pose()  # what the browser sends back is no movement of its own
+            camera.fov = looking(pose, self.size[0] / self.size[1])
+        self.pose, self.size = self._seen_pose() or (pose, self.size)  # what it sends back is no movement of its own
         self._show_frusta()
         if self._slider is not None and sight.camera.time is not None and self._playing is None:
             self._slider.value = sight.camera.time
@@ -391,9 +394,7 @@ class Session:
             yield
         self.drawn += 1
 
-    def _seen_pose(self) -> tuple[Pose, tuple[int, int]]:
-        """Where the client's camera is, and the pixels of its window."""
+    def _seen_pose(self) -> tuple[Pose, tuple[int, int]] | None:
+        """Where the client's camera is, and the pixels of its window; None where it has said nothing that is one."""
         camera = self.client.camera
-        width, height = max(1, int(camera.image_width)), max(1, int(camera.image_height))
-        fov = float(camera.fov) if math.isfinite(camera.fov) and camera.fov > 0 else 1.0
-        return Pose(np.array(camera.wxyz), np.array(camera.position), fov, width / height), (width, height)
+        return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)

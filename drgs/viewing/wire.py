@@ -20,7 +20,7 @@ from websockets.http11 import Request, Response
 
 from drgs.viewing.gate import Gate
 
-__all__ = ["bound_socket", "guarded"]
+__all__ = ["bound_socket", "guarded", "in_a_line"]
 
 _log = logging.getLogger(__name__)
 
@@ -127,14 +127,18 @@ def _refused(status: http.HTTPStatus, why: str) -> Response:
     return Response(status, status.phrase, said, body)
 
 
-def _in_one_line(record: logging.LogRecord) -> bool:
+def in_a_line(error: BaseException) -> str:
+    """What an error says, with its kind, whatever lines it has."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _without_traceback(record: logging.LogRecord) -> bool:
     """What a client has sent is worth a line at most, without a traceback, whatever it was; a handshake none."""
     if record.exc_info and record.exc_info[1] is not None:
-        error = record.exc_info[1]
-        record.msg = f"view: {record.getMessage()}: {type(error).__name__}: {' '.join(str(error).split())}"
+        record.msg = f"view: {record.getMessage()}: {in_a_line(record.exc_info[1])}"
         record.args, record.exc_info, record.exc_text = (), None, None
         return "opening handshake failed" not in record.msg
     return True
 
 
-_log.addFilter(_in_one_line)
+_log.addFilter(_without_traceback)
