@@ -156,6 +156,30 @@ def test_gaussians_of_the_client(rng, unit):
     np.testing.assert_allclose(found.opacities[:, 0], g.opacities, rtol=1e-6)
 
 
+@pytest.mark.parametrize("log_scale", [-100.0, 0.0, 44.0, 88.0, 200.0])
+def test_what_the_client_gets_is_finite(rng, log_scale):
+    """One Gaussian of any size and place among others of size 1, or all of them: no NaN, nothing infinite."""
+    for several in (1, 500):
+        log_scales = torch.zeros(500, 3)
+        log_scales[:several, :2] = log_scale
+        means = torch.randn(500, 3)
+        means[:several] *= 1e38
+        g = drgs.Gaussians(
+            means,
+            torch.as_tensor(rng.normal(size=(500, 4))).float(),
+            log_scales,
+            torch.zeros(500),
+            torch.zeros(500, 1, 3),
+        )
+        found = ClientGaussians.of(g)
+        with np.errstate(over="raise"):
+            halves = found.covariances.astype(np.float16)
+        for x in (found.centers, halves, found.opacities, found.scale):
+            assert np.isfinite(x).all()
+        diagonal = np.diagonal(halves.astype(np.float64), axis1=1, axis2=2)
+        assert (diagonal >= 0).all()
+
+
 # ----------------------------------------------------------------------------------------------- pictures
 
 

@@ -97,7 +97,8 @@ class Viewer:
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = first.pose.position, first.target, first.up
         camera.fov = first.pose.fov
-        camera.near, camera.far = _NEAR * first.distance, _FAR * first.distance
+        distance = first.distance or 1.0
+        camera.near, camera.far = _NEAR * distance, _FAR * distance
 
     async def _connected(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(
