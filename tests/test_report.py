@@ -338,6 +338,25 @@ def test_what_no_option_sets_is_said(run):
     assert fit_command(FitConfig(dc_rate=0.5), None, run, run)[1] == ["dc_rate=0.5"]
 
 
+# The number of words in tables, and those of them that do not stand on one line.
+BROKEN_WORDS = """() => {
+  const broken = []; let words = 0;
+  for (const cell of document.querySelectorAll("td, th")) {
+    const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+    while (walker.nextNode()) {
+      for (const found of walker.currentNode.data.matchAll(/[\\p{L}\\p{N}]+/gu)) {
+        const range = document.createRange();
+        range.setStart(walker.currentNode, found.index);
+        range.setEnd(walker.currentNode, found.index + found[0].length);
+        words += 1;
+        if (new Set([...range.getClientRects()].map(x => Math.round(x.top))).size > 1) broken.push(found[0]);
+      }
+    }
+  }
+  return [words, broken];
+}"""
+
+
 def test_in_a_browser(active, tmp_path):
     """It loads without a word on the console and asks for nothing; a phone does not scroll sideways; it prints."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -362,4 +381,10 @@ def test_in_a_browser(active, tmp_path):
         page.locator(".slider input").first.evaluate("x => { x.value = 0; x.dispatchEvent(new Event('input')) }")
         assert shown() != "step 16"
         assert len(page.pdf(format="A4")) > 10_000
+        page.set_viewport_size({"width": 400, "height": 800})
+        page.evaluate("document.querySelectorAll('details').forEach(x => { x.open = true })")
+        words, broken = page.evaluate(BROKEN_WORDS)
+        assert words > 50
+        assert broken == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400  # wide tables scroll in a box of their own
         browser.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import shutil
 import signal
@@ -10,8 +11,10 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -151,6 +154,30 @@ def test_gaussians_of_the_client(rng, unit):
     colors = (0.5 + drgs.ellipsoids.Y_00 * g.sh[:, 0]).clamp(0, 1).numpy()
     assert np.abs(found.rgbs / 255 - colors).max() <= 0.5 / 255 + 1e-6
     np.testing.assert_allclose(found.opacities[:, 0], g.opacities, rtol=1e-6)
+
+
+@pytest.mark.parametrize("log_scale", [-100.0, 0.0, 44.0, 88.0, 200.0])
+def test_what_the_client_gets_is_finite(rng, log_scale):
+    """One Gaussian of any size and place among others of size 1, or all of them: no NaN, nothing infinite."""
+    for several in (1, 500):
+        log_scales = torch.zeros(500, 3)
+        log_scales[:several, :2] = log_scale
+        means = torch.randn(500, 3)
+        means[:several] *= 1e38
+        g = drgs.Gaussians(
+            means,
+            torch.as_tensor(rng.normal(size=(500, 4))).float(),
+            log_scales,
+            torch.zeros(500),
+            torch.zeros(500, 1, 3),
+        )
+        found = ClientGaussians.of(g)
+        with np.errstate(over="raise"):
+            halves = found.covariances.astype(np.float16)
+        for x in (found.centers, halves, found.opacities, found.scale):
+            assert np.isfinite(x).all()
+        diagonal = np.diagonal(halves.astype(np.float64), axis1=1, axis2=2)
+        assert (diagonal >= 0).all()
 
 
 # ----------------------------------------------------------------------------------------------- pictures
@@ -579,6 +606,108 @@ def test_a_run_that_goes_on_is_shown(place, tmp_path, viewers):  # noqa: F811
         html(client, "state.safetensors", after=at)
         client.look(pose.wxyz, np.array(pose.position) * 1.1)
         client.picture(after=at)  # what was there is still shown
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"wxyz": [0.0, 0.0, 0.0, 0.0]},
+        {"wxyz": [float("nan")] * 4},
+        {"wxyz": [1.0]},
+        {"position": [float("inf"), 0.0, 0.0]},
+        {"position": [1e300, 0.0, 0.0]},
+        {"fov": 0.0},
+        {"fov": float("nan")},
+        {"fov": 4.0},
+        {"image_height": 0},
+        {"image_width": -5},
+        {"image_width": 1 << 40},
+        {"look_at": [float("nan")] * 3, "up_direction": [0.0, 0.0, 0.0]},
+    ],
+    ids=str,
+)
+def test_a_camera_that_is_none_is_left_out(viewers, bad, caplog, capfd):
+    """Zeros, NaN and too few numbers in the place of a camera, from the first message on: nothing fails, and what is
+    a camera again is drawn."""
+    looked = subject(torch.zeros(1, 3))
+    viewer = viewers(looked)
+    pose = looked.first.pose
+    with Client(viewer.port) as client:
+        client.look(pose.wxyz, pose.position, other=bad)
+        client.wait(lambda m: m["type"] == "GaussianSplatsMessage")
+        client.look(pose.wxyz, pose.position)
+        client.picture()
+        client.look(pose.wxyz, pose.position, other=bad)
+        at = len(client.heard)
+        client.look(pose.wxyz, np.array(pose.position) - (0, 0, 1))
+        picture = client.picture(after=at)
+        assert np.isfinite(viewer.sessions.popitem()[1].pose.wxyz).all()
+    assert picture.max() > 100
+    assert not [record for record in caplog.records if record.exc_info]
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_messages_that_are_none_are_one_line(viewers, caplog, capfd):
+    """What no page sends: unknown kinds, values of other types, bytes that are no message. The others go on."""
+    looked = subject(torch.zeros(1, 3))
+    viewer = viewers(looked)
+    pose = looked.first.pose
+    with Client(viewer.port) as other:
+        other.look(pose.wxyz, pose.position)
+        for data in (
+            b"",
+            b"\xc1",
+            b"abc",
+            "text",
+            msgspec.msgpack.encode({"type": "NoSuch"}),
+            msgspec.msgpack.encode({"type": "ViewerCameraMessage"}),
+            b"\x93\x01\x02\x03",
+        ):
+            with Client(viewer.port) as client:
+                client.look(pose.wxyz, pose.position)
+                client.wait(lambda m: m["type"] == "GaussianSplatsMessage")
+                client.send_bytes(data)
+        for bad in ({"wxyz": "abcd"}, {"position": None}, {"fov": "wide"}, {"image_width": "x"}):
+            with Client(viewer.port) as client:
+                client.look(pose.wxyz, pose.position, other=bad)
+        with Client(viewer.port) as client:
+            client.look(pose.wxyz, pose.position)
+            for label, value in (("show", 5), ("show", "nothing"), ("drawn by", "nothing"), ("our picture", "x")):
+                client.choose(label, value)
+            client.send(type="GuiUpdateMessage", uuid="nobody", updates={"value": 1})
+            client.choose("drawn by", "fast")
+            client.picture()
+        other.picture()
+    gc.collect()  # a task that has failed says so when it is freed
+    assert not [record.getMessage() for record in caplog.records if record.exc_info or "\n" in record.getMessage()]
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_what_a_browser_leaves_is_freed(viewers):
+    """Browsers that come and go leave neither a session nor what was sent to them, though Python's own search for
+    circles of references is off meanwhile."""
+    looked = subject(torch.randn(500, 3))
+    viewer = viewers(looked)
+    left = []
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(6):
+            with Client(viewer.port) as client:
+                client.look(looked.first.pose.wxyz, looked.first.pose.position)
+                client.picture()
+                (session,) = viewer.sessions.values()
+                left += [weakref.ref(x) for x in (session, session.client, session._gaussians, session.client.scene)]
+                del session
+            end = time.monotonic() + 30
+            while viewer.sessions and time.monotonic() < end:
+                time.sleep(0.01)
+        end = time.monotonic() + 60
+        while any(ref() is not None for ref in left) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert [type(ref()).__name__ for ref in left if ref() is not None] == []
+    finally:
+        gc.enable()
 
 
 # ---------------------------------------------------------------------------------------------- command

@@ -15,8 +15,9 @@ from viewing_client import PROTOCOL, Client
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from drgs.viewing.gate import Gate, bound_socket, guarded, is_loopback
+from drgs.viewing.gate import Gate, is_loopback
 from drgs.viewing.server import Viewer
+from drgs.viewing.wire import bound_socket, guarded
 
 TOKEN = "a-token-of-the-test"
 
@@ -196,3 +197,167 @@ def test_a_server_that_goes_another_way_is_noticed():
         guarded(gate, listening),
     ):
         pass
+
+
+# ------------------------------------------------------------------------------------------------ odd requests
+
+UPGRADE = (
+    b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+)
+SPOKEN = b"Sec-WebSocket-Protocol: " + PROTOCOL.encode() + b"\r\n"
+ODD_LINES = [
+    *(
+        f"GET {path} HTTP/1.1".encode("utf-8", "surrogatepass")
+        for path in (
+            "/%00",
+            "/%ff",
+            "/" + "a" * 300,
+            "/" + "%61" * 300,
+            "/" + "a" * 9000,
+            "/" + "a/" * 3000,
+            "//[",
+            "//[::1",
+            "//[x]/?a",
+            "http://[/",
+            "http://localhost/",
+            "*",
+            "?",
+            "/?" + "&" * 3000,
+            "/?token=%ff",
+            "/?token[=x",
+            "/?%ed%a0%80",
+            "/ü",
+            "/?token=ü",
+            "/\ud800",
+            "/..",
+            "/%2e%2e/",
+            "/..%5c..",
+            "/assets",
+            "/%zz",
+            "/a b",
+            "",
+            "/\x01",
+            "/#",
+            "/%0d%0aX: y",
+        )
+    ),
+    *(
+        f"{method} / HTTP/1.1".encode()
+        for method in ("POST", "HEAD", "OPTIONS", "CONNECT", "get", "GËT", "", "GET GET")
+    ),
+    *(f"GET / {version}".encode() for version in ("HTTP/1.0", "HTTP/2.0", "", "HTTP/1.1 x")),
+    b"\x16\x03\x01\x02\x00\x01\x00",  # what a browser sends for https://
+]
+ODD_HEADERS = [
+    *(
+        b"Host: " + host
+        for host in (
+            b"[:::]",
+            b"[1:2]",
+            b"[127.0.0.1]",
+            b"[..]",
+            b"[1::1::1]",
+            b"[:]",
+            b"localhost:",
+            b"localhost:999999",
+            b"..",
+            b"",
+            b"local\xfchost",
+            "local\u2100host".encode(),
+            b"a" * 400,
+            b"\x00",
+            b"localhost\r\nHost: localhost",
+        )
+    ),
+    *(
+        b"Host: localhost\r\nCookie: " + cookie
+        for cookie in (
+            b"%s=\xfc",
+            b"%s=\xed\xa0\x80",
+            b"%s",
+            b"%s=a=b",
+            b"=",
+            b";" * 3000,
+            b"\x00",
+            b"%s=" + b"x" * 9000,
+        )
+    ),
+    *(
+        b"Host: localhost\r\n" + lines
+        for lines in (
+            b"Origin: http://[",
+            b"Origin: \xfc",
+            b"Origin: ",
+            b"Upgrade: \xfc",
+            b"Upgrade: websocket\r\nUpgrade: websocket",
+            b"Accept-Encoding: a\r\nAccept-Encoding: b",
+            b"Accept-Encoding: \xfc",
+            b"Connection: \xfc\r\nUpgrade: websocket",
+            UPGRADE + b"Upgrade: x",
+            UPGRADE + UPGRADE.strip(),
+            UPGRADE + b"Sec-WebSocket-Protocol: \xfc",
+            UPGRADE + b"Sec-WebSocket-Protocol: viser-v0",
+            UPGRADE + SPOKEN + b"Sec-WebSocket-Extensions: ;;;",
+            UPGRADE.replace(b"dGhl", b"!!!!") + SPOKEN.strip(),
+            UPGRADE.replace(b"13", b"x") + SPOKEN.strip(),
+            b"Content-Length: x",
+            b"Content-Length: 5",
+            b"Transfer-Encoding: chunked",
+            b"no header",
+            b" folded: 1",
+            b"\xfc: 1",
+            b"X: 1\r\n" * 200,
+        )
+    ),
+]
+
+
+def answered(port: int, request: bytes) -> tuple[int, bytes]:
+    """The status and all bytes of the answer to a request as it stands."""
+    with socket.create_connection(("127.0.0.1", port), 20) as wire:
+        wire.sendall(request)
+        said = wire.recv(1 << 16)
+    assert said.startswith(b"HTTP/1.1 "), (request[:200], said[:200])
+    return int(said[9:12]), said
+
+
+@pytest.mark.parametrize("guard", ["open", "token"])
+def test_odd_requests_are_answered_and_not_failed_on(open_viewer, closed_viewer, guard, caplog, capfd):
+    """Whatever the path, the host, the cookie, the method or the upgrade is, the answer says what is wrong with it (or
+    is the page, or that there is none), and nothing is printed or logged with a traceback."""
+    viewer = {"open": open_viewer, "token": closed_viewer}[guard]
+    cookie = viewer.gate.cookie.encode()
+    known = b"Host: localhost\r\nCookie: " + cookie + b"=" + TOKEN.encode() + b"\r\n"
+    requests = [line + b"\r\n" + known + more + b"\r\n" for line in ODD_LINES for more in (b"", UPGRADE + SPOKEN)]
+    for headers in ODD_HEADERS:
+        there = headers.replace(b"%s", cookie).strip(b"\r\n")
+        requests += [b"GET / HTTP/1.1\r\n" + there + b"\r\n" + more + b"\r\n" for more in (b"", UPGRADE + SPOKEN)]
+    found = {request: answered(viewer.port, request)[0] for request in requests}
+    odd = {
+        request[:150]: status for request, status in found.items() if status not in (101, 200, 303, 400, 403, 404, 405)
+    }
+    assert not odd
+    assert {400, 403, 404, 405} <= {*found.values()}
+    assert all(status == 405 for request, status in found.items() if request.startswith((b"POST / ", b"HEAD / ")))
+    assert not [record for record in caplog.records if record.exc_info]
+    assert capfd.readouterr() == ("", "")
+    assert get(viewer.port, Host="localhost", Cookie=(cookie + b"=" + TOKEN.encode()).decode()).status == 200
+
+
+def test_cookies_of_other_programs_do_not_matter(closed_viewer):
+    """Cookies are of all ports of a host: another program's may hold any bytes beside ours."""
+    cookie = closed_viewer.gate.cookie.encode() + b"=" + TOKEN.encode()
+    for other in (b"a=\xfc\xff", "b=\u2100".encode(), b"=", b";;;", b"c=\xed\xa0\x80"):
+        request = b"GET / HTTP/1.1\r\nHost: localhost\r\nCookie: " + other + b"; " + cookie + b"\r\n\r\n"
+        assert answered(closed_viewer.port, request)[0] == 200, other
+
+
+def test_a_page_of_another_viser_is_told_to_load_again(open_viewer):
+    """A page that was left open while the program became another version; it was printed on our stdout before."""
+    status, said = answered(
+        open_viewer.port,
+        b"GET / HTTP/1.1\r\nHost: localhost\r\n" + UPGRADE + b"Sec-WebSocket-Protocol: viser-v0.0.1\r\n\r\n",
+    )
+    assert status == 400
+    assert f"must speak {PROTOCOL}; load it again".encode() in said

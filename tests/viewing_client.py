@@ -29,20 +29,21 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self._socket.close()
 
-    def look(self, wxyz, position, fov: float = 0.8, width: int = 160, height: int = 120) -> None:
-        """Say where the camera is."""
-        self.send(
-            type="ViewerCameraMessage",
-            wxyz=[float(x) for x in wxyz],
-            position=[float(x) for x in position],
-            fov=fov,
-            near=0.01,
-            far=100.0,
-            image_height=height,
-            image_width=width,
-            look_at=[0.0, 0.0, 0.0],
-            up_direction=[0.0, -1.0, 0.0],
-        )
+    def look(self, wxyz, position, fov: float = 0.8, width: int = 160, height: int = 120, other: Any = ()) -> None:
+        """Say where the camera is; with `other` fields of the message instead."""
+        message = {
+            "type": "ViewerCameraMessage",
+            "wxyz": [float(x) for x in wxyz],
+            "position": [float(x) for x in position],
+            "fov": fov,
+            "near": 0.01,
+            "far": 100.0,
+            "image_height": height,
+            "image_width": width,
+            "look_at": [0.0, 0.0, 0.0],
+            "up_direction": [0.0, -1.0, 0.0],
+        }
+        self.send(**message | dict(other))
 
     def choose(self, label: str, value: Any) -> None:
         """Give an input of the panel another value."""
@@ -64,7 +65,11 @@ class Client:
         )
 
     def send(self, **message: Any) -> None:
-        self._socket.send(msgspec.msgpack.encode(message))
+        self.send_bytes(msgspec.msgpack.encode(message))
+
+    def send_bytes(self, data: bytes | str) -> None:
+        """Send what may be no message."""
+        self._socket.send(data)
 
     def wait(self, wanted, seconds: float = 60.0, after: int = 0) -> dict[str, Any]:
         """The first message heard, of those from number `after` on, that is wanted."""

@@ -70,7 +70,7 @@ def subject_of(args: View, given: Given, before: Subject | None = None) -> Subje
         count=len(given.gaussians),
         scene=given.scene,
         origin=origin,
-        times=given.record.times if given.record is not None and given.moving is not None else (),
+        times=_times(given),
         settings=given.settings,
         layers=layers_of(_paint(args, given), uncertainty, pixels),
         stations=stations,
@@ -91,6 +91,15 @@ def _state(given: Given) -> str:
     except (OSError, ValueError):
         return ""
     return f"step {step:,} of {given.record.config.max_steps:,}" if isinstance(step, int) else ""
+
+
+def _times(given: Given) -> tuple[float, ...]:
+    """Of what moves: those of the photographs, else the ends of the field's span; none where nothing does."""
+    if given.moving is None:
+        return ()
+    if given.record is not None and given.record.times:
+        return given.record.times
+    return tuple(dict.fromkeys(float(x) for x in given.moving.field.grid.span))
 
 
 def _paint(args: View, given: Given) -> dict[str, Painter]:

@@ -1,6 +1,7 @@
 """A viewer in the browser, by viser: the client draws Gaussians, and our own image comes where its camera rests.
 
 gate        who may talk to it: addresses, tokens, origins
+wire        its socket, and what is answered on it
 server      starts viser behind the gate, and gives every browser a session
 session     one browser: what it shows, where its camera rests, what it is sent
 panel       what stands in the browser's panel, as escaped HTML

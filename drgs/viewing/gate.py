@@ -5,13 +5,11 @@ page may open a WebSocket to 127.0.0.1 (it states its own site as `Origin`), or 
 (the request then states that name as `Host`). Both are refused. One that listens to a network asks for a token, once
 in the address, from then on in a cookie that scripts do not see.
 
-viser has no place for such questions, so its call of `websockets`' `serve` is led through here (`guarded`): to the
-socket that was bound before, and with our question in front of its own.
+Here is what is decided, from a path and headers alone; `drgs.viewing.wire` asks it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hmac
 import http
@@ -19,17 +17,19 @@ import ipaddress
 import re
 import secrets
 import socket
-import types
-from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["Gate", "bound_socket", "guarded", "is_loopback"]
+__all__ = ["Gate", "is_loopback"]
 
-_HOST = re.compile(r"[A-Za-z0-9._-]{1,253}(:\d{1,5})?|\[[0-9A-Fa-f:.]{2,45}\](:\d{1,5})?")
+_HOST = re.compile(r"(?:(?P<name>[A-Za-z0-9._-]{1,253})|\[(?P<address>[0-9A-Fa-f:.]{2,45})\])(?::\d{1,5})?")
 _TOKEN = re.compile(r"[A-Za-z0-9_~.-]{8,200}")
 # The client would connect to whatever server these name, and show what that says as a page of ours.
 _LEADING_AWAY = ("websocket", "playbackPath")
+# What viser and websockets read as one value, and those that they read as a list: nothing else of the headers is read
+# but cookies, which other programs of this machine may have set to anything.
+_ONCE = ("Host", "Origin", "Upgrade", "Accept-Encoding", "Sec-WebSocket-Key", "Sec-WebSocket-Version")
+_LISTS = ("Connection", "Sec-WebSocket-Protocol", "Sec-WebSocket-Extensions")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,15 +76,17 @@ class Gate:
             path: With its query.
             headers: As `websockets` has them.
         """
-        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]) or len(origins) > 1:
+        if (odd := _odd(path, headers)) is not None:
+            return http.HTTPStatus.BAD_REQUEST, odd
+        host, origins = headers["Host"].lower(), headers.get_all("Origin")
+        named = _HOST.fullmatch(host)
+        if named is None:
             return http.HTTPStatus.BAD_REQUEST, "the request must name one host"
-        host = hosts[0].lower()
-        if self.token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        if self.token is None and not is_loopback(named["name"] or named["address"]):
             return http.HTTPStatus.FORBIDDEN, "this viewer is for this machine only; say --token to reach it by a name"
         if origins and _site(origins[0]) != host:
             return http.HTTPStatus.FORBIDDEN, "pages of other sites may not talk to this viewer"
-        query = parse_qs(urlsplit(path).query, keep_blank_values=True)
+        query = _query(path)
         if any(name in query for name in _LEADING_AWAY):
             return http.HTTPStatus.FORBIDDEN, "the address must not lead the page to another server"
         if not self._knows(query.get("token", []), headers):
@@ -93,7 +95,7 @@ class Gate:
 
     def answer(self, path: str, headers: Any) -> list[tuple[str, str]] | None:
         """Headers that lead a page with the token in its address to the one without, which has a cookie; else None."""
-        if self.token is None or "token" not in parse_qs(urlsplit(path).query):
+        if self.token is None or "token" not in _query(path):
             return None
         cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
         return [("Location", "/"), ("Set-Cookie", cookie), ("Content-Length", "0"), *self.around(headers)]
@@ -114,7 +116,7 @@ class Gate:
             return True
         pairs = (part.strip().partition("=") for line in headers.get_all("Cookie") for part in line.split(";"))
         known = [*given, *(value for name, _, value in pairs if name == self.cookie)]
-        return any(hmac.compare_digest(text.encode(), self.token.encode()) for text in known)
+        return any(hmac.compare_digest(_bytes(text), self.token.encode()) for text in known)
 
 
 def is_loopback(host: str) -> bool:
@@ -127,78 +129,29 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def bound_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens.
-
-    Args:
-        host: A name or an address.
-        port: 0 is any that is free.
-    Raises:
-        ValueError: If there is no such address here, or the port is taken.
-    """
-    if not 0 <= port < 1 << 16:
-        raise ValueError(f"view: --port must be in [0, 65535], got {port}; choose another")
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(address[:2], family=family)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ValueError(
-            f"view: --host {host} --port {port} must be an address of this machine that is free, got: {reason}; "
-            "choose another port, or --port 0 for any"
-        ) from None
+def _odd(path: str, headers: Any) -> str | None:
+    """What is wrong with a request whoever sends it; None where nothing is."""
+    if not headers.get_all("Host"):
+        return "the request must name one host"
+    for name in _ONCE:
+        if len(headers.get_all(name)) > 1:
+            return f"the request must state {name} once"
+    texts = [path, *(text for name in (*_ONCE, *_LISTS) for text in headers.get_all(name))]
+    if not all(text.isascii() for text in texts):
+        return "the request must be in ASCII"
+    if not path.startswith("/"):
+        return "the path must begin with /"
+    return None
 
 
-@contextlib.contextmanager
-def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
-    """For the length of the block, a server that viser starts listens at a socket, behind a gate.
-
-    Raises:
-        RuntimeError: If viser has started none through it: another version of viser, which is not to be trusted.
-    """
-    from viser.infra import _infra
-    from websockets.asyncio.server import serve
-
-    led = []
-
-    def behind(handler: Any, host: Any, port: Any, *, process_request: Callable[..., Any], **options: Any) -> Any:
-        led.append(port)
-        return serve(handler, sock=listening, process_request=_asked(gate, process_request), **options)
-
-    before = _infra.websockets
-    shown = types.SimpleNamespace(**vars(before))
-    shown.asyncio = types.SimpleNamespace(server=types.SimpleNamespace(serve=behind))
-    _infra.websockets = shown  # type: ignore[assignment]  # its module, as far as it uses it
-    try:
-        yield
-    finally:
-        _infra.websockets = before
-    if not led:
-        raise RuntimeError("view: viser must start its server by websockets.asyncio.server.serve, has not")
+def _query(path: str) -> dict[str, list[str]]:
+    """Of a path as it came. No `urlsplit`: to that a path of two slashes names a host, and may be an error."""
+    return parse_qs(path.partition("?")[2].partition("#")[0], keep_blank_values=True)
 
 
-def _asked(gate: Gate, process_request: Callable[..., Any]) -> Callable[..., Any]:
-    """viser's answer to a request, where the gate has nothing against it."""
-    from websockets.datastructures import Headers
-    from websockets.http11 import Response
-
-    def process(connection: Any, request: Any) -> Any:
-        if found := gate.refusal(request.path, request.headers):
-            status, why = found
-            body = f"drgs view: {why}\n".encode()
-            said = Headers([("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))])
-            said["Connection"] = "close"
-            return Response(status, status.phrase, said, body)
-        upgrades = request.headers.get("Upgrade", "").lower() == "websocket"
-        if not upgrades and (moved := gate.answer(request.path, request.headers)):
-            return Response(http.HTTPStatus.SEE_OTHER, "See Other", Headers(moved))
-        response = process_request(connection, request)
-        if response is not None:
-            for name, value in gate.around(request.headers):
-                response.headers[name] = value
-        return response
-
-    return process
+def _bytes(text: str) -> bytes:
+    """Of a header, whose bytes beyond ASCII `websockets` has as lone surrogates; of a query, whatever is in it."""
+    return text.encode(errors="surrogateescape")
 
 
 def _site(origin: str) -> str:

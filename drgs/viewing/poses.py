@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from drgs.cameras import Camera, intrinsics
 __all__ = ["Pose", "camera_of", "looking", "pose_of"]
 
 _WIDEST = math.radians(150.0)  # of a client's view; a wider one is drawn so wide
+_LARGEST = 1 << 15  # pixels of a side of a window
+_FARTHEST = 1e30  # of a coordinate: its square is a number, too
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -21,7 +24,7 @@ class Pose:
     """A camera as viser has it, in the client's frame: the world's, moved by the origin of the Gaussians.
 
     Attributes:
-        wxyz: (4,) quaternion of camera to world.
+        wxyz: (4,) quaternion of camera to world, not 0.
         position: (3,) of the camera.
         fov: Vertical field of view in radians.
         aspect: Width over height.
@@ -31,6 +34,33 @@ class Pose:
     position: np.ndarray
     fov: float
     aspect: float
+
+    @classmethod
+    def stated(cls, wxyz: Any, position: Any, fov: Any, width: Any, height: Any) -> tuple[Pose, tuple[int, int]] | None:
+        """The camera that a client states, and the pixels of its window; None where these are none.
+
+        Whatever the client sent may be here: zeros, NaN, lists of another length, text.
+
+        Args:
+            wxyz, position, fov: As in a pose; the quaternion of any length but 0.
+            width, height: Pixels, at least 1.
+        """
+        try:
+            given = np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in (wxyz, position, fov, width, height)])
+        except (TypeError, ValueError):
+            return None
+        if given.shape != (10,) or not np.isfinite(given).all() or np.abs(given).max() > _FARTHEST:
+            return None
+        quaternion, place, (angle, across, down) = given[:4], given[4:7], given[7:]
+        length = float(np.linalg.norm(quaternion))
+        if (
+            length < 1 / _FARTHEST
+            or not 0 < angle < math.pi
+            or not 1 <= min(across, down) <= max(across, down) <= _LARGEST
+        ):
+            return None
+        size = int(across), int(down)
+        return cls(quaternion / length, place, float(angle), size[0] / size[1]), size
 
     def is_near(self, other: Pose | None) -> bool:
         """Whether both show the same picture, to a small part of a pixel."""

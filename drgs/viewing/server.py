@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import logging
 from collections.abc import Hashable, Iterator
 from typing import Any
 
-from drgs.viewing.gate import Gate, bound_socket, guarded
+from drgs.viewing.gate import Gate
 from drgs.viewing.layers import INFORMATION
 from drgs.viewing.session import Session
 from drgs.viewing.subject import Subject
+from drgs.viewing.wire import bound_socket, guarded, in_a_line
 from drgs.viewing.worker import Worker
 
 __all__ = ["Viewer"]
@@ -19,7 +21,7 @@ __all__ = ["Viewer"]
 _log = logging.getLogger(__name__)
 
 _NEAR, _FAR = 1e-3, 1e3  # of the distance to what is looked at: where the client's pictures begin and end
-_LEARNING = "information"
+_LEARNING, _LEFT = "information", "what browsers have left"  # jobs that can wait
 
 
 class Viewer:
@@ -62,6 +64,7 @@ class Viewer:
         # A tunnel to a server of somebody else's would lead around the gate.
         self._server._websock_server.unregister_handler(ShareUrlRequest)
         self._server._websock_server.unregister_handler(ShareUrlDisconnect)
+        self._server.get_event_loop().set_exception_handler(self._misunderstood)
         self.worker = Worker(self._failed)
         self._place()
         self._server.on_client_connect(self._connected)
@@ -94,7 +97,8 @@ class Viewer:
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = first.pose.position, first.target, first.up
         camera.fov = first.pose.fov
-        camera.near, camera.far = _NEAR * first.distance, _FAR * first.distance
+        distance = first.distance or 1.0
+        camera.near, camera.far = _NEAR * distance, _FAR * distance
 
     async def _connected(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(
@@ -104,6 +108,15 @@ class Viewer:
     async def _disconnected(self, client: Any) -> None:
         if session := self.sessions.pop(client.client_id, None):
             session.close()
+            self.worker.put(_LEFT, self._freeing(), can_wait=True)
+
+    @staticmethod
+    def _freeing() -> Iterator[None]:
+        """Job: free what a browser that has gone leaves. viser's handles and a session hold each other, the Gaussians
+        and the pictures that were sent with them, and Python by itself looks for such circles too late: tens of
+        browsers' were kept."""
+        gc.collect()
+        yield
 
     def _learn(self) -> None:
         """Have the information of the photographs added up, if nobody has asked for it yet."""
@@ -138,6 +151,12 @@ class Viewer:
 
         with contextlib.suppress(RuntimeError):  # the loop has ended: there is nobody left
             self._server.get_event_loop().call_soon_threadsafe(run)
+
+    @staticmethod
+    def _misunderstood(_: Any, context: dict[str, Any]) -> None:
+        """A browser has sent what viser, or a session, could not make anything of: a line in the log."""
+        error = context.get("exception")
+        _log.warning("view: %s", context.get("message") if error is None else in_a_line(error))
 
     def _failed(self, key: Hashable, error: Exception) -> None:
         """A job has ended by an error: whose job it was is told, and the log."""

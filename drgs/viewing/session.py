@@ -8,7 +8,6 @@ those that say otherwise run on viser's event loop, one after the other.
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,6 +26,7 @@ from drgs.viewing.stations import Station, score_colors
 if TYPE_CHECKING:
     import viser
 
+    from drgs.cameras import Camera
     from drgs.viewing.layers import ColorScale
     from drgs.viewing.subject import Subject
     from drgs.viewing.worker import Worker
@@ -40,6 +40,7 @@ _PRESETS = ("exact", "fast", "gsplat")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
 _MOMENTS = 48  # at most so many times in a round of playing
+_UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
 
 
@@ -75,8 +76,10 @@ class Session:
         self._playing: asyncio.Task | None = None
         self._frusta: list[Any] = []
         self._near = 0.0  # a camera is in a frustum within this distance
-        self.time = subject.times[0] if subject.times else None
-        self.pose, self.size = self._seen_pose()
+        self.time = subject.moment(None)
+        self._slider: Any = None
+        self._button: Any = None
+        self.pose, self.size = self._seen_pose() or (subject.first.pose, _UNKNOWN)
         self._build(preset)
         self._send_gaussians()
         self._show_stations()
@@ -111,14 +114,17 @@ class Session:
         self._are_shown.on_update(self._stations_toggled)
 
     def _build_times(self) -> None:
-        """The slider and the button of what moves; neither where nothing does."""
+        """The slider and the button of what moves; neither where nothing does, or no longer."""
         gui, times = self.client.gui, self.subject.times
-        self._slider: Any = None
-        self._button: Any = None
+        self._stop_playing()
+        for handle in (self._slider, self._button):
+            if handle is not None:
+                handle.remove()
+        self._slider = self._button = None
         if len(times) < 2:
             return
         step = (times[-1] - times[0]) / 1000
-        self._slider = gui.add_slider("time", times[0], times[-1], step, times[0])
+        self._slider = gui.add_slider("time", times[0], times[-1], step, self.time)
         self._button = gui.add_button("play")
         self._slider.on_update(self._time_chosen)
         self._button.on_click(self._play_clicked)
@@ -130,12 +136,10 @@ class Session:
         names = tuple(layer.name for layer in subject.layers)
         if names != tuple(self._layer.options):
             self._layer.options = names
-        if self.time is None and subject.times:
-            self.time = subject.times[0]
-            self._build_times()
-        elif self.time is not None and not subject.times:
-            self.time = None
         self._hide()
+        self.time = subject.moment(self.time)
+        if subject.times != before.times:
+            self._build_times()
         self._send_gaussians()
         if subject.stations is not before.stations:
             self._show_stations()
@@ -172,7 +176,10 @@ class Session:
         self._ask_later(0.0)
 
     async def _camera_moved(self, _: Any) -> None:
-        pose, size = self._seen_pose()
+        seen = self._seen_pose()
+        if seen is None:  # not a camera: what is shown stays
+            return
+        pose, size = seen
         if pose.is_near(self.pose) and size == self.size:
             return
         self.pose, self.size = pose, size
@@ -182,8 +189,9 @@ class Session:
 
     async def _time_chosen(self, _: Any) -> None:
         assert self._slider is not None
-        if self._slider.value != self.time:
-            self.time = float(self._slider.value)
+        wanted = self.subject.moment(float(self._slider.value))
+        if wanted != self.time:
+            self.time = wanted
             self._hide()
             self._send_gaussians()
             self._ask_later()
@@ -191,12 +199,16 @@ class Session:
     async def _play_clicked(self, _: Any) -> None:
         assert self._button is not None
         if self._playing is not None:
-            self._playing.cancel()
-            self._playing, self._button.label = None, "play"
+            self._stop_playing()
             self._ask_later()
             return
         self._button.label = "pause"
         self._playing = asyncio.create_task(self._play())
+
+    def _stop_playing(self) -> None:
+        if self._playing is not None:
+            self._playing.cancel()
+            self._playing, self._button.label = None, "play"
 
     async def _play(self) -> None:
         """Goes through all times, again and again, as fast as the Gaussians of each can be sent."""
@@ -275,11 +287,11 @@ class Session:
         with self.client.atomic():
             camera.position = pose.position
             camera.wxyz = pose.wxyz
-            camera.fov = looking(pose, camera.aspect)
-        self.pose, _ = self._seen_pose()  # what the browser sends back is no movement of its own
+            camera.fov = looking(pose, self.size[0] / self.size[1])
+        self.pose, self.size = self._seen_pose() or (pose, self.size)  # what it sends back is no movement of its own
         self._show_frusta()
         if self._slider is not None and sight.camera.time is not None and self._playing is None:
-            self._slider.value = sight.camera.time
+            self._slider.value = self.subject.moment(sight.camera.time)
         self._hide()
         self._ask_later()
         self._about.content = panel.photograph(station, sight)
@@ -368,13 +380,14 @@ class Session:
         with self._lock:
             self._wanted += 1
             wanted = self._wanted
-        self._worker.put((self, "picture"), self._picture(wanted, self.subject, self.layer, self._preset.value))
+        # What is drawn is settled here: when the job begins, another subject may be looked at, at another time.
+        whole = camera_of(self.pose, *self.size, self.subject.origin, self.time)
+        steps = self._picture(wanted, self.subject, whole, self.layer, self._preset.value)
+        self._worker.put((self, "picture"), steps)
 
-    def _picture(self, wanted: int, subject: Subject, layer: Layer, preset: str) -> Iterator[None]:
+    def _picture(self, wanted: int, subject: Subject, whole: Camera, layer: Layer, preset: str) -> Iterator[None]:
         """Job: pictures of what the camera sees, each larger than the one before."""
         began, settings = time.perf_counter(), subject.settings(preset)
-        width, height = self.size
-        whole = camera_of(self.pose, width, height, subject.origin, self.time)
         for camera in stages(whole, min(self._pixels, layer.pixels or self._pixels)):
             self.say(f"{layer.name}, {preset}: drawing {camera.width}x{camera.height} ...")
             drawing = yield from layer.draw(subject.scene, camera, settings)
@@ -391,9 +404,7 @@ class Session:
             yield
         self.drawn += 1
 
-    def _seen_pose(self) -> tuple[Pose, tuple[int, int]]:
-        """Where the client's camera is, and the pixels of its window."""
+    def _seen_pose(self) -> tuple[Pose, tuple[int, int]] | None:
+        """Where the client's camera is, and the pixels of its window; None where it has said nothing that is one."""
         camera = self.client.camera
-        width, height = max(1, int(camera.image_width)), max(1, int(camera.image_height))
-        fov = float(camera.fov) if math.isfinite(camera.fov) and camera.fov > 0 else 1.0
-        return Pose(np.array(camera.wxyz), np.array(camera.position), fov, width / height), (width, height)
+        return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)

@@ -14,6 +14,8 @@ __all__ = ["ClientGaussians"]
 _LARGE = 64.0  # units of the client's lengths that the larger Gaussians have as their standard deviation
 _QUANTILE = 0.999  # which Gaussians those are
 _MOST = 60_000.0  # of a covariance's entry: half floats end at 65,504
+_FARTHEST = 1e30  # of a coordinate: what is farther is nowhere to be seen, and float32 ends
+_SMALLEST = 1e-30  # of the larger Gaussians, in the world's unit
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,7 +24,7 @@ class ClientGaussians:
 
     The client keeps covariances as half floats, from 6e-5 to 65,504 with all their digits: lengths are therefore
     multiplied so that a Gaussian of nearly the largest has a standard deviation of 64, and all down to 1/8000 of that
-    are drawn as they are.
+    are drawn as they are, those above 3.8 times that as large. All of it is finite, whatever the Gaussians are.
 
     Attributes:
         centers: (N, 3) float32.
@@ -47,15 +49,15 @@ class ClientGaussians:
             rgbs: (N, 3) uint8; None: their color of degree 0, which is the mean over all directions.
         """
         with torch.no_grad():  # to be looked at
-            axes = semi_axes(g.quats.float(), g.scales.float())
-            sizes = g.scales.float().amax(1).cpu().numpy()
+            scales = g.scales.double()  # may be infinite: float32 ends at the exponential of 88
+            sizes = scales.amax(1).cpu().numpy()
             large = float(np.quantile(sizes, _QUANTILE)) if len(sizes) else 1.0
-            factor = _LARGE / large if 0 < large < np.inf else 1.0
-            axes = axes * factor
-            covariances = (axes @ axes.transpose(1, 2)).clamp(-_MOST, _MOST).cpu().numpy()
+            factor = _LARGE / large if _SMALLEST < large < 1 / _SMALLEST else 1.0
+            axes = semi_axes(g.quats.double(), (scales * factor).clamp_max(_MOST**0.5))
+            covariances = (axes @ axes.transpose(1, 2)).float().clamp(-_MOST, _MOST).cpu().numpy()
             if rgbs is None:
                 color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)
                 rgbs = (255 * color).round().to(torch.uint8).cpu().numpy()
-            centers = (g.means.double() * factor).float().cpu().numpy()
+            centers = (g.means.double() * factor).clamp(-_FARTHEST, _FARTHEST).float().cpu().numpy()
             opacities = g.opacities.float()[:, None].cpu().numpy()
         return cls(centers, covariances, rgbs, opacities, 1.0 / factor)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -75,6 +76,18 @@ class Subject:
     first: FirstView
     background: tuple[float, float, float]
     notes: tuple[str, ...] = ()
+
+    def moment(self, time: float | None) -> float | None:
+        """The time at which it is looked at by who wants a time: one that it has; None where nothing moves.
+
+        Args:
+            time: Wanted: of a slider, a photograph, or of what was looked at before, which may have had none or others.
+        """
+        if not self.times:
+            return None
+        if time is None or not math.isfinite(time):
+            return self.times[0]
+        return min(max(time, self.times[0]), self.times[-1])
 
     def layer(self, name: str) -> Layer:
         """The layer of a name, else the first one."""

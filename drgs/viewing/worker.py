@@ -84,3 +84,4 @@ class Worker:
                     del queue[key]
             if error is not None:
                 self._failed(key, error)
+            del key, steps, error  # while nothing is to be done, nothing of what was done is kept

@@ -1,0 +1,144 @@
+"""The socket of the viewer, and what is answered on it: the gate is asked before anything of viser's is.
+
+viser has no place for such a question, so its call of `websockets`' `serve` is led through here (`guarded`): to the
+socket that was bound before, with our question in front of its own, and with an answer to what is no request at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http
+import logging
+import socket
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from drgs.viewing.gate import Gate
+
+__all__ = ["bound_socket", "guarded", "in_a_line"]
+
+_log = logging.getLogger(__name__)
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """A socket that listens.
+
+    Args:
+        host: A name or an address.
+        port: 0 is any that is free.
+    Raises:
+        ValueError: If there is no such address here, or the port is taken.
+    """
+    if not 0 <= port < 1 << 16:
+        raise ValueError(f"view: --port must be in [0, 65535], got {port}; choose another")
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        return socket.create_server(address[:2], family=family)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(
+            f"view: --host {host} --port {port} must be an address of this machine that is free, got: {reason}; "
+            "choose another port, or --port 0 for any"
+        ) from None
+
+
+@contextlib.contextmanager
+def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
+    """For the length of the block, a server that viser starts listens at a socket, behind a gate.
+
+    Raises:
+        RuntimeError: If viser has started none through it: another version of viser, which is not to be trusted.
+    """
+    from viser.infra import _infra
+
+    led = []
+
+    def behind(handler: Any, host: Any, port: Any, *, process_request: Callable[..., Any], **options: Any) -> Any:
+        led.append(port)
+        options |= {"process_request": _asked(gate, process_request), "create_connection": _Answering, "logger": _log}
+        return serve(handler, sock=listening, **options)
+
+    before = _infra.websockets
+    shown = types.SimpleNamespace(**vars(before))
+    shown.asyncio = types.SimpleNamespace(server=types.SimpleNamespace(serve=behind))
+    _infra.websockets = shown  # type: ignore[assignment]  # its module, as far as it uses it
+    try:
+        yield
+    finally:
+        _infra.websockets = before
+    if not led:
+        raise RuntimeError("view: viser must start its server by websockets.asyncio.server.serve, has not")
+
+
+class _Answering(ServerConnection):
+    """A connection that answers what is no request of HTTP/1.1, too: by itself it would be closed without a word."""
+
+    def send_data(self) -> None:
+        """What the protocol has to send, behind our answer where it has given up reading a request."""
+        error, self._given = self.protocol.handshake_exc, getattr(self, "_given", False)
+        if error is not None and self.protocol.state.name == "CONNECTING" and self.request is None and not self._given:
+            self._given = True
+            if "unsupported HTTP method" in str(error.__cause__):
+                answer = _refused(http.HTTPStatus.METHOD_NOT_ALLOWED, "the method must be GET")
+                answer.headers["Allow"] = "GET"
+            else:
+                answer = _refused(http.HTTPStatus.BAD_REQUEST, "this is no request that HTTP/1.1 knows")
+            self.transport.write(answer.serialize())
+        super().send_data()
+
+
+def _asked(gate: Gate, process_request: Callable[..., Any]) -> Callable[..., Any]:
+    """viser's answer to a request, where the gate has nothing against it."""
+    import viser
+
+    spoken = f"viser-v{viser.__version__}"
+
+    def process(connection: Any, request: Request) -> Response | None:
+        if found := gate.refusal(request.path, request.headers):
+            return _refused(*found)
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
+            if spoken not in (name.strip() for name in offered.split(",")):
+                return _refused(http.HTTPStatus.BAD_REQUEST, f"the page must speak {spoken}; load it again")
+        elif moved := gate.answer(request.path, request.headers):
+            return Response(http.HTTPStatus.SEE_OTHER, "See Other", Headers(moved))
+        try:
+            response = process_request(connection, request)
+        except (OSError, ValueError):  # no name of a file: too long, or with characters that none has
+            response = _refused(http.HTTPStatus.NOT_FOUND, "there is no such page")
+        if response is not None:
+            for name, value in gate.around(request.headers):
+                response.headers[name] = value
+        return response
+
+    return process
+
+
+def _refused(status: http.HTTPStatus, why: str) -> Response:
+    """An answer that says why there is none."""
+    body = f"drgs view: {why}\n".encode()
+    said = Headers([("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))])
+    said["Connection"] = "close"
+    return Response(status, status.phrase, said, body)
+
+
+def in_a_line(error: BaseException) -> str:
+    """What an error says, with its kind, whatever lines it has."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _without_traceback(record: logging.LogRecord) -> bool:
+    """What a client has sent is worth a line at most, without a traceback, whatever it was; a handshake none."""
+    if record.exc_info and record.exc_info[1] is not None:
+        record.msg = f"view: {record.getMessage()}: {in_a_line(record.exc_info[1])}"
+        record.args, record.exc_info, record.exc_text = (), None, None
+        return "opening handshake failed" not in record.msg
+    return True
+
+
+_log.addFilter(_without_traceback)
