@@ -277,7 +277,7 @@ def test_photos_that_fall_apart(tmp_path, capsys, monkeypatch):
     assert "what would help: a sharper, brighter photo in place of 14.png (0)" in told
     assert "what would help: --masks, if the object was turned" in told
     assert "--matcher exhaustive" not in told  # which it was
-    assert any("model 2, retriangulation and bundle adjustment" in text for text in texts if text)
+    assert any("attempt 2, retriangulation and bundle adjustment" in text for text in texts if text)
 
 
 @pytest.mark.parametrize("part", ["images", "sparse", "database.db", "database.db-wal"])

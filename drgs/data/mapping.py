@@ -72,7 +72,7 @@ class _Told:
             self._tell()
 
     def _tell(self) -> None:
-        parts = [f"model {self._model}"] if self._model > 1 else []  # the photographs have fallen apart
+        parts = [f"attempt {self._model}"] if self._model > 1 else []  # that was kept, or was too small
         is_last = "bundle adjustment" in self._what and self.registered >= self.total
         what = f"final {self._what}" if is_last else self._what
         seconds = time.monotonic() - self._since
