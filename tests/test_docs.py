@@ -208,15 +208,41 @@ def _navigation() -> str:
     return re.sub(r"^\s*#.*$", "", text, flags=re.M)
 
 
-def test_the_site_builds(tmp_path):
-    """Strictly: no broken link, no docstring that cannot be read; and nothing of it is fetched from elsewhere."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The documentation, built strictly: no broken link, no docstring that cannot be read."""
     pytest.importorskip("mkdocs", reason="the site needs pip install 'drgs[docs]'")
+    folder = tmp_path_factory.mktemp("docs") / "site"
     environ = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(folder)]
     done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr[-3000:]
-    for page in (tmp_path / "site").rglob("*.html"):
+    return folder
+
+
+def test_the_site_fetches_nothing(site):
+    """Nothing of it is from elsewhere when it is looked at."""
+    for page in site.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         assert not re.search(r'<(script|img|iframe)[^>]+src="(https?:)?//', text), page
         for link in re.findall(r"<link[^>]+>", text):
             assert "canonical" in link or not re.search(r'href="(https?:)?//', link), (page, link)
+
+
+def test_the_site_is_searched_from_files(site):
+    """Opened as a file, without a server, its search finds pages."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1300, "height": 900})
+        page.goto((site / "index.html").as_uri())
+        page.evaluate("document.querySelector('[data-md-toggle=search]').click()")
+        page.wait_for_function("document.activeElement.name === 'query'")
+        page.keyboard.type("crossval")
+        page.wait_for_selector(".md-search-result__item a", state="attached")
+        links = page.locator(".md-search-result__item a").evaluate_all("found => found.map(x => x.href)")
+        browser.close()
+    assert any(link.startswith("file://") and "crossval.html" in link for link in links)

@@ -52,9 +52,9 @@ def shown(browser):
     """Opens viewers in pages, and ends both."""
     opened = []
 
-    def open_one(looked, **options):
+    def open_one(looked, width=WIDTH, height=HEIGHT, **options):
         viewer = Viewer(looked, **{"preset": "fast", "pixels": 60_000} | options)
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page = browser.new_page(viewport={"width": width, "height": height})
         page.set_default_timeout(PATIENCE)
         opened.append((viewer, page))
         page.errors = []
@@ -194,6 +194,27 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
         stop.set()
         thread.join()
         save_state(state, tensors, header)
+
+
+def test_a_phone_sees_the_scene(shown, place):  # noqa: F811
+    """At 390x844 the panel leaves most of the window free, the first view has all of its width, and no frustum lies
+    over a quarter of it; what is folded in the panel opens."""
+    args = View(scene=place / "run", preset="fast")
+    looked = subject_of(args, Given.of(args))
+    viewer, page = shown(looked, 390, 844)
+    page.wait_for_function("document.getElementById('drgs-status').getBoundingClientRect().bottom <= 844")
+    top = page.evaluate("document.getElementById('drgs-header').getBoundingClientRect().top")
+    assert top > 844 * 0.66
+    session = session_of(viewer)
+    width = np.tan(session.pose.fov / 2) * session.pose.aspect
+    first = looked.first.pose
+    assert width == pytest.approx(np.tan(first.fov / 2) * first.aspect, rel=0.01)
+    assert any(frustum.visible for frustum in session._frusta)
+    for frustum in session._frusta:
+        away = np.linalg.norm(np.asarray(frustum.position) - session.pose.position)
+        assert frustum.visible == (session._reach / away < 0.5 * width)
+    page.get_by_text("settings", exact=True).click()
+    page.locator('input[value="rgb"]').locator("visible=true").first.wait_for()
 
 
 def test_the_slider_moves_the_scene(shown):

@@ -8,6 +8,9 @@ those that say otherwise run on viser's event loop, one after the other.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -39,6 +42,8 @@ REST = 0.3
 _PRESETS = ("exact", "fast", "gsplat")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
+_COVERS = 0.5  # of half a view's narrower side: a frustum that reaches farther is hidden
+_NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
 _MOMENTS = 48  # at most so many times in a round of playing
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
@@ -75,35 +80,52 @@ class Session:
         self._timer: asyncio.TimerHandle | None = None
         self._playing: asyncio.Task | None = None
         self._frusta: list[Any] = []
-        self._near = 0.0  # a camera is in a frustum within this distance
+        self._reach = 0.0  # of a frustum, from its tip
         self.time = subject.moment(None)
         self._slider: Any = None
         self._button: Any = None
         self.pose, self.size = self._seen_pose() or (subject.first.pose, _UNKNOWN)
+        self._has_begun = False  # has been at the first view
+        self._widen()
         self._build(preset)
         self._send_gaussians()
         self._show_stations()
         self._ask_later()
         client.camera.on_update(self._camera_moved)
 
+    def _widen(self) -> None:
+        """Once the browser is at the first view: see all of its width in a window taller than that, as a phone's."""
+        first, distance = self.subject.first.pose, self.subject.first.distance
+        is_there = float(np.linalg.norm(self.pose.position - first.position)) <= 1e-3 * distance
+        if self._has_begun or not is_there:
+            return
+        self._has_begun = True
+        if self.pose.aspect < first.aspect:
+            fov = looking(first, self.pose.aspect)
+            self.client.camera.fov = fov
+            self.pose = dataclasses.replace(self.pose, fov=fov)
+
     # ---------------------------------------------------------------------------------------- panel
 
     def _build(self, preset: str) -> None:
         """What stands in the panel."""
-        gui, subject = self.client.gui, self.subject
+        gui, subject, is_narrow = self.client.gui, self.subject, self.size[0] <= _NARROW
         self._header = gui.add_html(panel.header(subject))
         names = [layer.name for layer in subject.layers]
-        self._layer = gui.add_dropdown("show", names, initial_value=names[0], hint=subject.layers[0].hint)
         presets = list(dict.fromkeys([preset, *_PRESETS]))
-        self._preset = gui.add_dropdown(
-            "drawn by", presets, initial_value=preset, hint="Render settings of our picture, where the camera rests."
-        )
-        self._ours = gui.add_checkbox(
-            "our picture", True, hint="Where the camera rests; else only what the browser draws by itself."
-        )
+        # Over a narrow window viser's panel lies open, over the picture: what is in it is folded instead.
+        with gui.add_folder("settings", expand_by_default=False) if is_narrow else contextlib.nullcontext():
+            self._layer = gui.add_dropdown("show", names, initial_value=names[0], hint=subject.layers[0].hint)
+            self._preset = gui.add_dropdown(
+                "drawn by", presets, initial_value=preset, hint="Settings of our picture, where the camera rests."
+            )
+            self._ours = gui.add_checkbox(
+                "our picture", True, hint="Where the camera rests; else only what the browser draws by itself."
+            )
         self._status = gui.add_html(panel.status(""))
         self._build_times()
-        with gui.add_folder("cameras", visible=bool(subject.stations)) as self._cameras:
+        folder = gui.add_folder("cameras", visible=bool(subject.stations), expand_by_default=not is_narrow)
+        with folder as self._cameras:
             self._are_shown = gui.add_checkbox("show", True, hint="Click on one to fly there.")
             self._legend = gui.add_html("")
         with gui.add_folder("view", visible=False) as self._view:
@@ -183,6 +205,7 @@ class Session:
         if pose.is_near(self.pose) and size == self.size:
             return
         self.pose, self.size = pose, size
+        self._widen()
         self._show_frusta()
         self._hide()
         self._ask_later()
@@ -261,14 +284,15 @@ class Session:
             )
             frustum.on_click(self._clicked(station))
             self._frusta.append(frustum)
-        self._near = 3 * size
+        self._reach = size
         self._show_frusta()
 
     def _show_frusta(self) -> None:
-        """All, or none, but for those that the camera stands in: they would lie over all that it sees."""
+        """All, or none, but for those that the camera stands in or near: they would lie over all that it sees."""
+        near = self._reach / (_COVERS * math.tan(0.5 * self.pose.fov) * min(1.0, self.pose.aspect))
         for frustum in self._frusta:
             away = float(np.linalg.norm(np.asarray(frustum.position) - self.pose.position))
-            shown = self._are_shown.value and away > self._near
+            shown = self._are_shown.value and away > near
             if frustum.visible != shown:
                 frustum.visible = shown
 
