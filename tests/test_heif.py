@@ -143,11 +143,11 @@ def test_named_when_missing(tmp_path, gradient, monkeypatch, capsys):
     assert not (tmp_path / "scene").exists()
 
 
-@pytest.mark.parametrize("suffix", [*SUFFIXES, "webp"])
-def test_structure_from_motion(corner, tmp_path, suffix):  # noqa: F811
+@pytest.mark.parametrize(("suffix", "masked"), [("heic", False), ("avif", True), ("webp", False)])
+def test_structure_from_motion(corner, tmp_path, suffix, masked):  # noqa: F811
     """Poses from photographs of a phone, two of them JPEGs, with the focal length that EXIF states; then a fit's data.
 
-    A JPEG of the same pixels has the same camera at first.
+    A JPEG of the same pixels has the same camera at first. Masks have the photographs' names, whatever these are.
     """
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -162,12 +162,17 @@ def test_structure_from_motion(corner, tmp_path, suffix):  # noqa: F811
         else:
             save(target, np.ascontiguousarray(pixels), exif=exif(focal_35=42))
     before = {path: path.read_bytes() for path in photos.iterdir()}
-    summary = run_sfm(photos, tmp_path / "out", progress=lambda stage, *_: stages.add(stage))
+    if masked:
+        (tmp_path / "white").mkdir()
+        for path in before:
+            assert cv2.imwrite(str(tmp_path / f"white/{path.name}.png"), np.full((240, 320), 255, np.uint8))
+    masks = tmp_path / "white" if masked else None
+    summary = run_sfm(photos, tmp_path / "out", progress=lambda stage, *_: stages.add(stage), masks=masks)
     assert (summary.registered, summary.missing) == (7, ())
     assert "decoding" in stages
     assert {path: path.read_bytes() for path in photos.iterdir()} == before
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        ".drgs.jsonl", "database.db", "images", "sparse"
+        ".drgs.jsonl", "database.db", "images", *(["masks"] if masked else []), "sparse"
     ]  # fmt: skip
     dataset = load(tmp_path / "out")
     assert sorted(view.image_path.suffix for view in dataset.views) == sorted([".jpg"] * 2 + [f".{suffix}"] * 5)
