@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -320,7 +321,7 @@ def test_stations_of_a_run(place):  # noqa: F811
     photograph = by_name["3"].best.photograph(12)
     view = next(view for view in load(place / "data").views if view.name == "3")
     np.testing.assert_allclose(photograph, view.checked().image(12, 12), atol=1e-6)
-    assert {layer.name for layer in looked.layers} == {"rgb", "depth", "missing", "information"}
+    assert {layer.name for layer in looked.layers} == {"rgb", "depth", "missing", "uncertainty"}
     assert looked.state == "step 12 of 12"
     # It looks at what the photographs look at: the middle, from their distance, with their up.
     assert np.linalg.norm(looked.first.target) < 0.1
@@ -496,7 +497,7 @@ def test_two_browsers_have_each_their_own_camera(viewers):
         assert not [m for m in two.heard[other:] if m["type"] == "BackgroundImageMessage"]
 
 
-def test_information_is_added_up_once_and_shown(place, viewers):  # noqa: F811
+def test_uncertainty_is_added_up_once_and_shown(place, viewers):  # noqa: F811
     """Asked for, it says how far it is, and then shows the map of the view."""
     args = View(scene=place / "run", preset="fast")
     looked = subject_of(args, Given.of(args))
@@ -506,15 +507,91 @@ def test_information_is_added_up_once_and_shown(place, viewers):  # noqa: F811
         client.look(pose.wxyz, pose.position)
         client.picture()
         at = len(client.heard)
-        client.choose("show", "information")
-        html(client, "information of the photographs: 4 of 4")
+        client.choose("show", "uncertainty")
+        html(client, " of 4 photographs added")
         picture = client.picture(after=at)
         assert looked.uncertainty.is_known
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
         wanted, (low, high) = map_colors(looked.uncertainty.map(camera))
         html(client, f"{low:.3g} ", after=at)
-        html(client, f" {high:.3g} variance, logarithmic", after=at)
+        html(
+            client,
+            f" {high:.3g} variance of the color, as a multiple of the photographs&#x27; noise, logarithmic",
+            after=at,
+        )
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0
+
+
+def uncertain(seed: int, hold, calls: list[int]) -> Subject:
+    """Of three photographs; `hold` is called before the information of each is computed."""
+    torch.manual_seed(seed)
+    g = blobs(torch.randn(12, 3) * 0.4)
+    cameras = orbit((0, 0, 0), 3.0, 3, width=24, height=20)
+
+    def said(camera):
+        calls.append(seed)
+        hold()
+        return fisher.diagonal(g, camera, FAST)
+
+    def mapped(camera, weights):
+        return fisher.variance_map(g, camera, weights, FAST).numpy()
+
+    known = Uncertainty(cameras, said, mapped, gain.Prior(1.0))
+    layers = layers_of({}, known, 2_000)
+    return subject(torch.zeros(12, 3), scene=g, state=f"step {seed}", uncertainty=known, layers=layers)
+
+
+def test_a_map_that_was_begun_is_finished(viewers):
+    """Checkpoints that come while the photographs are added up stop nothing: the map of the first is shown, with its
+    step, then that of the last one; those between are passed over, and no photograph is added twice."""
+    begun, go, calls = threading.Event(), threading.Event(), []
+
+    def hold():
+        if len(calls) == 2:  # until the checkpoints have come
+            begun.set()
+            assert go.wait(60)
+        if len(calls) == 4:  # until the browser has asked for the map of the first
+            (session,) = viewer.sessions.values()
+            end = time.monotonic() + 60
+            while not viewer.worker.has((session, "picture")) and time.monotonic() < end:
+                time.sleep(0.01)
+
+    subjects = [uncertain(seed, hold, calls) for seed in (1, 2, 3)]
+    viewer = viewers(subjects[0])
+    pose = subjects[0].first.pose
+    with Client(viewer.port) as client:
+        client.look(pose.wxyz, pose.position)
+        client.picture()
+        client.choose("show", "uncertainty")
+        assert begun.wait(60)
+        for later in subjects[1:]:
+            viewer.replace(later)
+        html(client, "step 3")
+        at = len(client.heard)
+        go.set()
+        html(client, "uncertainty of step 1, fast: ", after=at)
+        html(client, "uncertainty, fast: ", after=at)
+        picture = client.picture(after=len(client.heard) - 3)
+        camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], np.zeros(3))
+        wanted, _ = map_colors(subjects[2].uncertainty.map(camera))
+        assert np.abs(picture.astype(int) - wanted).mean() < 1.0
+    assert calls == [1, 1, 1, 3, 3, 3]
+
+
+def test_a_long_picture_says_how_long(viewers):
+    """Of a picture in several bands: an estimate by the small one before it, then the share that is done."""
+    looked = subject(torch.randn(300, 3))
+    viewer = viewers(looked, preset="exact")
+    with Client(viewer.port) as client:
+        client.look(looked.first.pose.wxyz, looked.first.pose.position, width=640, height=480)
+        html(client, "rgb, exact: 640x480 in ")
+    said = [re.sub("<[^>]*>", "", text) for text in client.said()]
+    drawn = [text for text in said if text.startswith("rgb, exact: drawing 640x480")]
+    assert re.fullmatch(r"rgb, exact: drawing 640x480, about \d+ (s|min) \.\.\.", drawn[0])
+    shares = [int(re.fullmatch(r".*: (\d+)%, about \d+ (?:s|min) left \.\.\.", text)[1]) for text in drawn[1:]]
+    assert shares == sorted(shares)
+    assert shares
+    assert 0 < shares[0] < 50 < shares[-1] < 100
 
 
 def test_a_click_flies_to_a_camera(place, viewers):  # noqa: F811

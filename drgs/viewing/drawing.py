@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Steps", "bands", "drawn", "stages"]
 
-Steps = Generator[None, None, np.ndarray]
-"""Yields between its steps, and returns what it has made."""
+Steps = Generator[float, None, np.ndarray]
+"""Yields the share that is done between its steps, and returns what it has made."""
 
 _FIRST = 16_000  # pixels of the first picture
 _BAND = 48_000  # pixels that are drawn in one step
@@ -72,8 +72,10 @@ def drawn(
     parts = []
     with torch.no_grad():  # a picture
         seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
+    below = 0
     for part in bands(camera):
         with torch.no_grad():
             parts.append(read(render(seen, part, settings, ("depth",))))
-        yield
+        below += part.height
+        yield below / camera.height
     return np.concatenate(parts)

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
     from drgs.viewing.uncertainty import Uncertainty
 
-__all__ = ["INFORMATION", "Drawing", "Layer", "ColorScale", "layers_of", "tinted"]
+__all__ = ["UNCERTAINTY", "ColorScale", "Drawing", "Layer", "layers_of", "tinted"]
 
-INFORMATION = "information"
+UNCERTAINTY = "uncertainty"
 _WIDE_PIXELS = 200_000  # of a picture of features: 100 MB of 128 channels
+_VARIANCE = "variance of the color, as a multiple of the photographs' noise, logarithmic"
 _ROW = 4096  # Gaussians that are painted at once
 
 
@@ -31,7 +32,7 @@ class ColorScale:
 
     Attributes:
         dark, bright: The values of its ends.
-        of: What has these values.
+        of: What has these values, in which unit.
     """
 
     dark: float
@@ -47,7 +48,9 @@ class Drawing:
     scale: ColorScale | None = None
 
 
-Drawings = Generator[None, None, Drawing]
+Drawings = Generator[float, None, Drawing]
+"""Yields the share that is done between its steps, and returns the picture."""
+
 Draw = Callable[["Scene", "Camera", "RenderSettings"], Drawings]
 
 
@@ -94,8 +97,8 @@ def layers_of(
         tint = None if kind == "overlay" else _tint_of(painter)
         made.append(Layer(kind, hints.get(kind, kind), _painted(painter), _WIDE_PIXELS, tint))
     if uncertainty is not None:
-        hint = "predictive variance of each pixel, given the photographs: bright is uncertain"
-        made.append(Layer(INFORMATION, hint, _mapped(uncertainty), pixels))
+        hint = "variance that the photographs leave to each pixel's color: bright is uncertain, dark is well known"
+        made.append(Layer(UNCERTAINTY, hint, _mapped(uncertainty), pixels))
     return tuple(made)
 
 
@@ -115,12 +118,12 @@ def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
 
     found = yield from drawn(scene, camera, settings, read)
     picture, (near, far) = pictures.depth_colors(found[..., 0], found[..., 1])
-    return Drawing(picture, ColorScale(far, near, "distance"))
+    return Drawing(picture, ColorScale(far, near, "distance, in the scene's unit"))
 
 
 def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     found = yield from drawn(scene, camera, settings, lambda out: 1 - out.alpha.cpu().numpy())
-    return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light"))
+    return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light, none to all"))
 
 
 def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
@@ -133,9 +136,9 @@ def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
 def _mapped(uncertainty: Uncertainty) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         found = uncertainty.map(camera)
-        yield
+        yield 1.0
         picture, (low, high) = pictures.map_colors(found)
-        return Drawing(picture, ColorScale(low, high, "variance, logarithmic"))
+        return Drawing(picture, ColorScale(low, high, _VARIANCE))
 
     return draw
 

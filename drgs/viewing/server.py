@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import io
 import logging
@@ -10,9 +11,10 @@ from collections.abc import Hashable, Iterator
 from typing import Any
 
 from drgs.viewing.gate import Gate
-from drgs.viewing.layers import INFORMATION
+from drgs.viewing.layers import UNCERTAINTY
 from drgs.viewing.session import Session
 from drgs.viewing.subject import Subject
+from drgs.viewing.uncertainty import Uncertainty
 from drgs.viewing.wire import bound_socket, guarded, in_a_line
 from drgs.viewing.worker import Worker
 
@@ -21,7 +23,7 @@ __all__ = ["Viewer"]
 _log = logging.getLogger(__name__)
 
 _NEAR, _FAR = 1e-3, 1e3  # of the distance to what is looked at: where the client's pictures begin and end
-_LEARNING, _LEFT = "information", "what browsers have left"  # jobs that can wait
+_LEARNING, _LEFT = "uncertainty", "what browsers have left"  # jobs that can wait
 
 
 class Viewer:
@@ -56,6 +58,7 @@ class Viewer:
             self.address = self.gate.address(host, self.port)
             self.subject, self._preset, self._pixels = subject, preset, pixels
             self.sessions: dict[int, Session] = {}
+            self._learnt: Subject | None = None  # the last one whose uncertainty is known
             with guarded(self.gate, listening), contextlib.redirect_stdout(io.StringIO()):  # it says where it listens
                 self._server = viser.ViserServer(host, self.port, verbose=False)
         except BaseException:
@@ -72,7 +75,6 @@ class Viewer:
 
     def replace(self, subject: Subject) -> None:
         """Show another subject in all browsers. From any thread."""
-        self.worker.drop(_LEARNING)
         self.subject = subject
         self._each(lambda session: session.show(subject))
 
@@ -102,7 +104,7 @@ class Viewer:
 
     async def _connected(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(
-            client, self.subject, self.worker, self._preset, self._pixels, self._learn
+            client, self.subject, self.worker, self._preset, self._pixels, self._learn, lambda: self._learnt
         )
 
     async def _disconnected(self, client: Any) -> None:
@@ -125,22 +127,34 @@ class Viewer:
             self.worker.put(_LEARNING, self._learning(), can_wait=True)
 
     def _learning(self) -> Iterator[None]:
-        """Job: the information of the photographs; whoever waits for it is told how far it is."""
-        uncertainty = self.subject.uncertainty
-        assert uncertainty is not None
+        """Job: the information of the photographs; whoever waits for it is told how far it is.
 
-        def told() -> None:
-            count = len(uncertainty.cameras)
-            for session in self._waiting():
-                session.say(f"information of the photographs: {uncertainty.done} of {count}")
+        What was begun of a checkpoint is finished though a fit has gone on since, and its map shown; then it is the
+        newest one's turn. A fit that saves faster than this would else never have a map.
+        """
+        while True:
+            subject = self.subject
+            if (uncertainty := subject.uncertainty) is None or uncertainty.is_known:
+                return
+            told = functools.partial(self._tell, subject, uncertainty)
+            told()
+            yield
+            yield from uncertainty.learn(told)
+            self._learnt = subject
+            self._each(lambda session: session.redraw() if session.layer.name == UNCERTAINTY else None)
+            if not self._waiting():
+                return
 
-        told()
-        yield
-        yield from uncertainty.learn(told)
-        self._each(lambda session: session.redraw() if session.layer.name == INFORMATION else None)
+    def _tell(self, subject: Subject, uncertainty: Uncertainty) -> None:
+        """Who waits for it how many photographs have been added."""
+        of = f" of {subject.state}" if subject.state else ""
+        for session in self._waiting():
+            session.say(
+                f"uncertainty{of}: {uncertainty.done} of {len(uncertainty.cameras)} photographs added", session.scale
+            )
 
     def _waiting(self) -> list[Session]:
-        return [session for session in list(self.sessions.values()) if session.layer.name == INFORMATION]
+        return [session for session in list(self.sessions.values()) if session.layer.name == UNCERTAINTY]
 
     def _each(self, call: Any) -> None:
         """Call a function with each session, on viser's event loop."""

@@ -13,7 +13,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
 from drgs.viewing.drawing import stages
-from drgs.viewing.layers import INFORMATION, Layer, tinted
+from drgs.viewing.layers import UNCERTAINTY, Layer, tinted
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.splats import ClientGaussians
 from drgs.viewing.stations import Station, score_colors
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import viser
 
     from drgs.cameras import Camera
-    from drgs.viewing.layers import ColorScale
+    from drgs.viewing.layers import ColorScale, Drawing, Drawings
     from drgs.viewing.subject import Subject
     from drgs.viewing.worker import Worker
 
@@ -58,7 +58,8 @@ class Session:
         worker: Computes.
         preset: How it is drawn at first.
         pixels: Of a picture, at most.
-        wants: Called with the session when its layer needs what is not known yet.
+        wants: Called when the layer needs what is not known yet.
+        learnt: The last subject whose uncertainty is known; None before there is one.
     """
 
     def __init__(
@@ -69,13 +70,16 @@ class Session:
         preset: str,
         pixels: int,
         wants: Callable[[], None],
+        learnt: Callable[[], Subject | None],
     ) -> None:
-        self.client, self.subject, self._worker, self._pixels, self._wants = client, subject, worker, pixels, wants
+        self.client, self.subject, self._worker, self._pixels = client, subject, worker, pixels
+        self._wants, self._learnt = wants, learnt
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
         self._wanted = 0
         self._is_closed, self.drawn = False, 0  # pictures that were drawn to the end
         self._is_over = False  # our picture lies there, and the Gaussians are hidden
+        self.scale: ColorScale | None = None  # of the picture that lies there
         self._gaussians: Any = None
         self._timer: asyncio.TimerHandle | None = None
         self._playing: asyncio.Task | None = None
@@ -158,14 +162,18 @@ class Session:
         names = tuple(layer.name for layer in subject.layers)
         if names != tuple(self._layer.options):
             self._layer.options = names
-        self._hide()
+        if keeps := self._lacks_uncertainty() and self._learnt() is not None:
+            self._wants()  # an earlier checkpoint's map, and what is half drawn of it, stays until there is another
+        else:
+            self._hide()
         self.time = subject.moment(self.time)
         if subject.times != before.times:
             self._build_times()
         self._send_gaussians()
         if subject.stations is not before.stations:
             self._show_stations()
-        self._ask_later()
+        if not keeps:
+            self._ask_later()
 
     def say(self, text: str, scale: ColorScale | None = None) -> None:
         """Say in the panel what is being done, or shown. From any thread."""
@@ -174,7 +182,7 @@ class Session:
 
     def redraw(self) -> None:
         """Draw what is shown once more: something that it needs has become known."""
-        self._ask_later()
+        self._ask_later(0.0)
 
     def close(self) -> None:
         """The browser has gone."""
@@ -378,7 +386,7 @@ class Session:
         with self._lock:
             self._wanted += 1
             if self._is_over:
-                self._is_over = False
+                self._is_over, self.scale = False, None
                 with self.client.atomic():
                     self._clear()
                     if self._gaussians is not None:
@@ -397,38 +405,76 @@ class Session:
         if not self._ours.value:
             self.say("")
             return
-        uncertainty = self.subject.uncertainty
-        if self.layer.name == INFORMATION and uncertainty is not None and not uncertainty.is_known:
+        subject = self.subject
+        if self._lacks_uncertainty():
             self._wants()
-            return
+            if (earlier := self._learnt()) is None or earlier.layer(UNCERTAINTY).name != UNCERTAINTY:
+                return
+            subject = earlier
         with self._lock:
             self._wanted += 1
             wanted = self._wanted
         # What is drawn is settled here: when the job begins, another subject may be looked at, at another time.
-        whole = camera_of(self.pose, *self.size, self.subject.origin, self.time)
-        steps = self._picture(wanted, self.subject, whole, self.layer, self._preset.value)
+        pose = dataclasses.replace(self.pose, position=self.pose.position + self.subject.origin)
+        whole = camera_of(pose, *self.size, np.zeros(3), subject.moment(self.time))
+        steps = self._picture(wanted, subject, whole, subject.layer(self.layer.name), self._preset.value)
         self._worker.put((self, "picture"), steps)
 
     def _picture(self, wanted: int, subject: Subject, whole: Camera, layer: Layer, preset: str) -> Iterator[None]:
         """Job: pictures of what the camera sees, each larger than the one before."""
-        began, settings = time.perf_counter(), subject.settings(preset)
+        began, settings, rate = time.perf_counter(), subject.settings(preset), 0.0
+        of = f" of {subject.state}" if subject is not self.subject and subject.state else ""
         for camera in stages(whole, min(self._pixels, layer.pixels or self._pixels)):
-            self.say(f"{layer.name}, {preset}: drawing {camera.width}x{camera.height} ...")
-            drawing = yield from layer.draw(subject.scene, camera, settings)
+            text, pixels, since = f"{layer.name}{of}, {preset}: ", camera.width * camera.height, time.perf_counter()
+            drawing = yield from self._told(
+                layer.draw(subject.scene, camera, settings),
+                f"{text}drawing {camera.width}x{camera.height}",
+                rate * pixels,
+            )
+            rate = (time.perf_counter() - since) / pixels
             with self._lock:
                 if wanted != self._wanted:
                     return
-                self._is_over = True
+                self._is_over, self.scale = True, drawing.scale
                 with self.client.atomic():
                     self.client.scene.set_background_image(drawing.picture, format="png")
                     if self._gaussians is not None:
                         self._gaussians.visible = False
             took = time.perf_counter() - began
-            self.say(f"{layer.name}, {preset}: {camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
+            self.say(f"{text}{camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
             yield
         self.drawn += 1
+
+    def _told(self, steps: Drawings, text: str, expected: float) -> Generator[None, None, Drawing]:
+        """Steps of a drawing, saying how much of it is done, and how long the rest will take.
+
+        Args:
+            text: What is drawn.
+            expected: Seconds, by the pixels of a picture before it; 0 where there was none.
+        """
+        self.say(f"{text}, about {_seconds(expected)} ..." if expected else f"{text} ...")
+        began = time.perf_counter()
+        while True:
+            try:
+                share = next(steps)
+            except StopIteration as end:
+                return end.value
+            left = (time.perf_counter() - began) * (1 - share) / share
+            if share < 1:
+                self.say(f"{text}: {share:.0%}, about {_seconds(left)} left ...")
+            yield
+
+    def _lacks_uncertainty(self) -> bool:
+        """Whether what is to be shown is not known yet."""
+        uncertainty = self.subject.uncertainty
+        return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_known
 
     def _seen_pose(self) -> tuple[Pose, tuple[int, int]] | None:
         """Where the client's camera is, and the pixels of its window; None where it has said nothing that is one."""
         camera = self.client.camera
         return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
+
+
+def _seconds(seconds: float) -> str:
+    """How long, in words as exact as an estimate is."""
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{max(1, round(seconds))} s"
