@@ -292,7 +292,8 @@ def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:
         ValueError: If it is no checkpoint, damaged, or of another schema version.
     """
     with _opened_state(Path(path)) as (file, header):
-        return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (no dict)
+        # Copies: these are views of the file, which ends the process where another program cuts it short meanwhile.
+        return {name: file.get_tensor(name).clone() for name in file.keys()}, header  # noqa: SIM118 (no dict)
 
 
 def state_header(path: str | os.PathLike) -> dict:

@@ -297,6 +297,19 @@ def settings_of_viewers(settings: RenderSettings) -> RenderSettings | None:
     return None if settings == viewers else viewers
 
 
+def viewers_hint(settings: RenderSettings) -> str:
+    """What a fit trains for, if viewers of PLY files will show another picture, and how to train for them; else ""."""
+    if settings_of_viewers(settings) is None:
+        return ""
+    name, differences = settings.nearest_preset()
+    changed = f" with {', '.join(f'{field}={value}' for field, value in differences.items())}" if differences else ""
+    wanted = f"preset {VIEWERS}" if name != VIEWERS else f"preset {VIEWERS} alone"
+    return (
+        f"this fit trains for preset {name}{changed}; viewers of PLY files draw with preset {VIEWERS}, whose picture "
+        f"of it will differ, most where Gaussians are smaller than a pixel; {wanted} trains for viewers"
+    )
+
+
 def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:
     """How Gaussians look in the viewers of PLY files, which draw with the rasterizers' model, not with `settings`.
 

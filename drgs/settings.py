@@ -157,6 +157,17 @@ class RenderSettings:
             raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
         return cls().replace(**{**table[name], **overrides})
 
+    def nearest_preset(self) -> tuple[str, dict[str, Any]]:
+        """Name of the preset from which, whatever the background, the fewest fields differ, `fast` among equals, and
+        these fields.
+        """
+        differences = {}
+        for name in ("fast", *PRESETS):
+            preset = self.preset(name, background=self.background)
+            fields = [field.name for field in dataclasses.fields(self)]
+            differences[name] = {x: getattr(self, x) for x in fields if getattr(self, x) != getattr(preset, x)}
+        return min(differences.items(), key=lambda found: len(found[1]))
+
     def replace(self, **fields: Any) -> RenderSettings:
         """A copy with the given fields replaced; unknown names raise ValueError."""
         known = {f.name for f in dataclasses.fields(self)}

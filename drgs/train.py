@@ -174,6 +174,8 @@ def _fit(
 
     loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured)
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
+        if hint := metrics.viewers_hint(config.settings):
+            bar.note(hint)
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
     moved = None

@@ -311,6 +311,23 @@ def test_state_round_trips(tmp_path):
     assert all(torch.equal(tensors[name], value) for name, value in state.items())
 
 
+def test_a_state_is_no_view_of_its_file(tmp_path):
+    """Who has loaded a checkpoint keeps its values, whatever is copied over the file afterwards: a viewer of a run goes
+    on. Mapped memory would end the process.
+    """
+    x = torch.arange(1 << 20, dtype=torch.float32)
+    save_state(tmp_path / "a.safetensors", {"x": x}, {})
+    code = """if True:
+        import os, sys
+        from drgs.files import load_state
+        tensors, _ = load_state(sys.argv[1])
+        os.truncate(sys.argv[1], 0)
+        print(float(tensors["x"][-1]))
+    """
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.safetensors"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"{float(x[-1])}\n"), done.stderr[-300:]
+
+
 def test_bad_states_are_refused(tmp_path):
     """Missing, damaged and foreign checkpoints each have their line."""
     path = tmp_path / "s.safetensors"

@@ -152,31 +152,26 @@ def test_fit_says_how_viewers_show_it(dataset, tmp_path, preset, capsys):
 
 
 def test_a_fit_says_first_what_viewers_will_show(tmp_path, capsys, monkeypatch):
-    """`drgs fit` says which preset it trains for, what viewers draw with and how to train for them, before it reads
-    a photograph; nothing with the viewers' own preset, nor with --quiet.
+    """A fit says which preset it trains for, what viewers draw with and how to train for them, before its first step;
+    nothing with the viewers' own preset, nor without progress.
     """
     write_still(tmp_path / "data")
-    read = drgs.commands.fit.load_dataset
-
-    def reading(*arguments, **options):
-        print("reading", file=sys.stderr)
-        return read(*arguments, **options)
-
-    monkeypatch.setattr(drgs.commands.fit, "load_dataset", reading)
+    step = Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda self: (print("stepping", file=sys.stderr), step(self))[1])
 
     def said(*options):
         name = str(tmp_path / f"run{len(list(tmp_path.iterdir()))}")
         words = ["fit", str(tmp_path / "data"), "-o", name, "--max-steps", "1", "--no-report", *options]
         assert cli.main(words) == 0
-        return capsys.readouterr().err.partition("reading")[0].splitlines()
+        return [line for line in capsys.readouterr().err.partition("stepping")[0].splitlines() if "viewers" in line]
 
     (hint,) = said()
     assert hint.startswith("this fit trains for preset fast; viewers of PLY files draw with preset gsplat")
-    assert hint.endswith("; --preset gsplat trains for viewers")
+    assert hint.endswith("; preset gsplat trains for viewers")
     (hint,) = said("--preset", "gsplat", "--set", "dilation=0.1")
-    assert hint.startswith("this fit trains for preset gsplat with --set dilation=0.1; ")
-    assert hint.endswith("; --preset gsplat alone trains for viewers")
-    assert said("--preset", "gsplat") == said("--quiet") == []
+    assert hint.startswith("this fit trains for preset gsplat with dilation=0.1; ")
+    assert hint.endswith("; preset gsplat alone trains for viewers")
+    assert said("--preset", "gsplat", "--background", "1", "1", "1") == said("--quiet") == []
 
 
 def test_viewers_widen_what_is_small():

@@ -29,8 +29,7 @@ class Sfm(Common):
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match all pairs, or neighbors by name (video); auto decides by their number."""
     masks: str | None = None
-    """Features only where the object is, which was turned or moved: a folder with NAME.png or NAME.EXT.png of every
-    photograph, white is kept, or alpha: their own alpha channel."""
+    """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
     seed: int = 0
     """Seed of all random sampling."""
 

@@ -151,8 +151,7 @@ class Seen(Settings, Around, Views):
 
     scene: SceneFile
     cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json or selection.json, or orbit; default a run's own,
-    else orbit."""
+    """A data set, a run, a cameras.json or selection.json, or orbit; default a run's own, else orbit."""
     split: Split = "all"
     """Which views of a data set."""
     limit: int = 2

@@ -76,8 +76,7 @@ class Render(Settings, Around, Views, Moments):
 
     scene: SceneFile
     cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json or selection.json, or orbit; default orbit, or with
-    --view the run."""
+    """A data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run."""
     output: OutputPath = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None
@@ -210,8 +209,7 @@ class Fisher(Comparing):
     """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
 
     cameras: str | None = None
-    """Views to draw maps for: a data set, a run, a cameras.json or selection.json, orbit, or dome; default the known
-    ones."""
+    """Views to draw maps for: a data set, a run, a cameras.json or selection.json, orbit or dome; default those known."""
     output: OutputPath = Path("out/fisher")
     """Folder for information.safetensors, fisher.json and the maps."""
     limit: int = 4
@@ -275,8 +273,7 @@ class Query(Settings, Around, Views):
     preset: Preset = "fast"
     """Render settings of a named system."""
     cameras: str | None = None
-    """A data set, a run (its photographs' cameras), a cameras.json or selection.json, or orbit; default a run's own,
-    else orbit."""
+    """A data set, a run, a cameras.json or selection.json, or orbit; default a run's own, else orbit."""
     split: Split = "all"
     """Which views of a data set."""
     limit: int = 4

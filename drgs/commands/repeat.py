@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-import typing
 from pathlib import Path
 from typing import Any
 
 from drgs.commands.options import Fit
 from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.settings import Preset, RenderSettings
+from drgs.settings import RenderSettings
 
 __all__ = ["fit_command"]
 
@@ -45,15 +44,9 @@ def fit_command(config: FitConfig, active: ActiveConfig | None, data: Path, outp
 
 def _settings(settings: RenderSettings) -> list[str]:
     """The preset that is nearest, and what replaces its fields."""
-    differences = {}
-    for name in typing.get_args(Preset):
-        preset = RenderSettings.preset(name, background=settings.background)
-        fields = [field.name for field in dataclasses.fields(RenderSettings)]
-        differences[name] = {x: getattr(settings, x) for x in fields if getattr(settings, x) != getattr(preset, x)}
-    usual = Fit.preset
-    nearest = min(differences, key=lambda name: (len(differences[name]), name != usual))
-    words = [] if nearest == usual else ["--preset", nearest]
-    for name, value in differences[nearest].items():
+    nearest, differences = settings.nearest_preset()
+    words = [] if nearest == Fit.preset else ["--preset", nearest]
+    for name, value in differences.items():
         words += ["--set", f"{name}={_value(value)}"]
     return words + _option("background", settings.background, RenderSettings.background)
 

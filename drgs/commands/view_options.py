@@ -21,8 +21,7 @@ class View(Informed, Around, Views):
     scene: Positional[Path]
     """A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md)."""
     train: str | None = None
-    """Views whose cameras are shown, and that are known: a data set, a run, a cameras.json or a selection.json; default
-    the run's."""
+    """Known views, whose cameras are shown: a data set, a run, a cameras.json or selection.json; default the run's."""
     selection: Path | None = None
     """Scores of cameras, as drgs select writes them; default those of the run, if it chose its views."""
     blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ("geometry", "backdrop")
