@@ -209,7 +209,7 @@ class Fisher(Comparing):
     """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
 
     cameras: str | None = None
-    """Views to draw maps for: a data set, a run, a cameras.json or selection.json, orbit or dome; default those known."""
+    """Views to draw maps for: a data set, a run, a cameras.json or selection.json, orbit or dome; default the known."""
     output: OutputPath = Path("out/fisher")
     """Folder for information.safetensors, fisher.json and the maps."""
     limit: int = 4
