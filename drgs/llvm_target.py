@@ -18,6 +18,15 @@ LANES = (4, 8, 16)  # what Mitsuba's ray tracing on a CPU, Embree, takes
 # Without FMA LLVM has no instruction for Dr.Jit's fused products, calls a function that nothing provides, and Dr.Jit
 # aborts the process at the first kernel. All else that an older processor lacks LLVM replaces.
 _NEEDED = {"x86_64": ("fma",), "amd64": ("fma",)}
+# LLVM's names of processors with 64 bits, and whether they have FMA. Of a name that it does not know LLVM makes one of
+# 32 bits, and aborts.
+_PROCESSORS = {
+    **dict.fromkeys(("x86-64", "x86-64-v2", "nehalem", "westmere", "sandybridge", "ivybridge", "btver2"), False),
+    **dict.fromkeys(("x86-64-v3", "x86-64-v4", "haswell", "broadwell", "skylake", "alderlake"), True),
+    **dict.fromkeys(("skylake-avx512", "cascadelake", "icelake-server", "sapphirerapids"), True),
+    **dict.fromkeys(("znver1", "znver2", "znver3", "znver4", "znver5"), True),
+    **dict.fromkeys(("generic", "cortex-a76", "neoverse-n1", "neoverse-v1", "apple-m1", "apple-m2"), True),
+}
 _WRITTEN = re.compile(r"(?P<cpu>[\w.-]+)/(?P<lanes>\d+)(?:/(?P<features>[+-][\w.-]+(?:,[+-][\w.-]+)*))?")
 
 
@@ -66,11 +75,11 @@ def compile_for(text: str, where: str) -> None:
         ValueError: If it is not written so, the lanes are none of `LANES`, or this Dr.Jit cannot be told.
     """
     found = _WRITTEN.fullmatch(text)
-    if found is None or int(found["lanes"]) not in LANES:
+    if found is None or int(found["lanes"]) not in LANES or found["cpu"] not in _PROCESSORS:
         lanes = ", ".join(map(str, LANES))
         raise ValueError(
             f"{where} must be CPU/LANES or CPU/LANES/FEATURES with lanes of {lanes}, such as haswell/8 or "
-            f"x86-64-v2/4/+fma, got {text!r}"
+            f"x86-64-v2/4/+fma, got {text!r}; CPU is one of {', '.join(_PROCESSORS)}"
         )
     try:
         choose = _core()._Z19jit_llvm_set_targetPKcS0_j
@@ -83,9 +92,12 @@ def compile_for(text: str, where: str) -> None:
 
 def missing_features(target: Target | None) -> list[str]:
     """Names of the instructions that Dr.Jit's kernels need and this target lacks; none where that is not known."""
-    if target is None or target.features is None:
+    needed = _NEEDED.get(platform.machine().lower(), ())
+    if target is None:
         return []
-    return [name for name in _NEEDED.get(platform.machine().lower(), ()) if f"+{name}" not in target.features]
+    if _PROCESSORS.get(target.cpu, target.features is None):  # what the name says, features may take away
+        return [name for name in needed if f"-{name}" in (target.features or ())]
+    return [name for name in needed if f"+{name}" not in (target.features or ())]
 
 
 def _core() -> ctypes.CDLL:

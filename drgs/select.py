@@ -143,12 +143,17 @@ def _returned(policy: str, pool: Pool, found: object) -> Selection:
         raise ValueError(
             f"{where}: picks must be k = {pool.k} different ones of {count} candidates, got indices {indices}; {advice}"
         )
-    if np.shape(scores) != (count,) or not np.issubdtype(np.asarray(scores).dtype, np.number):
+    try:
+        plain = scores.detach().cpu() if isinstance(scores, torch.Tensor) else scores
+        numbers = np.asarray(plain, dtype=np.float64) if not np.iscomplexobj(plain) else np.empty(0)
+    except (TypeError, ValueError, NotImplementedError):  # lists of other lengths, text; a tensor on `meta`
+        numbers = np.empty(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise ValueError(
-            f"{where}: scores must be a number for each of {count} candidates, got {kind_of(scores)}; "
+            f"{where}: scores must be a finite number for each of {count} candidates, got {kind_of(scores)}; "
             "before the first pick, in their order"
         )
-    found.scores = [float(x) for x in scores]  # plain, as files hold them
+    found.scores = numbers.tolist()  # plain, as files hold them
     for name, one in (("parts", found.parts), ("unseen", found.unseen)):
         if not isinstance(one, list) or len(one) not in (0, count):
             raise ValueError(

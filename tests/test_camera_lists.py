@@ -10,7 +10,7 @@ import pytest
 from test_active import SIZE, config, lazily, plan, write_still
 
 from drgs import cli
-from drgs.cameras import orbit
+from drgs.cameras import Camera, orbit
 from drgs.data import load
 from drgs.data.camera_lists import described, is_camera_list, load_cameras_json, save_cameras_json
 from drgs.files import save_ply
@@ -122,6 +122,19 @@ def test_files_without_cameras(tmp_path, place, capsys, text, message):
     assert message in told
     assert str(path) in told
     assert told.count("\n") == 1
+
+
+def test_a_data_set_is_no_list_of_cameras(tmp_path):
+    """Whatever the first key of a transforms.json is; an empty list of cameras hides no picks."""
+    (tmp_path / "transforms.json").write_text('{"cameras": [], "fl_x": 10, "frames": [{"file_path": "a.png"}]}')
+    assert not is_camera_list(tmp_path / "transforms.json")
+    camera = Camera(K=np.diag([9.0, 9, 1]), w2c=np.eye(4), width=4, height=4, name="a")
+    path = tmp_path / "selection.json"
+    path.write_text(
+        json.dumps({"schema": 1, "command": "select", "cameras": [], "picks": [{"camera": described(camera)}]})
+    )
+    assert is_camera_list(path)
+    assert [camera.name for camera in load_cameras_json(path)] == ["a"]
 
 
 def test_a_camera_that_is_a_name_is_no_pose(tmp_path):

@@ -213,3 +213,11 @@ def test_command_says_it(tmp_path, monkeypatch, capsys):
     assert view["error"]["pattern"] == "factor"
     assert view["error"]["what"] == "the image of preset gsplat, times 0.75"
     assert view["error"]["box"] == [0, 0, 31, 23]
+
+
+def test_where_nothing_counts_there_is_no_error(rng):
+    """Nothing is divided by an error of 0."""
+    image, alpha = rng.random((6, 5, 3)), np.ones((6, 5))
+    for wrong, counts in ((image, np.ones((6, 5), bool)), (image + 1, np.zeros((6, 5), bool))):
+        found = pattern_of(wrong, image, alpha, (0.0, 0.0, 0.0), counts)
+        assert (found.name, found.what) == ("none", "no error where pixels count")

@@ -396,13 +396,14 @@ print(drgs.render(g, orbit((0, 0, 0), 3.0, 1, width=8, height=8)[0]).rgb.isfinit
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
-def test_a_processor_without_fma_is_refused():
+@pytest.mark.parametrize("target", ["nehalem/4", "x86-64-v2/8", "nehalem/4/+sse4.2,-avx,-fma", "haswell/8/-fma"])
+def test_a_processor_without_fma_is_refused(target):
     """Dr.Jit would print the code of the first kernel, two thousand lines, and abort."""
-    done = _python(RENDER, DRGS_LLVM_TARGET="nehalem/4/+sse4.2,-avx,-fma", DRGS_VARIANT="llvm_ad_rgb")
+    done = _python(RENDER, DRGS_LLVM_TARGET=target, DRGS_VARIANT="llvm_ad_rgb")
     assert done.returncode == 1, done.stderr[-500:]
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith("ValueError: drgs: the processor must have FMA, ")
-    assert "got nehalem without; use another machine" in last
+    assert f"got {target.split('/')[0]} without; use another machine" in last
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
@@ -413,7 +414,7 @@ def test_compiled_for_another_processor():
     assert done.stdout.splitlines() == ["True", "{'cpu': 'x86-64-v2', 'lanes': 4}"], done.stderr[-500:]
 
 
-@pytest.mark.parametrize("text", ["haswell", "haswell/3", "haswell/8/fma", "/8", "haswell/eight"])
+@pytest.mark.parametrize("text", ["haswell", "haswell/3", "haswell/8/fma", "/8", "haswell/eight", "haswel/8"])
 def test_targets_are_written_in_one_way(text):
     with pytest.raises(ValueError, match=r"DRGS_LLVM_TARGET must be CPU/LANES or CPU/LANES/FEATURES .* got") as refused:
         llvm_target.compile_for(text, "drgs: DRGS_LLVM_TARGET")

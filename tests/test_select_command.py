@@ -269,8 +269,15 @@ def test_data_set_with_absent_images(place, tmp_path, monkeypatch, capsys, caplo
         ("Selection([0], scores)", "picks must be a list of Pick, got a list of 1 (int); make picks with pool.pick("),
         ("Selection([pool.pick(0, 1)] * 2, scores)", "picks must be k = 1 different ones of 5 candidates, got indices"),
         ("Selection([Pick(7, '', 1.0, {}, None)], scores)", "of 5 candidates, got indices [7]"),
-        ("Selection([pool.pick(0, 1)], [1.0])", "scores must be a number for each of 5 candidates, got a list of 1"),
-        ("Selection([pool.pick(0, 1)], [None] * 5)", "scores must be a number for each of 5 candidates, got a list"),
+        (
+            "Selection([pool.pick(0, 1)], [1.0])",
+            "scores must be a finite number for each of 5 candidates, got a list of 1",
+        ),
+        ("Selection([pool.pick(0, 1)], [None] * 5)", "scores must be a finite number for each of 5 candidates, got a"),
+        ("Selection([pool.pick(0, 1)], scores * np.nan)", "scores must be a finite number for each of 5 candidates"),
+        ("Selection([pool.pick(0, 1)], scores + 1j)", "scores must be a finite number for each of 5 candidates, got"),
+        ("pool.pick(99, 1.0)", "index must be one of 5 candidates and score a finite number, got 99 and 1.0; count"),
+        ("pool.pick(0, [1, 2])", "index must be one of 5 candidates and score a finite number, got 0 and [1, 2]"),
         ("Selection([pool.pick(0, 1)], scores, parts=[{}])", "parts must be a list for each of 5 candidates, or empty"),
     ],
 )
@@ -287,7 +294,7 @@ def test_a_policy_that_returns_something_else(place, tmp_path, monkeypatch, caps
     line = ["select", f"{place}/run", "--candidates", f"{place}/data", "-o", f"{tmp_path}/out.json", "--policy"]
     assert cli.main([*line, "odd_policy:chosen"]) == 2
     told = capsys.readouterr().err
-    assert told.startswith("drgs select: policy odd_policy:chosen: ")
+    assert told.startswith(("drgs select: policy odd_policy:chosen: ", "drgs select: Pool.pick: "))
     assert message in told
     assert told.count("\n") == 1
     assert not (tmp_path / "out.json").exists()

@@ -141,6 +141,26 @@ def test_the_least_recently_used_goes_first(still):
     assert (len(cache), cache.bytes, cache.evictions) == (3, 300, 2)
 
 
+def test_a_call_within_a_call_takes_nothing_of_it(still):
+    """Another call that computes the same views meanwhile, as another Python thread may: every view keeps its own
+    answer, in this call and in the cache.
+    """
+    g, cameras = still
+    cache, inner = Cache(), []
+
+    def meanwhile(done, total):
+        if not inner:
+            inner.append(None)
+            select(g, cameras[6:9], cameras[:2], settings=FAST, cache=cache)
+
+    expected = select(g, cameras[2:9], cameras[:2], settings=FAST).scores
+    within = select(g, cameras[2:9], cameras[:2], settings=FAST, cache=cache, progress=meanwhile).scores
+    assert within == pytest.approx(expected, rel=1e-5)
+    assert select(g, cameras[2:9], cameras[:2], settings=FAST, cache=cache).scores == pytest.approx(expected, rel=1e-5)
+    assert len({round(score, 9) for score in expected}) == len(expected)
+    assert cache.bytes == sum(x.nbytes for answer in cache._answers.values() for x in answer.values())
+
+
 def test_a_scene_that_changes_leaves_nothing(still):
     """A map that grows between calls: all is computed anew, and nothing of the old one is kept."""
     g, cameras = still

@@ -12,6 +12,7 @@ from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
+from drgs.data.mapping import _gaps, runs
 from drgs.data.sfm import run_sfm
 
 pytest.importorskip("pycolmap")
@@ -232,6 +233,29 @@ def test_bad_masks(masked, tmp_path, capfd, bad):
     assert re.search(message, complaint)
     assert complaint.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_name_that_leaves_no_room_for_its_mask(masked, tmp_path, capfd):
+    """COLMAP wants .png behind the photo's name, and file systems end names at 255 bytes."""
+    from drgs import cli
+
+    photos, _ = masked
+    first = sorted(photos.iterdir())[0]
+    first.rename(photos / ("a" * 248 + first.suffix))
+    line = ["sfm", str(photos), "-o", str(tmp_path / "out"), "--masks", "alpha", "--quiet"]
+    assert cli.main(line) == 2
+    complaint = capfd.readouterr().err
+    assert "with masks, the name of a photo must have at most 251 bytes, got 252: aaa" in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_names_in_words():
+    """However many photographs are left out, a line stays a line."""
+    names = [f"{i:04d}" for i in range(100)]
+    assert runs(names[3:9] + names[20:22], names) == "0003 to 0008, 0020, 0021"
+    assert runs(names[::2], names).endswith("0020, 0022, and 38 more")
+    found = _gaps(names, {"0010", "0011"}, [["0013"], ["0000", "0001"], ["0050"]], {("0050", "0011"): 7})
+    assert found == [("0011", "0050", 7), ("0011", "0013", 0), ("0010", "0001", 0)]
 
 
 def test_masks_of_others_stay(masked, tmp_path):

@@ -141,6 +141,10 @@ def test_few_cameras_before_what_moves_are_told_of(caplog, count, told, is_movin
         for index, camera in enumerate(around)
         for time in (0.0, 0.5, 1.0)
     ]
+    for view in views if count > 1 else ():  # stands whose cameras are calibrated anew for every time
+        view.camera = dataclasses.replace(
+            view.camera, w2c=view.camera.w2c + 1e-5 * (view.camera.time or 0) * np.eye(4, k=3)
+        )
     check_cameras(views)
     assert (f"the {3 * count} training views of 3 times are from {count} places only" in caplog.text) == (
         told and is_moving

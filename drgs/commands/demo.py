@@ -218,7 +218,8 @@ def _still_life() -> ModuleType:
         from drgs.scenes import still_life
     except ImportError:
         raise FileNotFoundError(
-            "demo: the package `scenes` must be installed, it is not; run `pip install -e .` in a checkout"
+            "demo: drgs/scenes must be a link to the folder scenes, it is not; clone with links (git config "
+            "core.symlinks true), or install the wheel"
         ) from None
     return still_life
 

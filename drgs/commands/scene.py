@@ -49,7 +49,8 @@ def run(args: Scene) -> None:
         maker = importlib.import_module(f"drgs.scenes.{args.name}")
     except ImportError:
         raise FileNotFoundError(
-            "scene: the package `scenes` must be installed, it is not; run `pip install -e .` in a checkout"
+            "scene: drgs/scenes must be a link to the folder scenes, it is not; clone with links (git config "
+            "core.symlinks true), or install the wheel"
         ) from None
     with Bar("path tracing", show=not args.quiet) as bar:
         folder = maker.generate(args.output, **numbers, progress=bar.update)

@@ -32,6 +32,7 @@ _DESCRIBED = {
     "model": str,
     "distortion": [float],
 }
+_LOOKED_AT = 1 << 20  # bytes of a file, where a transforms.json has its frames
 _LISTS = ("cameras", "picks", "views")
 _OURS = re.compile(rb'\{\s*("schema"\s*:\s*\d+\s*,\s*)?"(command|cameras)"\s*:')  # how such an object begins
 _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position": [float], "rotation": [[float]]}
@@ -95,7 +96,7 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
 def _entries(path: Path, found: object) -> list[tuple[str, Any]]:
     """(where it stands, camera as parsed) of each camera of a file."""
     if isinstance(found, dict):
-        lists = {key: found[key] for key in _LISTS if isinstance(found.get(key), list)}
+        lists = {key: found[key] for key in _LISTS if isinstance(found.get(key), list) and found[key]}
         key = next(iter(lists), "")
         rows = [row.get("camera", row) if isinstance(row, dict) else row for row in lists.get(key, ())]
         if not rows or any(not isinstance(row, dict) for row in rows):
@@ -136,7 +137,9 @@ def is_camera_list(path: Path) -> bool:
         return path.name == "cameras.json"
     with path.open("rb") as file:
         start = file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
-    return start.startswith(b"[") or _OURS.match(start) is not None
+    if start.startswith(b"["):
+        return True
+    return _OURS.match(start) is not None and b'"frames"' not in path.read_bytes()[:_LOOKED_AT]
 
 
 def described(camera: Camera) -> dict:

@@ -6,6 +6,7 @@ What goes on then is in COLMAP's log, which is followed here in a file.
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import itertools
 import re
@@ -23,6 +24,7 @@ __all__ = ["PhotoGroups", "map_photos", "runs"]
 _EVERY = 0.25  # seconds between two looks at the log
 _FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
 _ADVISED = 3  # gaps that are named
+_STRETCHES = 12  # of names that follow each other
 
 # What COLMAP's log says -> what that is. Lines that are not known, of another version, change nothing.
 _DOING = {
@@ -138,11 +140,12 @@ def _followed(folder: Path, told: _Told) -> Iterator[None]:
             is_last = is_over.wait(_EVERY)
             # The log keeps lines back for half a minute, until its file is closed: another one takes its place.
             log.set_log_destination(log.Level.INFO, "" if is_last else str(folder / f"log.{number + 1}."))
-            for file in folder.glob(f"log.{number}.*"):
-                for found in map(_LINE.match, file.read_bytes().splitlines()):
-                    if found:
-                        told.line(found[1].decode("utf-8", "replace"))
-                file.unlink()
+            with contextlib.suppress(OSError):  # without the log it is told how long it takes, not what is being done
+                for file in folder.glob(f"log.{number}.*"):
+                    for found in map(_LINE.match, file.read_bytes().splitlines()):
+                        if found:
+                            told.line(found[1].decode("utf-8", "replace"))
+                    file.unlink()
             if is_last:
                 return
             told.still()
@@ -180,11 +183,11 @@ class PhotoGroups:
     def of(database: Path, names: Sequence[str], kept: set[str], others: Sequence[set[str]]) -> PhotoGroups:
         """The parts of all `names`, in their order, as the database's matches connect them."""
         others = sorted(others, key=len, reverse=True)
-        alone = tuple(name for name in names if name not in kept.union(*others))
+        placed = kept.union(*others)
+        alone = tuple(name for name in names if name not in placed)
         features, matches = _evidence(database)
         lost = [[name for name in names if name in other - kept] for other in others] + [[name] for name in alone]
-        gaps = [_gap(names, kept, group, matches) for group in lost if group]
-        gaps.sort(key=lambda gap: -gap[2])
+        gaps = _gaps(names, kept, [group for group in lost if group], matches)
         return PhotoGroups(
             kept=tuple(sorted(kept)),
             others=tuple(tuple(sorted(other)) for other in others),
@@ -251,21 +254,36 @@ def _evidence(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int
     return features, matches
 
 
-def _gap(
-    names: Sequence[str], kept: set[str], group: Sequence[str], matches: dict[tuple[str, str], int]
-) -> tuple[str, str, int]:
-    """Where a group of photographs is nearest to the kept ones: by verified matches, else by place in the list."""
-    best = ("", "", 0)
+def _gaps(
+    names: Sequence[str], kept: set[str], lost: Sequence[Sequence[str]], matches: dict[tuple[str, str], int]
+) -> list[tuple[str, str, int]]:
+    """Where each lost group is nearest to the kept photographs, by verified matches, else by place in the list; the
+    best first.
+    """
+    groups_of: dict[str, list[int]] = {}
+    for number, group in enumerate(lost):
+        for name in group:
+            groups_of.setdefault(name, []).append(number)
+    best: list[tuple[str, str, int]] = [("", "", 0)] * len(lost)
     for (a, b), count in matches.items():
-        if b in kept:
-            a, b = b, a
-        if a in kept and b in group and count > best[2]:
-            best = (a, b, count)
-    if best[2]:
-        return best
+        ours, theirs = (a, b) if a in kept else (b, a)
+        for number in groups_of.get(theirs, ()) if ours in kept else ():
+            if count > best[number][2]:
+                best[number] = ours, theirs, count
     place = {name: index for index, name in enumerate(names)}
-    theirs, ours = min(((b, a) for b in group for a in kept), key=lambda pair: abs(place[pair[0]] - place[pair[1]]))
-    return ours, theirs, 0
+    ordered = sorted(place[name] for name in kept)
+    for number, group in enumerate(lost):
+        if not best[number][2]:
+            near = [(abs(place[name] - at), at, name) for name in group for at in _around(ordered, place[name])]
+            _, at, theirs = min(near)
+            best[number] = names[at], theirs, 0
+    return sorted(best, key=lambda gap: -gap[2])
+
+
+def _around(ordered: Sequence[int], at: int) -> Sequence[int]:
+    """Of places in rising order, those next to one."""
+    right = bisect.bisect(ordered, at)
+    return ordered[max(0, right - 1) : right + 1]
 
 
 def runs(some: Sequence[str], names: Sequence[str]) -> str:
@@ -277,6 +295,6 @@ def runs(some: Sequence[str], names: Sequence[str]) -> str:
             stretches[-1].append(name)
         else:
             stretches.append([name])
-    return ", ".join(
-        f"{stretch[0]} to {stretch[-1]}" if len(stretch) > 2 else ", ".join(stretch) for stretch in stretches
-    )
+    shown = [f"{part[0]} to {part[-1]}" if len(part) > 2 else ", ".join(part) for part in stretches[:_STRETCHES]]
+    rest = sum(map(len, stretches[_STRETCHES:]))
+    return ", ".join([*shown, f"and {rest} more"] if rest else shown)

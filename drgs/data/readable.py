@@ -19,13 +19,14 @@ __all__ = ["check_names", "readable_photos"]
 
 _QUALITY = 98  # of JPEG, for what has been compressed before
 _SHOWN = 5
+_LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
 
 _log = logging.getLogger(__name__)
 
 
-def check_names(folder: Path, names: list[str]) -> None:
-    """Refuse names that a COLMAP model cannot hold: several lines, or bytes that are not UTF-8; say which photographs
-    are hidden, and left out.
+def check_names(folder: Path, names: list[str], masked: bool = False) -> None:
+    """Refuse names that a COLMAP model cannot hold: several lines, or bytes that are not UTF-8; with masks, whose names
+    are those and `.png`, also too long ones. Say which photographs are hidden, and left out.
 
     Raises:
         ValueError: There is one.
@@ -34,6 +35,11 @@ def check_names(folder: Path, names: list[str]) -> None:
         if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
             raise ValueError(
                 f"{folder}: the name of a photo must be one line of UTF-8, got {name[:80]!r}; rename this photo"
+            )
+        if masked and len(name.encode()) > _LONGEST:
+            raise ValueError(
+                f"{folder}: with masks, the name of a photo must have at most {_LONGEST} bytes, got "
+                f"{len(name.encode())}: {name[:40]}...; rename this photo and its mask"
             )
     # Those of ._ are no photographs, but what macOS notes about them on other systems.
     hidden = [p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and re.match(r"\.(?!_)", p.name)]

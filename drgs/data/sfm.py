@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drgs.data.checks import image_size, list_images
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
@@ -108,7 +110,7 @@ def run_sfm(
     if not image_dir.is_dir():
         raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]
-    check_names(image_dir, names)
+    check_names(image_dir, names, masked=masks is not None)
     if len(names) < 2:
         raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
     if camera_model not in CAMERA_MODELS:
@@ -155,7 +157,9 @@ def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial:
         pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
         for file, image in ((partial / "masks" / f"{name}.png", kept), (partial / "photos" / name, pixels)):
             suffix = file.suffix.lower()
-            if suffix not in (".png", ".tif", ".tiff", ".bmp"):  # COLMAP goes by the content, and decodes no WebP
+            if image.dtype != np.uint8:  # whatever its name: COLMAP goes by the content, and JPEG has 8 bits
+                suffix = ".png"
+            elif suffix not in (".png", ".tif", ".tiff", ".bmp"):  # COLMAP decodes no WebP
                 suffix = ".jpg"
             best = [cv2.IMWRITE_JPEG_QUALITY, 100] if suffix == ".jpg" else []
             file.write_bytes(cv2.imencode(suffix, image, best)[1].tobytes())

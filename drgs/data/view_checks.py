@@ -104,8 +104,13 @@ def check_cameras(views: list[View]) -> None:
     """
     times = {view.camera.time for view in views} - {None}
     centers = np.stack([view.camera.center for view in views])
-    tiny = 1e-6 * max(1.0, float(np.abs(centers).max()))
-    places = len(np.unique(np.round(centers / tiny), axis=0))
+    # Cameras on stands may have been calibrated anew for every time.
+    near = max(1e-3 * float(np.ptp(centers, axis=0).max()), 1e-6 * max(1.0, float(np.abs(centers).max())))
+    found: list[np.ndarray] = []
+    for center in centers:
+        if len(found) < _FEW_PLACES and all(np.abs(center - other).max() > near for other in found):
+            found.append(center)
+    places = len(found)
     if len(times) >= 2 and 2 <= places < _FEW_PLACES:
         _log.warning(
             "the %d training views of %d times are from %d places only: from others it will look far worse than "

@@ -60,6 +60,7 @@ _HEADER = {
     "config": dict,
     "point_source": str,
 }
+_OF_A_PICK = ("number", "step", "index")  # by which an event of the log is a pick of the checkpoint
 _TIMED = ("train", "preview", "checkpoint", "done")  # events whose `seconds` are those of all steps so far
 _ACTIVE = {"config": dict, "pool": [str], "picks": [{"number": int, "step": int, **_VIEW}]}
 
@@ -207,11 +208,11 @@ def seconds_of(run: Run, header: dict) -> float | None:
 def pick_seconds(run: Run, picks: list[dict]) -> list[dict]:
     """The picks of a checkpoint with what choosing each took, by `log.jsonl`; 0 where that does not say."""
     times = {
-        (event.get("number"), event.get("step"), event.get("index")): event["seconds"]
+        tuple(str(event.get(name)) for name in _OF_A_PICK): event["seconds"]
         for event in _logged(run)
         if event["event"] == "pick" and _is_time(event.get("seconds"))
     }
-    known = [times.get((pick["number"], pick["step"], pick["index"]), 0.0) for pick in picks]
+    known = [times.get(tuple(str(pick[name]) for name in _OF_A_PICK), 0.0) for pick in picks]
     return [{"seconds": seconds, **pick} for pick, seconds in zip(picks, known, strict=True)]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -22,7 +23,8 @@ __all__ = ["Cache", "camera_key", "size_of", "value_key"]
 
 class Cache:
     """What views tell, kept while the scene does not change, in a bounded number of bytes: of colors, 4 bytes a
-    parameter and view, and with the block `backdrop` 4 bytes a pixel.
+    parameter and view, and with the block `backdrop` 4 bytes a pixel. A call holds what it has found until it is used,
+    so that up to twice as many bytes are alive meanwhile.
 
     Forgets everything when it is asked about another scene than last time. A scene is another one if a tensor of its
     `parameters()` has come, gone, been replaced, or been changed in place by torch, or if its origin differs; one that
@@ -52,6 +54,7 @@ class Cache:
             raise ValueError(f"Cache: max_bytes must be at least 0, got {max_bytes}; 0 keeps nothing")
         self._answers: OrderedDict[Hashable, Information] = OrderedDict()  # the one that was used last comes last
         self._scene: _State | None = None
+        self._lock = threading.RLock()  # several Python threads may select at a time
         self.max_bytes, self.bytes = max_bytes, 0
         self.hits = self.misses = self.evictions = 0
 
@@ -66,42 +69,53 @@ class Cache:
 
     def invalidate(self) -> None:
         """Forget everything."""
-        self._answers.clear()
-        self.bytes = 0
-        self._scene = None
+        with self._lock:
+            self._answers.clear()
+            self.bytes = 0
+            self._scene = None
 
     def find(self, scene: Scene, key: Hashable) -> Information | None:
         """What is stored under a key for this scene, which is a hit; None if nothing is."""
-        if self._scene is None or not self._scene.is_still(scene):
-            self.invalidate()
-            self._scene = _State(scene)
-        if key not in self._answers:
-            return None
-        self._answers.move_to_end(key)
-        self.hits += 1
-        return self._answers[key]
+        with self._lock:
+            if self._scene is None or not self._scene.is_still(scene):
+                self.invalidate()
+                self._scene = _State(scene)
+            if key not in self._answers:
+                return None
+            self._answers.move_to_end(key)
+            self.hits += 1
+            return self._answers[key]
 
-    def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
-        """What is stored under a key for this scene, else what `compute` returns.
+    def keep(self, scene: Scene, key: Hashable, answer: Information) -> None:
+        """Store what was computed, which is a miss.
 
         Args:
-            scene: As it is now.
-            key: Of all else that the information depends on: what is computed, its options, settings and camera.
-            compute: Called where nothing is stored.
+            scene: That it was computed of; if another one was asked about since, nothing is stored.
+            key: Of all else that it depends on: what is computed, its options, settings and camera.
+            answer: The information.
         """
+        with self._lock:
+            self.misses += 1
+            if self._scene is None or not self._scene.is_still(scene):
+                return
+            if (before := self._answers.pop(key, None)) is not None:  # computed twice, by two calls at a time
+                self.bytes -= size_of(before)
+            if (size := size_of(answer)) > self.max_bytes:
+                self.evictions += 1
+                return
+            self._answers[key] = answer
+            self.bytes += size
+            while self.bytes > self.max_bytes:
+                _, oldest = self._answers.popitem(last=False)
+                self.bytes -= size_of(oldest)
+                self.evictions += 1
+
+    def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
+        """What is stored under a key for this scene, else what `compute` returns, which is then kept."""
         if (found := self.find(scene, key)) is not None:
             return found
         found = compute()
-        self.misses += 1
-        if (size := size_of(found)) > self.max_bytes:
-            self.evictions += 1
-            return found
-        self._answers[key] = found
-        self.bytes += size
-        while self.bytes > self.max_bytes:
-            _, oldest = self._answers.popitem(last=False)
-            self.bytes -= size_of(oldest)
-            self.evictions += 1
+        self.keep(scene, key, found)
         return found
 
 

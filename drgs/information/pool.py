@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
+import math
+import operator
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
@@ -292,13 +293,12 @@ class Pool:
         last = {key: i for i, key in enumerate(keys)}
         coming = self._computed([views[first[key]] for key, found in held.items() if found is None])
 
-        def new(i: int) -> Information:
-            return accept(i, next(coming))
-
         for i, key in enumerate(keys):
             found = held.pop(key)
             if found is None:
-                found = cache.get(self.scene, key, functools.partial(new, i))
+                # Never looked up again: another call may have stored it meanwhile, and the next answer is this one's.
+                found = accept(i, next(coming))
+                cache.keep(self.scene, key, found)
             elif i > first[key]:
                 cache.hits += 1  # the same view once more
             if i < last[key]:
@@ -312,5 +312,19 @@ class Pool:
         return (view.question(self.scene, view.camera, view.mask) for view in views)
 
     def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:
-        """A `Pick` with plain numbers."""
-        return Pick(int(index), self.candidates[index].name, float(score), dict(parts or {}), margin)
+        """A `Pick` with plain numbers.
+
+        Raises:
+            ValueError: If there is no such candidate, or the score is no finite number.
+        """
+        count = len(self.candidates)
+        try:
+            place, number = operator.index(index), float(score)
+        except (TypeError, ValueError, RuntimeError):
+            place, number = -1, math.nan
+        if not 0 <= place < count or not math.isfinite(number):
+            raise ValueError(
+                f"Pool.pick: index must be one of {count} candidates and score a finite number, got "
+                f"{str(index)[:40]} and {str(score)[:40]}; count candidates from 0"
+            )
+        return Pick(place, self.candidates[place].name, number, dict(parts or {}), margin)

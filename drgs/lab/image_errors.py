@@ -144,6 +144,8 @@ def pattern_of(
         counts: (H, W) bool, the pixels that count.
     """
     case = _Case(*(np.asarray(x, np.float64) for x in (wrong, right, alpha, background)), np.asarray(counts, bool))
+    if not np.any((case.wrong - case.right)[case.counts]):
+        return Pattern("none", "no error where pixels count", math.nan)
     found = sorted(_changes(case), key=lambda pattern: list(PATTERNS).index(pattern.name))
     best = max(pattern.explained for pattern in found)
     if best >= _FOUND:
@@ -216,6 +218,8 @@ def _transfers(case: _Case) -> Iterator[tuple]:
 def _moves(case: _Case) -> Iterator[tuple]:
     """A shift, and one with a magnification, by Gauss-Newton on the difference of the images."""
     height, width = case.counts.shape
+    if min(height, width) < 2:  # no window for the correlation
+        return
     y, x = np.mgrid[:height, :width].astype(np.float64)
     x, y = x - (width - 1) / 2, y - (height - 1) / 2
     pair = (np.ascontiguousarray(image.mean(-1)) for image in (case.right, case.wrong))
