@@ -24,7 +24,7 @@ pytest.importorskip("viser", reason="no viser: pip install 'drgs[view]'")
 
 from test_select_command import place  # noqa: F401 (a data set, and a run that chose its views)
 from test_semantic_fit import dataset, run, taught  # noqa: F401 (a run with features)
-from viewing_client import Client, gaussians
+from viewing_client import Client, decoded, gaussians
 
 import drgs
 from drgs import cli, fisher, gain
@@ -544,16 +544,17 @@ def uncertain(seed: int, hold, calls: list[int]) -> Subject:
 def test_a_map_that_was_begun_is_finished(viewers):
     """Checkpoints that come while the photographs are added up stop nothing: the map of the first is shown, with its
     step, then that of the last one; those between are passed over, and no photograph is added twice."""
-    begun, go, calls = threading.Event(), threading.Event(), []
+    begun, go, calls, drawn = threading.Event(), threading.Event(), [], []
 
     def hold():
+        (session,) = viewer.sessions.values()
         if len(calls) == 2:  # until the checkpoints have come
+            drawn.append(session.drawn)
             begun.set()
             assert go.wait(60)
-        if len(calls) == 4:  # until the map of the first is asked for, or, after the picture of colors, drawn already
-            (session,) = viewer.sessions.values()
+        if len(calls) == 4:  # until the browser has asked for the map of the first, or has it already
             end = time.monotonic() + 60
-            while not viewer.worker.has((session, "picture")) and session.drawn < 2 and time.monotonic() < end:
+            while not viewer.worker.has((session, "picture")) and session.drawn == drawn[0] and time.monotonic() < end:
                 time.sleep(0.01)
 
     subjects = [uncertain(seed, hold, calls) for seed in (1, 2, 3)]
@@ -570,8 +571,8 @@ def test_a_map_that_was_begun_is_finished(viewers):
         at = len(client.heard)
         go.set()
         html(client, "uncertainty of step 1, fast: ", after=at)
-        html(client, "uncertainty, fast: ", after=at)
-        picture = client.picture(after=len(client.heard) - 3)
+        html(client, "uncertainty, fast: 51x38 in ", after=at)
+        picture = decoded([m for m in client.heard if m["type"] == "BackgroundImageMessage"][-1])
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], np.zeros(3))
         wanted, _ = map_colors(subjects[2].uncertainty.map(camera))
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0
