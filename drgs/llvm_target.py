@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import functools
 import platform
 import re
 import sys
@@ -17,15 +18,16 @@ __all__ = ["LANES", "Target", "compile_for", "compiled_for", "missing_features"]
 LANES = (4, 8, 16)  # what Mitsuba's ray tracing on a CPU, Embree, takes
 # Without FMA LLVM has no instruction for Dr.Jit's fused products, calls a function that nothing provides, and Dr.Jit
 # aborts the process at the first kernel. All else that an older processor lacks LLVM replaces.
-_NEEDED = {"x86_64": ("fma",), "amd64": ("fma",)}
-# LLVM's names of processors with 64 bits, and whether they have FMA. Of a name that it does not know LLVM makes one of
-# 32 bits, and aborts.
-_PROCESSORS = {
-    **dict.fromkeys(("x86-64", "x86-64-v2", "nehalem", "westmere", "sandybridge", "ivybridge", "btver2"), False),
-    **dict.fromkeys(("x86-64-v3", "x86-64-v4", "haswell", "broadwell", "skylake", "alderlake"), True),
-    **dict.fromkeys(("skylake-avx512", "cascadelake", "icelake-server", "sapphirerapids"), True),
-    **dict.fromkeys(("znver1", "znver2", "znver3", "znver4", "znver5"), True),
-    **dict.fromkeys(("generic", "cortex-a76", "neoverse-n1", "neoverse-v1", "apple-m1", "apple-m2"), True),
+_NEEDED = "fma"
+# LLVM's names of x86-64 processors, and the features that a machine must have for them. Of a name that it does not
+# know LLVM makes a processor of 32 bits, and aborts.
+_PROCESSORS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("x86-64", "x86-64-v2", "nehalem", "westmere"), ()),
+    **dict.fromkeys(("sandybridge", "ivybridge"), ("avx",)),
+    **dict.fromkeys(("x86-64-v3", "haswell", "broadwell", "skylake", "alderlake"), ("avx2", _NEEDED)),
+    **dict.fromkeys(("znver1", "znver2", "znver3"), ("avx2", _NEEDED)),
+    **dict.fromkeys(("x86-64-v4", "skylake-avx512", "cascadelake"), ("avx512vl", _NEEDED)),
+    **dict.fromkeys(("icelake-server", "sapphirerapids", "znver4", "znver5"), ("avx512vbmi2", _NEEDED)),
 }
 _WRITTEN = re.compile(r"(?P<cpu>[\w.-]+)/(?P<lanes>\d+)(?:/(?P<features>[+-][\w.-]+(?:,[+-][\w.-]+)*))?")
 
@@ -63,41 +65,53 @@ def compiled_for() -> Target | None:
 
 
 def compile_for(text: str, where: str) -> None:
-    """Compile what comes for another processor than this machine's, to get the digits that it gets.
+    """Compile what comes for another x86-64 processor than this machine's, to get the digits that it gets.
 
-    Sums depend in their last bits on the instructions and on the lanes of a packet. The processor must have the
-    instructions: those of a newer one end the process.
+    Sums depend in their last bits on the instructions and on the lanes of a packet.
 
     Args:
         text: `CPU/LANES` or `CPU/LANES/FEATURES` as LLVM names them: `haswell/8`, `x86-64-v2/4/+fma`.
         where: What an error begins with.
     Raises:
-        ValueError: If it is not written so, the lanes are none of `LANES`, or this Dr.Jit cannot be told.
+        ValueError: If it is not written so, the lanes are none of `LANES`, this machine lacks instructions, or this
+            Dr.Jit cannot be told.
     """
-    found = _WRITTEN.fullmatch(text)
+    found, here = _WRITTEN.fullmatch(text), _own()
+    if here is None or here.features is None or not _is_x86():
+        raise ValueError(f"{where} must be left out but on x86-64 with Dr.Jit 1.5, got {platform.machine()}")
     if found is None or int(found["lanes"]) not in LANES or found["cpu"] not in _PROCESSORS:
         lanes = ", ".join(map(str, LANES))
         raise ValueError(
             f"{where} must be CPU/LANES or CPU/LANES/FEATURES with lanes of {lanes}, such as haswell/8 or "
             f"x86-64-v2/4/+fma, got {text!r}; CPU is one of {', '.join(_PROCESSORS)}"
         )
-    try:
-        choose = _core()._Z19jit_llvm_set_targetPKcS0_j
-    except (OSError, AttributeError):
-        raise ValueError(f"{where} must be left out with this version of Dr.Jit, which takes no target") from None
-    choose.argtypes, choose.restype = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32), None
     features = found["features"]
+    wanted = [*_PROCESSORS[found["cpu"]], *(x[1:] for x in (features or "").split(",") if x.startswith("+"))]
+    if absent := [name for name in wanted if f"+{name}" not in here.features]:
+        raise ValueError(f"{where} must be of instructions that {here.cpu} has, got {text!r} with {', '.join(absent)}")
+    choose = _core()._Z19jit_llvm_set_targetPKcS0_j
+    choose.argtypes, choose.restype = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32), None
     choose(found["cpu"].encode(), None if features is None else features.encode(), int(found["lanes"]))
 
 
-def missing_features(target: Target | None) -> list[str]:
+def missing_features(target: Target) -> list[str]:
     """Names of the instructions that Dr.Jit's kernels need and this target lacks; none where that is not known."""
-    needed = _NEEDED.get(platform.machine().lower(), ())
-    if target is None:
+    if not _is_x86():
         return []
-    if _PROCESSORS.get(target.cpu, target.features is None):  # what the name says, features may take away
-        return [name for name in needed if f"-{name}" in (target.features or ())]
-    return [name for name in needed if f"+{name}" not in (target.features or ())]
+    stated = target.features or ()
+    if _NEEDED in _PROCESSORS.get(target.cpu, ()):  # the name says it; features may take it away
+        return [_NEEDED] if f"-{_NEEDED}" in stated else []
+    return [] if f"+{_NEEDED}" in stated else [_NEEDED]
+
+
+@functools.cache
+def _own() -> Target | None:
+    """This machine's target: first asked for before another one is chosen."""
+    return compiled_for()
+
+
+def _is_x86() -> bool:
+    return platform.machine().lower() in ("x86_64", "amd64")
 
 
 def _core() -> ctypes.CDLL:

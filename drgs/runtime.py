@@ -400,7 +400,7 @@ def _refuse_processor() -> None:
     if wanted := os.environ.get("DRGS_LLVM_TARGET"):
         compile_for(wanted, "drgs: DRGS_LLVM_TARGET")
     target = compiled_for()
-    if target and (missing := missing_features(target)):
+    if target is not None and (missing := missing_features(target)):
         raise ValueError(
             f"drgs: the processor must have {' and '.join(missing).upper()}, as Intel's have since Haswell (2013) and "
             f"AMD's since Piledriver (2012), got {target.cpu} without; use another machine, in a virtual one the "

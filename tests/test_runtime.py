@@ -414,8 +414,25 @@ def test_compiled_for_another_processor():
     assert done.stdout.splitlines() == ["True", "{'cpu': 'x86-64-v2', 'lanes': 4}"], done.stderr[-500:]
 
 
-@pytest.mark.parametrize("text", ["haswell", "haswell/3", "haswell/8/fma", "/8", "haswell/eight", "haswel/8"])
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
+def test_a_processor_newer_than_this_one_is_refused(monkeypatch):
+    """Its instructions would end the process; a target is chosen of what the machine has, however often."""
+    runtime.backend()
+    old = llvm_target.Target("haswell", 8, ("+avx2", "+fma"))
+    monkeypatch.setattr(llvm_target, "_own", lambda: old)
+    with pytest.raises(ValueError, match=r"DRGS_LLVM_TARGET must be of instructions that haswell has, got .*avx512vl"):
+        llvm_target.compile_for("x86-64-v4/16", "drgs: DRGS_LLVM_TARGET")
+    code = RENDER + "drgs.runtime.setup(threads=1)\ndrgs.runtime.setup(threads=2)\n" + RENDER
+    done = _python(code, DRGS_LLVM_TARGET="haswell/8", DRGS_VARIANT="llvm_ad_rgb")
+    assert done.stdout.split() == ["True", "True"], done.stderr[-500:]
+
+
+@pytest.mark.parametrize(
+    "text", ["haswell", "haswell/3", "haswell/8/fma", "/8", "haswell/eight", "haswel/8", "generic/8"]
+)
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
 def test_targets_are_written_in_one_way(text):
+    runtime.backend()
     with pytest.raises(ValueError, match=r"DRGS_LLVM_TARGET must be CPU/LANES or CPU/LANES/FEATURES .* got") as refused:
         llvm_target.compile_for(text, "drgs: DRGS_LLVM_TARGET")
     assert repr(text) in str(refused.value)

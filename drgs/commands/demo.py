@@ -11,7 +11,6 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +19,7 @@ import torch
 from drgs import metrics, reference, runtime
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.commands.report import report_of
+from drgs.commands.scene import maker_of
 from drgs.data import load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -116,7 +116,7 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
     Returns:
         What demo.json holds.
     Raises:
-        FileNotFoundError: If the package `scenes` is not installed.
+        FileNotFoundError: In a checkout without links.
         ValueError: If something is in the way that an earlier demo did not make.
     """
     with (
@@ -140,7 +140,7 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
         return seconds[stage]
 
     start = time.perf_counter()
-    still_life = _still_life()
+    still_life = maker_of("still_life")
     size = {"views": plan.views, "width": plan.width, "height": plan.height, "spp": plan.spp}
     with Bar("path tracing", plan.views, progress) as bar:
         data = still_life.generate(out_dir / "still_life", **size, progress=lambda done, total: bar.update(done, total))
@@ -211,17 +211,6 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
     }
     write_json(out_dir / "demo.json", report)
     return report
-
-
-def _still_life() -> ModuleType:
-    try:
-        from drgs.scenes import still_life
-    except ImportError:
-        raise FileNotFoundError(
-            "demo: drgs/scenes must be a link to the folder scenes, it is not; clone with links (git config "
-            "core.symlinks true), or install the wheel"
-        ) from None
-    return still_life
 
 
 def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str, list[torch.Tensor]], list[PresetRow]]:

@@ -15,7 +15,7 @@ from drgs.display.progress import Bar
 if TYPE_CHECKING:
     from drgs.commands.making_options import Scene
 
-__all__ = ["run"]
+__all__ = ["maker_of", "run"]
 
 _ONLY = {  # options that not every scene has
     "--views": ("room", "still_life"),
@@ -45,17 +45,26 @@ def run(args: Scene) -> None:
         numbers |= _pair("--size", args.size, "width", "height")
     if args.teacher_size is not None:
         numbers |= _pair("--teacher-size", args.teacher_size, "teacher_width", "teacher_height")
-    try:
-        maker = importlib.import_module(f"drgs.scenes.{args.name}")
-    except ImportError:
-        raise FileNotFoundError(
-            "scene: drgs/scenes must be a link to the folder scenes, it is not; clone with links (git config "
-            "core.symlinks true), or install the wheel"
-        ) from None
+    maker = maker_of(args.name)
     with Bar("path tracing", show=not args.quiet) as bar:
         folder = maker.generate(args.output, **numbers, progress=bar.update)
     if not args.quiet:
         _say(args.name, folder, maker, numbers)
+
+
+def maker_of(name: str) -> ModuleType:
+    """The module that makes a data set.
+
+    Raises:
+        FileNotFoundError: In a checkout without links.
+    """
+    try:
+        return importlib.import_module(f"drgs.scenes.{name}")
+    except ImportError:
+        raise FileNotFoundError(
+            "drgs/scenes must be a link to the folder scenes, it is not; clone with links (git config core.symlinks "
+            "true), or install the wheel"
+        ) from None
 
 
 def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, int]) -> None:

@@ -50,6 +50,7 @@ _STEEP = 0.1  # of the pixels: those of the largest gradient
 _FEW = 0.05  # of the pixels
 _SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)  # of blurs, in pixels
 _MOVES = 20  # steps of the search for a shift, each about squares the error of the one before
+_MOVED = 1e-4  # pixels that the last of these steps moves something by
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,9 +236,12 @@ def _moves(case: _Case) -> Iterator[tuple]:
                     break
                 down, across = np.gradient(made, axis=(0, 1))
                 slopes = [-across, -down, -(across * x[..., None] + down * y[..., None])][:count]
-                table = np.stack([slope[use].ravel() for slope in slopes], 1)
-                step = np.linalg.lstsq(table, (case.wrong - made)[use].ravel(), rcond=None)[0]
-                move[:count] += step.clip(-2, 2)
+                table = np.stack([slope[use].ravel() for slope in slopes])
+                square, right = table @ table.T, table @ (case.wrong - made)[use].ravel()
+                step = np.linalg.lstsq(square, right, rcond=None)[0].clip(-2, 2)  # of a flat image no move is best
+                move[:count] += step
+                if np.abs(step * (1, 1, max(width, height))[:count]).max() < _MOVED:
+                    break
             move[:2] = move[:2].clip(-width, width)
             made, known = _moved(case.right, move)
             if (case.counts & known).sum() > 0.25 * case.counts.sum():
