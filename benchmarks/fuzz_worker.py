@@ -43,7 +43,7 @@ WATCHED = [
 """Modules whose lines atheris watches."""
 _NEWS = 2.0  # seconds between counts
 _IN_MEMORY = ("alloc", "out of memory", "memory for", "insufficient memory")
-_ENDED = "the process that reads it ended with"  # drgs/data/children.py
+_ENDED = "the process that reads it ended with"  # drgs/data/reader_process.py
 _LARGEST = 1 << 16  # bytes of an input that atheris chooses
 
 

@@ -73,7 +73,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     import torch
 
     from drgs.ellipsoids import Gaussians
-    from drgs.guards.doors import check_path
+    from drgs.guards.inputs import check_path
 
     path = check_path("load_ply", path)
     names = _check_ply(path)
@@ -168,7 +168,7 @@ def save_ply(
     """
     import plyfile
 
-    from drgs.guards.doors import check_path, check_scene
+    from drgs.guards.inputs import check_path, check_scene
 
     if isinstance(g, str | os.PathLike):
         raise ArgumentError("save_ply: gaussians must come first and the path second, got a path first; swap them")

@@ -30,7 +30,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Scene
 from drgs.gain import METHODS, Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.doors import (
+from drgs.guards.inputs import (
     Masks,
     check_any_scene,
     check_scene,

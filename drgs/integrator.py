@@ -20,7 +20,7 @@ from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.doors import cameras_of_one_size, check_scene, check_view, gaussians_at
+from drgs.guards.inputs import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
 from drgs.tracing.bridge import differentiable, own_errors
 from drgs.tracing.call import Call, Output

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from drgs.guards.doors import check_oracle
+from drgs.guards.inputs import check_oracle
 from drgs.oracle import (
     activate,
     cull_near,

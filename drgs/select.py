@@ -26,8 +26,8 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.gain import CRITERIA, METHODS, Information
 from drgs.guards.arguments import kind_of, must_be
-from drgs.guards.doors import Masks, camera_list, check_any_scene, mask_list
 from drgs.guards.imports import imported_function
+from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.cache import Cache
 from drgs.information.pool import Pick, Pool, Scoring, Selection, Workers
 from drgs.policies.informed import coverage, fisher, fisherrf, moments

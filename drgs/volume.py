@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from drgs.guards.doors import check_oracle
+from drgs.guards.inputs import check_oracle
 from drgs.oracle import activate, cull_near, float64, sh_colors, take, view_rays, within
 from drgs.settings import EPS_ALPHA, RenderSettings
 

@@ -15,7 +15,7 @@ from drgs.data import load
 from drgs.data.camera_lists import described, is_camera_list, load_cameras_json, save_cameras_json
 from drgs.files import save_ply
 from drgs.train import fit
-from drgs.viewing.stations import read_ranking
+from drgs.viewing.placed_views import read_ranking
 
 
 @pytest.fixture(scope="module")

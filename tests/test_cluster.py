@@ -33,7 +33,7 @@ from drgs.cluster import connect, parcels
 from drgs.cluster.agreement import Disagreement, check_agreement, statement
 from drgs.cluster.cells import run_cells_on
 from drgs.cluster.connect import opened
-from drgs.cluster.parcels import Missing, Parcel, keep, opened_parcel
+from drgs.cluster.payloads import Missing, Parcel, keep, opened_parcel
 from drgs.cluster.wanted import check_address
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply

@@ -21,8 +21,8 @@ from drgs import cli
 from drgs.cameras import orbit
 from drgs.codecs import load_gaussians, save_gaussians
 from drgs.commands.convert import label_column, still, uncertainty_columns
-from drgs.commands.given import Given
 from drgs.commands.options import Convert
+from drgs.commands.scene_input import SceneInput
 from drgs.data.camera_lists import save_cameras_json
 from drgs.features.segmentation import Classes
 from drgs.files import load_ply, load_state, save_ply, save_state
@@ -179,7 +179,7 @@ def test_information_that_the_command_wrote(tmp_path, monkeypatch):
 def test_labels_are_those_of_the_largest_cosine(tmp_path, caplog):
     """A byte a Gaussian, and the names in the header."""
     g, names = scene(), ("wall", "chair", "lamp  post\nend_header")
-    given = Given(g, decoder=decoder(), classes=Classes(names, embeddings()))
+    given = SceneInput(g, decoder=decoder(), classes=Classes(names, embeddings()))
     labels, comments = label_column(Path("run"), given, g)
     save_gaussians(g, tmp_path / "a.ply", extra={"label": labels}, comments=comments)
     ply = plyfile.PlyData.read(tmp_path / "a.ply")
@@ -196,7 +196,7 @@ def test_labels_are_those_of_the_largest_cosine(tmp_path, caplog):
 def test_a_scene_that_moves_is_converted_at_a_time(tmp_path):
     """Of a run whose Gaussians move, --time says when; without it, the command that writes all times is named."""
     scene_ = dynamic(scene().replace(features=None), None)
-    given = Given(scene_.gaussians, moving=scene_)
+    given = SceneInput(scene_.gaussians, moving=scene_)
     args = Convert(scene=tmp_path / "run", out=tmp_path / "a.ply", time=0.7)
     found = still(args, given)
     assert torch.equal(found.means, scene_.at(0.7).means)
@@ -273,7 +273,7 @@ def test_an_export_of_splatfacto(tmp_path):
 
 @pytest.mark.parametrize("name", ["scene.spz", "scene.sog", "folder"])
 def test_commands_take_every_format(tmp_path, rng, monkeypatch, capsys, name):
-    """`drgs render` draws what `drgs.render` would; the same door (`Given.at`) is that of all commands."""
+    """`drgs render` draws what `drgs.render` would; the same door (`SceneInput.at`) is that of all commands."""
     monkeypatch.chdir(tmp_path)
     if name == "folder":
         (tmp_path / name).mkdir()

@@ -11,7 +11,7 @@ import pytest
 from test_data import save, write_colmap, write_llff, write_transforms
 
 from drgs import cli
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json
 from drgs.data.checks import read_image
@@ -65,7 +65,7 @@ def test_an_unbundled_sog_is_known_by_its_folder_and_by_its_index(tmp_path):
     (tmp_path / "meta.json").write_bytes(META)
     for path in (tmp_path, tmp_path / "meta.json"):
         with pytest.raises(ValueError, match=r"meta.json: means must have the key 'maxs'"):  # it is being read
-            Given.at(path)
+            SceneInput.at(path)
     with pytest.raises(ValueError, match="is the index of an unbundled SOG scene.*; convert it with `drgs convert"):
         load_ply(tmp_path / "meta.json")
 

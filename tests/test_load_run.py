@@ -10,7 +10,7 @@ import torch
 from test_resume import dataset, made, run  # noqa: F401 (fixtures)
 
 from drgs import cli
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.files import load_ply, load_state, save_ply, save_state
 from drgs.fitting.records import load_run
 
@@ -28,7 +28,7 @@ def test_checkpoint_and_ply_hold_the_same_bits(run, caplog):  # noqa: F811
     assert loaded.gaussians.sh_degree == load_ply(run.point_cloud).sh_degree
     assert not any(x.requires_grad for x in loaded.gaussians.parameters().values())
     assert (loaded.step, loaded.record.config.max_steps) == (6, 6)
-    assert equal(Given.at(run.path).gaussians, loaded.gaussians)
+    assert equal(SceneInput.at(run.path).gaussians, loaded.gaussians)
     assert not caplog.text
 
 

@@ -13,7 +13,7 @@ from scenes_random import camera, gaussians
 from test_network_information import swarm
 
 from drgs import cli, fisher, gain
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
 from drgs.information.maps import fisherrf_map
@@ -38,7 +38,7 @@ def place(tmp_path, monkeypatch):
     save_cameras_json(tmp_path / "known.json", views[:2])
     save_cameras_json(tmp_path / "cameras.json", views[2:])
     moving = swarm(g)
-    monkeypatch.setattr(Given, "at", classmethod(lambda cls, path: cls(g, moving=moving)))
+    monkeypatch.setattr(SceneInput, "at", classmethod(lambda cls, path: cls(g, moving=moving)))
     monkeypatch.chdir(tmp_path)
     return moving, views
 

@@ -9,8 +9,8 @@ import torch
 
 from drgs import Camera, Gaussians, load_ply, render, save_ply
 from drgs.cli import main
-from drgs.commands.given import Given
 from drgs.commands.query import read_embeddings
+from drgs.commands.scene_input import SceneInput
 from drgs.data.camera_lists import save_cameras_json
 from drgs.features.decoder import Decoder, save_decoder
 from drgs.features.query import TextQuery
@@ -150,7 +150,9 @@ def test_an_embedding_finds_its_gaussians_and_pixels(files, capsys):
     mask = cv2.imread(str(files / "out/left.mask.png"), cv2.IMREAD_GRAYSCALE)
     assert set(np.unique(mask)) == {0, 255}
     camera = Camera(K=np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), w2c=np.eye(4), width=48, height=32)
-    chair = render(g.take(slice(5, 9)), camera, Given(g).settings("fast")).alpha >= 0.5  # nothing is in front of it
+    chair = (
+        render(g.take(slice(5, 9)), camera, SceneInput(g).settings("fast")).alpha >= 0.5
+    )  # nothing is in front of it
     assert (mask > 0).sum() == int(chair.sum()) > 40
     np.testing.assert_array_equal(mask > 0, chair.numpy())
     report = json.loads((files / "out/query.json").read_text())
@@ -165,8 +167,8 @@ def test_an_embedding_finds_its_gaussians_and_pixels(files, capsys):
 
 def test_classes_of_a_run(files, monkeypatch, capsys):
     """A run's own decoder and classes are used; --class may be repeated, and says which classes there are."""
-    given = Given(scene(), decoder=decoder(), classes=Classes(NAMES, embeddings()))
-    monkeypatch.setattr("drgs.commands.query.Given.of", lambda args: given)
+    given = SceneInput(scene(), decoder=decoder(), classes=Classes(NAMES, embeddings()))
+    monkeypatch.setattr("drgs.commands.query.SceneInput.of", lambda args: given)
     assert query(files, "--class", "chair", "--class", "lamp", decoder=False) == 0
     assert "chair, lamp (largest cosine of 3 texts): 5 of 10 Gaussians" in capsys.readouterr().out
     assert len(load_ply(files / "out/selected.ply")) == 5
@@ -185,8 +187,8 @@ def test_a_short_fit_is_told_how_many_steps_it_needs(files, monkeypatch, capsys,
     g = scene().replace(features=torch.eye(WIDTH)[[0] * 10])  # all of them wall
     config = FitConfig(max_steps=max_steps, feature_rate=rate)
     record = FitRecord(data=files, train=(), test=(), config=config, is_active=False)
-    given = Given(g, record=record, step=step, decoder=decoder(), classes=Classes(NAMES, embeddings()))
-    monkeypatch.setattr("drgs.commands.query.Given.of", lambda args: given)
+    given = SceneInput(g, record=record, step=step, decoder=decoder(), classes=Classes(NAMES, embeddings()))
+    monkeypatch.setattr("drgs.commands.query.SceneInput.of", lambda args: given)
     assert query(files, "--class", "lamp", decoder=False) == 2
     error = capsys.readouterr().err
     assert "a Gaussian must be selected, none of 10 is (largest cosine of 3 texts; " in error

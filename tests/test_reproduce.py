@@ -270,7 +270,7 @@ def test_what_is_refused_leaves_nothing(still, tmp_path, capsys):
 def test_workers_get_whole_paths(tmp_path, monkeypatch):
     """What is sent to workers, which have working directories of their own, does not depend on this one."""
     pytest.importorskip("cloudpickle")
-    from drgs.cluster.parcels import Parcel
+    from drgs.cluster.payloads import Parcel
 
     sent = []
 

@@ -155,7 +155,7 @@ _OTHERS = {
     "codecs/gltf.py",  # the header of a .glb
     "commands/info.py",  # stdout
     "commands/repeat.py",  # options on a line of a report
-    "data/children.py",  # between processes
+    "data/reader_process.py",  # between processes
     "fitting/config.py",  # plain values
     "guards/json_files.py",  # a message
     "guards/locks.py",  # .drgs.lock

@@ -13,8 +13,8 @@ import drgs
 from drgs import cli, metrics
 from drgs.commands import render as render_command
 from drgs.commands.eval import run as run_eval
-from drgs.commands.given import Given
 from drgs.commands.options import Eval
+from drgs.commands.scene_input import SceneInput
 from drgs.data.checks import read_image
 from drgs.data.semantics import Semantics
 from drgs.display.pictures import write_png
@@ -422,7 +422,7 @@ def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, caps
     assert found["run"]["pixel_accuracy"] < found["teacher"]["pixel_accuracy"]  # after 6 steps
     assert all(0 <= view["pixel_accuracy"] <= 1 for view in run.metrics["views"])
     # All numbers are in one place, too: means of the images' metrics, and scores of the labels.
-    assert Given.at(run.run.path).step == run.metrics["step"] > 0
+    assert SceneInput.at(run.run.path).step == run.metrics["step"] > 0
     labels = {name: found["run"][name] for name in ("pixel_accuracy", "class_accuracy", "miou", "miou_top7")}
     assert run.metrics["scores"] == {**run.metrics["mean"], **labels}
     monkeypatch.setattr("drgs.data.load", lambda path, **_: taught)

@@ -29,8 +29,8 @@ from viewing_client import Client, decoded, gaussians
 import drgs
 from drgs import cli, fisher, gain
 from drgs.cameras import Camera, intrinsics, look_at, orbit
-from drgs.commands.given import Given
 from drgs.commands.options import View
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.data import load
 from drgs.display.pictures import map_colors
@@ -38,10 +38,10 @@ from drgs.files import load_state, save_state
 from drgs.viewing import panel
 from drgs.viewing.drawing import bands, drawn, stages
 from drgs.viewing.layers import layers_of, tinted
+from drgs.viewing.placed_views import Ranking, Score, Sight, Station, read_ranking, score_colors, stations_of
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.server import Viewer
 from drgs.viewing.splats import ClientGaussians
-from drgs.viewing.stations import Ranking, Score, Sight, Station, read_ranking, score_colors, stations_of
 from drgs.viewing.subject import FirstView, Subject
 from drgs.viewing.uncertainty import Uncertainty
 from drgs.viewing.worker import Worker
@@ -213,7 +213,7 @@ def test_layers_are_what_there_is(run):  # noqa: F811
     colors of `drgs render`, and paint the client's Gaussians, too."""
     plain = layers_of({}, None, 10_000)
     assert [layer.name for layer in plain] == ["rgb", "depth", "missing"]
-    given = Given.of(View(scene=run.run.path))
+    given = SceneInput.of(View(scene=run.run.path))
     looked = subject_of(View(scene=run.run.path), given)
     assert [layer.name for layer in looked.layers] == ["rgb", "depth", "missing", "features", "labels", "overlay"]
     camera = camera_of(looked.first.pose, 40, 30, looked.origin)
@@ -305,7 +305,7 @@ def test_worker_leaves_what_is_no_longer_wanted():
 def test_stations_of_a_run(place):  # noqa: F811
     """Views that were fitted to, and the others with the scores, parts and ranks that a selection states."""
     selection = json.loads((place / "run/selection.json").read_text())
-    looked = subject_of(View(scene=place / "run"), Given.of(View(scene=place / "run")))
+    looked = subject_of(View(scene=place / "run"), SceneInput.of(View(scene=place / "run")))
     by_name = {station.camera.name: station for station in looked.stations}
     assert sorted(by_name) == list("012345678")
     fitted = {view["name"] for key in ("start", "picks") for view in selection[key]}
@@ -337,7 +337,7 @@ def test_stations_of_drgs_select(place, monkeypatch, capsys):  # noqa: F811
     ranking = read_ranking(place / "orbit.json")
     assert (ranking.title, len(ranking.cameras), len(ranking.picked)) == ("fisher, eig", 5, 2)
     args = View(scene=place / "run", selection=place / "orbit.json")
-    looked = subject_of(args, Given.of(args))
+    looked = subject_of(args, SceneInput.of(args))
     candidates = [station for station in looked.stations if station.kind == "candidate"]
     assert len(candidates) == 5
     best = max(candidates, key=lambda station: station.best.score.total)
@@ -500,7 +500,7 @@ def test_two_browsers_have_each_their_own_camera(viewers):
 def test_uncertainty_is_added_up_once_and_shown(place, viewers):  # noqa: F811
     """Asked for, it says how far it is, and then shows the map of the view."""
     args = View(scene=place / "run", preset="fast")
-    looked = subject_of(args, Given.of(args))
+    looked = subject_of(args, SceneInput.of(args))
     viewer = viewers(looked)
     pose = looked.first.pose
     with Client(viewer.port) as client:
@@ -598,7 +598,7 @@ def test_a_long_picture_says_how_long(viewers):
 def test_a_click_flies_to_a_camera(place, viewers):  # noqa: F811
     """A click on a frustum moves the camera to where the photograph was taken, and shows what is known of it."""
     args = View(scene=place / "run", preset="fast")
-    looked = subject_of(args, Given.of(args))
+    looked = subject_of(args, SceneInput.of(args))
     viewer = viewers(looked)
     number = next(k for k, station in enumerate(looked.stations) if station.best.score and station.kind == "candidate")
     station = looked.stations[number]
@@ -664,7 +664,7 @@ def test_a_run_that_goes_on_is_shown(place, tmp_path, viewers):  # noqa: F811
     args = View(scene=tmp_path / "run", preset="fast")
     from drgs.commands.view import _reading, _stamps
 
-    viewer = viewers(subject_of(args, Given.of(args)))
+    viewer = viewers(subject_of(args, SceneInput.of(args)))
     before, pose = _stamps(watched_files(args)), viewer.subject.first.pose
     with Client(viewer.port) as client:
         client.look(pose.wxyz, pose.position)

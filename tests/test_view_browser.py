@@ -22,8 +22,8 @@ from test_view import EVIL, blobs, subject
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.commands import view
-from drgs.commands.given import Given
 from drgs.commands.options import View
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.files import load_state, save_state
 from drgs.viewing.poses import camera_of, pose_of
@@ -147,7 +147,7 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     """A click on a frustum flies there and opens what is known of it; a checkpoint that a fit writes meanwhile is
     noticed and shown, with its step."""
     args = View(scene=place / "run", preset="fast")
-    looked = subject_of(args, Given.of(args))
+    looked = subject_of(args, SceneInput.of(args))
     station = next(station for station in looked.stations if station.kind == "candidate")
     tip, middle = station.camera.center, looked.first.target
     body = tip + station.camera.c2w[:3, :3] @ np.array([0.0, 0.0, 0.1])
@@ -204,7 +204,7 @@ def test_a_phone_sees_the_scene(shown, place):  # noqa: F811
     """At 390x844 the panel leaves most of the window free, the first view has all of its width, and no frustum lies
     over a quarter of it; what is folded in the panel opens."""
     args = View(scene=place / "run", preset="fast")
-    looked = subject_of(args, Given.of(args))
+    looked = subject_of(args, SceneInput.of(args))
     viewer, page = shown(looked, 390, 844)
     page.wait_for_function("document.getElementById('drgs-status').getBoundingClientRect().bottom <= 844")
     top = page.evaluate("document.getElementById('drgs-header').getBoundingClientRect().top")

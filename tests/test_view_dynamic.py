@@ -11,8 +11,8 @@ from test_view import html, viewers  # noqa: F401
 from viewing_client import Client
 
 from drgs.commands import view
-from drgs.commands.given import Given
 from drgs.commands.options import View
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of
 from drgs.train import Trainer, fit
 
@@ -54,7 +54,7 @@ def test_a_run_becomes_dynamic_and_goes_on(stages, viewers, capfd):  # noqa: F81
         (run / "next").replace(run / "state.safetensors")
 
     now(still)
-    viewer = viewers(subject_of(args, Given.of(args)))
+    viewer = viewers(subject_of(args, SceneInput.of(args)))
     assert viewer.subject.times == ()
     pose = viewer.subject.first.pose
     with Client(viewer.port) as client:

@@ -9,8 +9,8 @@ from test_active import SIZE, write_still
 
 from drgs import cli
 from drgs.cameras import orbit
-from drgs.commands.given import Given
 from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import Source, drawn_views, known_views, other_views, seen_views
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import Run, save_ply
@@ -43,7 +43,7 @@ def given(place, command=Render, scene="run", **options):
     scene = place / scene if scene == "run" else place / "run/point_cloud.ply"
     needed = {"candidates": "orbit"} if command is Select else {}
     args = command(scene=scene, quiet=True, **(needed | options))
-    return args, Given.of(args)
+    return args, SceneInput.of(args)
 
 
 @pytest.mark.parametrize("command", [Render, Crossval, Tradeoff, Select, Fisher])
@@ -83,12 +83,12 @@ def test_a_run_without_its_log_is_one_for_every_option(place, tmp_path, command)
     with pytest.raises(
         FileNotFoundError, match=r"run: must be a run folder, found no config\.json of a fit; run `drgs fit`"
     ):
-        Given.at(tmp_path / "run")
+        SceneInput.at(tmp_path / "run")
     (tmp_path / "run/config.json").write_text("{")
     (tmp_path / "run/state.safetensors").write_text("")
     assert Source.of("--train", str(tmp_path / "run")).kind == "run"
     with pytest.raises(ValueError, match=r"config\.json: must be valid JSON"):
-        Given.at(tmp_path / "run")
+        SceneInput.at(tmp_path / "run")
 
 
 def test_kinds_of_sources(place):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.cluster.agreement import check_agreement, statement, this_worker
-from drgs.cluster.parcels import Missing, opened_parcel
+from drgs.cluster.payloads import Missing, opened_parcel
 from drgs.files import atomic_write
 from drgs.guards.locks import InUse, host_of
 from drgs.guards.writing import is_full

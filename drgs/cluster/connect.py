@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
 from drgs.cluster.agreement import Disagreement, check_agreement, statement, worker_name, worker_statement
-from drgs.cluster.parcels import Parcel, keep
+from drgs.cluster.payloads import Parcel, keep
 from drgs.cluster.views import answers
 from drgs.cluster.wanted import check_wanted
 from drgs.display.progress import Bar

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from drgs.cluster.agreement import check_agreement, statement, this_worker
-from drgs.cluster.parcels import Missing, Parcel, opened_parcel
+from drgs.cluster.payloads import Missing, Parcel, opened_parcel
 
 if TYPE_CHECKING:
     from distributed import Future

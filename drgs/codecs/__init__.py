@@ -68,7 +68,7 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
             not finite (the first index is named).
     """
     from drgs.codecs import gltf, ksplat, packed_ply, sog, splat, spz
-    from drgs.guards.doors import check_path
+    from drgs.guards.inputs import check_path
 
     path = check_path("load_gaussians", path)
     if path.is_dir():
@@ -112,7 +112,7 @@ def save_gaussians(
     """
     from drgs.codecs.gltf import encode_glb
     from drgs.codecs.spz import encode_spz
-    from drgs.guards.doors import check_path, check_scene
+    from drgs.guards.inputs import check_path, check_scene
 
     if isinstance(g, str | os.PathLike):
         raise ArgumentError(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs import check_suffix, load_gaussians, save_gaussians
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.display.progress import Bar
 from drgs.files import load_state
 from drgs.gain import Prior, check, variances
@@ -51,16 +51,16 @@ def run(args: Convert) -> None:
         )
 
 
-def _given(args: Convert) -> Given:
+def _given(args: Convert) -> SceneInput:
     """What is converted."""
     if not args.as_stored:
-        return Given.at(args.scene)
+        return SceneInput.at(args.scene)
     if args.scene.suffix.lower() != ".spz":
         raise ValueError(f"--as-stored must have an .spz, whose axes are others than those of a PLY, got {args.scene}")
-    return Given(load_gaussians(args.scene, as_stored=True))
+    return SceneInput(load_gaussians(args.scene, as_stored=True))
 
 
-def still(args: Convert, given: Given) -> Gaussians:
+def still(args: Convert, given: SceneInput) -> Gaussians:
     """The Gaussians; of a scene that moves, as they are at --time.
 
     Raises:
@@ -108,7 +108,7 @@ def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.
     return {f"uncertainty_{name}": x.reshape(len(g), -1).sum(1).sqrt().float().numpy() for name, x in found.items()}
 
 
-def label_column(path: Path, given: Given, g: Gaussians) -> tuple[np.ndarray, tuple[str, ...]]:
+def label_column(path: Path, given: SceneInput, g: Gaussians) -> tuple[np.ndarray, tuple[str, ...]]:
     """(N,) class 1..K of each Gaussian, that of the largest cosine, and a line of the header for each name.
 
     Args:

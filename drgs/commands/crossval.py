@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drgs import runtime
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -32,7 +32,7 @@ def run(args: Crossval) -> int:
         raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
     else:
         check_file(args.export, "crossval", inputs, dumps.is_export)
-    given = Given.of(args)
+    given = SceneInput.of(args)
     g, fields = given.colors, given.fields
     cameras, source = seen_views(args, given)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]

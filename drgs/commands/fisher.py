@@ -21,8 +21,8 @@ import numpy as np
 import torch
 
 from drgs import fisher
-from drgs.commands.given import Given
-from drgs.commands.rivals import Rivals
+from drgs.commands.compared_maps import Rivals
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
@@ -65,7 +65,7 @@ def run(args: Fisher) -> None:
     prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
-    given = Given.of(args)
+    given = SceneInput.of(args)
     settings = given.settings(args.preset)
     text = args.train
     if text is None and given.run is None:
@@ -146,7 +146,7 @@ class Told:
     sphere: Sphere | None
 
     @classmethod
-    def of(cls, given: Given, args: Fisher, settings: RenderSettings, cameras: Sequence[Camera]) -> Told:
+    def of(cls, given: SceneInput, args: Fisher, settings: RenderSettings, cameras: Sequence[Camera]) -> Told:
         """As the options say, of a run in the metric of its decoder, and of all these cameras."""
         g, scoring = given.gaussians, Scoring(method=args.method, blocks=args.blocks)
         blocks, metric = scoring.blocks_of(g, "fisher", given.scene), None

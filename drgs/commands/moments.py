@@ -14,7 +14,7 @@ from drgs.files import save_ply
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.given import Given
+    from drgs.commands.scene_input import SceneInput
     from drgs.ellipsoids import Scene
 
 __all__ = ["at_times", "named_view", "ply_names", "write_plys"]
@@ -36,7 +36,7 @@ def named_view(cameras: list[Camera], name: str | None, where: str) -> list[Came
     return found[:1]
 
 
-def at_times(cameras: list[Camera], text: str | None, frames: int, given: Given) -> list[Camera]:
+def at_times(cameras: list[Camera], text: str | None, frames: int, given: SceneInput) -> list[Camera]:
     """The cameras with the times that they are drawn at.
 
     Args:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 
 if TYPE_CHECKING:
     import torch
@@ -25,7 +25,7 @@ Painter = Callable[["Output"], np.ndarray]
 """From what `drgs.render` gives, features included, to (H, W, 3) uint8."""
 
 
-def painters(kinds: Iterable[str], given: Given, scene: Path) -> dict[str, Painter]:
+def painters(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, Painter]:
     """What draws each kind of picture.
 
     Args:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.commands.given import Given
 from drgs.commands.painters import OPAQUE
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.camera_lists import described
 from drgs.data.checks import read_npy
@@ -45,7 +45,7 @@ def run(args: Query) -> None:
     ply = "rest.ply" if args.remove else "selected.ply"
     inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
     output = claim(args.output, "query", ["query.json", ply], inputs)
-    given = Given.of(args)
+    given = SceneInput.of(args)
     g, decoder = given.gaussians, _decoder(args, given)
     query = _query(args, given)
     with Bar("scores", show=not args.quiet):
@@ -102,7 +102,7 @@ def read_embeddings(path: Path) -> torch.Tensor:
     return vectors.float().reshape(-1, vectors.shape[-1])
 
 
-def _decoder(args: Query, given: Given) -> Decoder | None:
+def _decoder(args: Query, given: SceneInput) -> Decoder | None:
     """What decodes the features, or None where they are the teacher's own; ValueError where there are no features."""
     g, decoder = given.gaussians, given.decoder
     if g.features is None:
@@ -121,7 +121,7 @@ def _decoder(args: Query, given: Given) -> Decoder | None:
     return decoder
 
 
-def _query(args: Query, given: Given) -> TextQuery:
+def _query(args: Query, given: SceneInput) -> TextQuery:
     """What is looked for."""
     temperature = TEMPERATURE if args.temperature is None else args.temperature
     if args.text_embedding is not None:
@@ -132,7 +132,7 @@ def _query(args: Query, given: Given) -> TextQuery:
     return TextQuery.of_classes(given.classes, args.classes, args.threshold, temperature)
 
 
-def _too_short(given: Given) -> str:
+def _too_short(given: SceneInput) -> str:
     """What to do, if a run has done fewer steps than its features need to tell classes apart; else "".
 
     They begin at 0 and move by their learning rate a step, Adam's: to about 1 in 1 / rate steps. Measured in

@@ -19,10 +19,10 @@ import torch
 
 from drgs import runtime
 from drgs.commands.forecast import forecast
-from drgs.commands.given import Given
 from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import MAX_SIDE, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
@@ -62,7 +62,7 @@ def run(args: Render) -> None:
     movies = [movie, *(_movie_of(movie, kind) for kind in kinds)] if "webm" in formats else []
     fixed = ["render.json", "cameras.json", *movies]
     output = claim(args.output, "render", fixed, inputs=[args.scene, views])
-    given = Given.of(args)
+    given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
     gaussians, settings = given.gaussians if paint else given.colors, given.settings(args.preset)
     size = args.width, args.height

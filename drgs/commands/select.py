@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.commands.clustered import workers_of
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import tables
@@ -38,7 +38,7 @@ def run(args: Select) -> None:
     args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior.given(args.prior, args.relative_prior)
-    given = Given.of(args)
+    given = SceneInput.of(args)
     settings = given.settings(args.preset)
     semantics = given.semantics()
     scoring = Scoring(

@@ -29,7 +29,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
-from drgs.commands.given import Given
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.camera_lists import described
 from drgs.display import tables
@@ -64,7 +64,7 @@ def run(args: Tradeoff) -> None:
     check_counts(args)
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     claim(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
-    given = Given.of(args)
+    given = SceneInput.of(args)
     gaussians, fields = given.colors, given.fields
     if not len(gaussians):
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.commands.given import Given
 from drgs.commands.orbits import Wish
+from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.commands.viewpoints import check_counts
 from drgs.display.progress import Bar, quietly
@@ -43,7 +43,7 @@ def run(args: View) -> None:
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with Bar("the scene", show=not args.quiet):
         stamps = _stamps(watched_files(args))
-        subject = subject_of(args, Given.of(args))
+        subject = subject_of(args, SceneInput.of(args))
     viewer = Viewer(subject, args.host, args.port, args.token, args.preset, args.max_pixels)
     try:
         print(f"{viewer.address}  (Ctrl-C ends)", flush=True)
@@ -69,7 +69,7 @@ def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]])
 
 def _reading(args: View, viewer: Viewer) -> Iterator[None]:
     """Job: what the files hold now, in all browsers."""
-    viewer.replace(subject_of(args, Given.of(args), viewer.subject))
+    viewer.replace(subject_of(args, SceneInput.of(args), viewer.subject))
     yield
 
 

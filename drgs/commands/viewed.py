@@ -19,16 +19,16 @@ from drgs.fitting.records import fitted_views
 from drgs.gain import Prior
 from drgs.guards.foreign import refuse_foreign
 from drgs.viewing.layers import layers_of
+from drgs.viewing.placed_views import Ranking, Station, read_ranking, stations_of
 from drgs.viewing.poses import pose_of
-from drgs.viewing.stations import Ranking, Station, read_ranking, stations_of
 from drgs.viewing.subject import FirstView, Subject
 from drgs.viewing.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.given import Given
     from drgs.commands.options import View
     from drgs.commands.painters import Painter
+    from drgs.commands.scene_input import SceneInput
 
 __all__ = ["subject_of", "watched_files"]
 
@@ -45,7 +45,7 @@ def watched_files(args: View) -> list[Path]:
     return [run.state, run.point_cloud, *(named or [run.path / _SELECTION])]
 
 
-def subject_of(args: View, given: Given, before: Subject | None = None) -> Subject:
+def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> Subject:
     """What is looked at.
 
     Args:
@@ -82,7 +82,7 @@ def subject_of(args: View, given: Given, before: Subject | None = None) -> Subje
     )
 
 
-def _state(given: Given) -> str:
+def _state(given: SceneInput) -> str:
     """The step of the checkpoint, where there is one that can be read."""
     if given.run is None:
         return ""
@@ -93,7 +93,7 @@ def _state(given: Given) -> str:
     return f"step {step:,} of {given.record.config.max_steps:,}" if isinstance(step, int) else ""
 
 
-def _times(given: Given) -> tuple[float, ...]:
+def _times(given: SceneInput) -> tuple[float, ...]:
     """Of what moves: those of the photographs, else the ends of the field's span; none where nothing does."""
     if given.moving is None:
         return ()
@@ -102,7 +102,7 @@ def _times(given: Given) -> tuple[float, ...]:
     return tuple(dict.fromkeys(float(x) for x in given.moving.field.grid.span))
 
 
-def _paint(args: View, given: Given) -> dict[str, Painter]:
+def _paint(args: View, given: SceneInput) -> dict[str, Painter]:
     """What draws features and labels, as far as there are any."""
     found: dict[str, Painter] = {}
     if given.gaussians.features is None:
@@ -115,7 +115,7 @@ def _paint(args: View, given: Given) -> dict[str, Painter]:
     return found
 
 
-def _known(args: View, given: Given, notes: list[str]) -> Known | None:
+def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
     """The views that it was fitted to; None where nobody says, or their data set has gone."""
     if args.train is None and given.run is None:
         return None
@@ -128,7 +128,7 @@ def _known(args: View, given: Given, notes: list[str]) -> Known | None:
         return None
 
 
-def _stations(args: View, given: Given, ranking: Ranking | None, notes: list[str]) -> tuple[Station, ...]:
+def _stations(args: View, given: SceneInput, ranking: Ranking | None, notes: list[str]) -> tuple[Station, ...]:
     """Where photographs were taken or could be."""
     if args.train is None and given.run is None:
         return stations_of([], (), ranking)
@@ -146,7 +146,7 @@ def _stations(args: View, given: Given, ranking: Ranking | None, notes: list[str
     return stations_of(views, fitted, ranking)
 
 
-def _ranking(args: View, given: Given) -> Ranking | None:
+def _ranking(args: View, given: SceneInput) -> Ranking | None:
     """Scores of cameras: those of --selection, else of a run that chose its views."""
     if args.selection is not None:
         refuse_foreign(args.selection, "a selection")
@@ -157,7 +157,7 @@ def _ranking(args: View, given: Given) -> Ranking | None:
     return read_ranking(path) if path.is_file() else None
 
 
-def _uncertainty(args: View, given: Given, known: Known | None) -> Uncertainty | None:
+def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertainty | None:
     """What the photographs leave uncertain, by the fast settings, whose maps are those of the exact ones."""
     if known is None or not known.cameras:
         return None

@@ -30,9 +30,9 @@ from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.given import Given
     from drgs.commands.option_groups import Views
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
+    from drgs.commands.scene_input import SceneInput
     from drgs.data import Dataset, View
 
 __all__ = [
@@ -97,7 +97,7 @@ class Source:
         """The cameras of a list."""
         return load_cameras_json(Path(self.text))
 
-    def dataset(self, args: Views, given: Given, lazy: bool = True) -> Dataset:
+    def dataset(self, args: Views, given: SceneInput, lazy: bool = True) -> Dataset:
         """The data set, or that of a run, without points, maps and labels; of videos, the frames and test cameras that
         `args` names, else those of the run that is named, else of the run that is looked at.
 
@@ -119,7 +119,7 @@ class Source:
             test_cameras=config.test_cameras if args.test_cameras is None else args.test_cameras,
         )
 
-    def split(self, dataset: Dataset, part: str, given: Given) -> list[View]:
+    def split(self, dataset: Dataset, part: str, given: SceneInput) -> list[View]:
         """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of
         every 8th view.
 
@@ -142,7 +142,7 @@ class Source:
 def drawn_views(
     args: Render | Crossval | Query | Tradeoff,
     text: str,
-    given: Given,
+    given: SceneInput,
     frames: int,
     size: tuple[int | None, int | None] = (None, None),
     returns: bool = False,
@@ -170,7 +170,7 @@ def drawn_views(
     return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{Path(text)} ({args.split})"
 
 
-def seen_views(args: Crossval | Query | Tradeoff, given: Given) -> tuple[list[Camera], str]:
+def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput) -> tuple[list[Camera], str]:
     """At most `--limit` pinhole cameras of `--cameras`, as large as they are drawn; and where they come from in words.
 
     Raises:
@@ -183,7 +183,7 @@ def seen_views(args: Crossval | Query | Tradeoff, given: Given) -> tuple[list[Ca
 
 def _drawn_orbit(
     args: Render | Crossval | Query | Tradeoff,
-    given: Given,
+    given: SceneInput,
     frames: int,
     size: tuple[int | None, int | None],
     returns: bool,
@@ -203,7 +203,7 @@ def _drawn_orbit(
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
 
-def _captured(given: Given) -> list[Camera]:
+def _captured(given: SceneInput) -> list[Camera]:
     """Cameras of the photographs that a run was fitted to, in their order; none if they are no longer there."""
     if given.run is None:
         return []
@@ -244,7 +244,7 @@ class Known:
     sizes: dict[tuple[int, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
 
 
-def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
+def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> Known:
     """The views of `--train`, else those that the run was fitted to.
 
     Args:
@@ -282,7 +282,7 @@ def known_views(text: str | None, args: Select | Fisher, given: Given) -> Known:
 
 
 def other_views(
-    option: str, text: str, args: Select | Fisher, given: Given, known: Known, fresh: bool
+    option: str, text: str, args: Select | Fisher, given: SceneInput, known: Known, fresh: bool
 ) -> tuple[list[Camera], str]:
     """Cameras to be compared with known views, reduced alike, and where they come from in words.
 
@@ -320,7 +320,7 @@ def other_views(
     return [_camera(view, known.sizes if same else {}, known.pixels) for view in left], f"{text} ({args.split})"
 
 
-def timed(cameras: list[Camera], args: Select | Fisher, given: Given) -> list[Camera]:
+def timed(cameras: list[Camera], args: Select | Fisher, given: SceneInput) -> list[Camera]:
     """Cameras with the time of `--time` where they state none, if the scene moves.
 
     Raises:
@@ -338,7 +338,7 @@ def timed(cameras: list[Camera], args: Select | Fisher, given: Given) -> list[Ca
     return found
 
 
-def _compared_orbit(wish: Wish, given: Given, known: Known, count: int) -> list[Camera]:
+def _compared_orbit(wish: Wish, given: SceneInput, known: Known, count: int) -> list[Camera]:
     """Around what the known views look at, else around the Gaussians, with the first known view's lens.
 
     All the way round: what known views do not cover is what candidates are for.

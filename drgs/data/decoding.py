@@ -1,4 +1,4 @@
-"""Videos with OpenCV (FFmpeg), in a process of its own (children.py): FFmpeg is large, and files come from elsewhere.
+"""Videos with OpenCV (FFmpeg), in a process of its own (reader_process.py): FFmpeg is large, files come from elsewhere.
 
 What a header says about the number of frames is not believed: the packets of the file are walked, undecoded, which also
 tells when each frame is shown. If the first and the last frame, decoded, are not shown when the packets say (a list of
@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import native_stderr
-from drgs.data.children import serve
+from drgs.data.reader_process import serve
 from drgs.guards import memory
 
 __all__ = ["frame", "walk"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.children import Child
+from drgs.data.reader_process import Child
 
 __all__ = ["HEIF_SUFFIXES", "heif_size", "is_heif", "heif_as_jpeg", "read_heif"]
 

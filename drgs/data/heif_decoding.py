@@ -1,4 +1,4 @@
-"""HEIC and AVIF with Pillow (libheif, libavif), in a process of its own (children.py): files come from elsewhere.
+"""HEIC and AVIF with Pillow (libheif, libavif), in a process of its own (reader_process.py): files come from elsewhere.
 
 The container says how the stored pixels are turned and mirrored to be shown, and that is part of the photograph: pixels
 are those that are shown, and EXIF's own orientation, which repeats it, is left out. (A JPEG has EXIF's orientation
@@ -16,7 +16,7 @@ import numpy as np
 import pillow_heif
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from drgs.data.children import serve
+from drgs.data.reader_process import serve
 from drgs.guards import memory
 
 __all__ = ["encoded_jpeg", "pixels", "size"]

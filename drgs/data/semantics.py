@@ -13,8 +13,8 @@ Found by their names beside the folder of the images, in this order:
 
 Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ. Those
 of frame 7 of the synchronous camera cam03, be it a file or part of a video, are ``cam03/semantic_class_0007.png``,
-``cam03/0007.png`` or ``cam03_0007.png``, and maps alike (`drgs.data.beside`). Dynamic 3D Gaussians' ``seg/`` are labels
-whose only class, 1, is what moves.
+``cam03/0007.png`` or ``cam03_0007.png``, and maps alike (`drgs.data.sidecars`). Dynamic 3D Gaussians' ``seg/`` are
+labels whose only class, 1, is what moves.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.beside import LABEL_FOLDERS, feature_maps, label_images, match_views, report_unmatched, search_folders
 from drgs.data.checks import read_image, read_npy
 from drgs.data.class_names import CLASS_FILES, read_class_names
+from drgs.data.sidecars import LABEL_FOLDERS, feature_maps, label_images, match_views, report_unmatched, search_folders
 from drgs.display.progress import Bar
 from drgs.guards.json_files import check_json, read_json
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.children import Child
+from drgs.data.reader_process import Child
 from drgs.display.progress import Bar
 from drgs.guards.foreign import refuse_foreign
 

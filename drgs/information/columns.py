@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import check_view, gaussians_at
+from drgs.guards.inputs import check_view, gaussians_at
 from drgs.information.groups import Group, Information, groups_of, scene_groups
 from drgs.integrator import render_jvp
 

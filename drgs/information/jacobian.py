@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import drjit as dr
 
 from drgs.ellipsoids import Y_00
-from drgs.tracing.behind import Table, passed
 from drgs.tracing.derivatives import if_any_hit
+from drgs.tracing.hit_table import Table, passed
 from drgs.tracing.kernels import Channels, HitModel, Ray
 from drgs.tracing.protocols import Float, Lib, Mask, Sink, UInt32
 from drgs.tracing.records import load_packed, pack, packed_size

@@ -34,7 +34,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene
 from drgs.guards.arguments import must_be
-from drgs.guards.doors import (
+from drgs.guards.inputs import (
     Masks,
     check_any_scene,
     check_view,

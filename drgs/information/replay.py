@@ -11,10 +11,10 @@ import torch
 
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
-from drgs.tracing.behind import Table, by_lists
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis, sh_color
+from drgs.tracing.hit_table import Table, by_lists
 from drgs.tracing.pose import quaternion_product
 from drgs.tracing.protocols import Float
 

@@ -12,10 +12,10 @@ from collections.abc import Callable
 import torch
 
 from drgs.lab.dumps import Dump, cotangents, one_line
-from drgs.lab.judgement import Case, Compared, compared, judge
 from drgs.lab.raw import COLORS, POSE, with_colors
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import GroupRow
+from drgs.lab.verdicts import Case, Compared, compared, judge
 
 __all__ = ["wide_gradients"]
 

@@ -32,11 +32,11 @@ from drgs.lab.channels import wide_gradients
 from drgs.lab.crops import crops
 from drgs.lab.dumps import Dump, cotangents
 from drgs.lab.image_errors import error_line
-from drgs.lab.judgement import Case, compared, judge, with_errors
 from drgs.lab.rasterizers import Rasterizer
 from drgs.lab.raw import COLORS, POSE, raw_of, with_pose
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
+from drgs.lab.verdicts import Case, compared, judge, with_errors
 from drgs.settings import RenderSettings
 
 __all__ = ["VERDICTS", "Result", "crossval"]

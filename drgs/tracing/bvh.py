@@ -33,9 +33,9 @@ from drgs.settings import RenderSettings
 from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.projection import Projected
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.sort_keys import EMPTY, positive
 from drgs.tracing.tiles import depth_order
 from drgs.tracing.walk import Part
-from drgs.tracing.words import EMPTY, positive
 
 __all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 

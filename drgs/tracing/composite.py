@@ -14,8 +14,8 @@ import drjit as dr
 import torch
 
 from drgs.settings import RenderSettings
-from drgs.tracing.behind import Table, by_lists
 from drgs.tracing.derivatives import Adjoint, Tangent
+from drgs.tracing.hit_table import Table, by_lists
 from drgs.tracing.kernels import Channels, HitModel, Primal
 from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
 from drgs.tracing.records import RECORD, count_of, pack, pack_records

@@ -23,8 +23,8 @@ from collections.abc import Callable
 
 import drjit as dr
 
-from drgs.tracing.behind import Table, passed
 from drgs.tracing.harmonics import sh_color
+from drgs.tracing.hit_table import Table, passed
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal, Ray
 from drgs.tracing.protocols import Float, Mask, UInt32
 from drgs.tracing.records import load_packed, packed_size

@@ -17,9 +17,9 @@ import torch
 from drgs import runtime
 from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 from drgs.tracing.records import load_record
+from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, word_of
 from drgs.tracing.walk import ListStream
 from drgs.tracing.weights import PIXELS, signed
-from drgs.tracing.words import BEYOND, EMPTY, name_of, word_of
 
 if TYPE_CHECKING:
     from drgs.tracing.kernels import Ray

@@ -25,9 +25,9 @@ from drgs.tracing.protocols import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import RESPONSES
 from drgs.tracing.rows import Room, SortedHits
+from drgs.tracing.sort_keys import ascending
 from drgs.tracing.walk import ListStream, Part, Slots
 from drgs.tracing.weights import PIXELS, Weights, signed
-from drgs.tracing.words import ascending
 
 __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 

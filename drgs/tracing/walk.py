@@ -23,8 +23,8 @@ from drgs.tracing.kernels import HitModel, Ray
 from drgs.tracing.protocols import DividedStream, Float, Kernel, Lib, Mask, Stream, UInt32
 from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.responses.peak import entry
+from drgs.tracing.sort_keys import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 from drgs.tracing.weights import PIXELS, Weights
-from drgs.tracing.words import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 
 if TYPE_CHECKING:
     from drgs.tracing.rows import SortedHits

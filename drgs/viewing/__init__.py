@@ -11,6 +11,6 @@ drawing     a picture in steps, a small one first
 uncertainty what the photographs leave uncertain, found on the way
 worker      the one thread that computes
 splats      Gaussians as the client takes them
-stations    where photographs were taken, or could be
+placed_views where photographs were taken, or could be
 poses       the client's cameras and ours
 """

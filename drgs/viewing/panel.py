@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.display.pictures import inferno
-from drgs.viewing.stations import Station, scale_colors, score_colors
+from drgs.viewing.placed_views import Station, scale_colors, score_colors
 
 if TYPE_CHECKING:
     from drgs.viewing.layers import ColorScale
-    from drgs.viewing.stations import Sight
+    from drgs.viewing.placed_views import Sight
     from drgs.viewing.subject import Subject
 
 __all__ = ["header", "legend", "photograph", "status"]

@@ -22,9 +22,9 @@ from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
 from drgs.viewing.drawing import stages
 from drgs.viewing.layers import UNCERTAINTY, Layer, tinted
+from drgs.viewing.placed_views import Station, score_colors
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.splats import ClientGaussians
-from drgs.viewing.stations import Station, score_colors
 
 if TYPE_CHECKING:
     import viser

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.viewing.layers import Layer
+from drgs.viewing.placed_views import Ranking, Station
 from drgs.viewing.poses import Pose
-from drgs.viewing.stations import Ranking, Station
 from drgs.viewing.uncertainty import Uncertainty
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Claims of drgs.data.children: a library that crashes over a file takes no fit with it; no answer is mixed up."""
+"""Claims of drgs.data.reader_process: a library that crashes over a file takes no fit with it; answers stay apart."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pytest
 from test_dynamic_data import coded, decoded, write_video
 
 from drgs.data import videos
-from drgs.data.children import Child
+from drgs.data.reader_process import Child
 from drgs.data.videos import VideoFrame
 
 MODULE = """
 import logging, os, time
 from pathlib import Path
 import numpy as np
-from drgs.data.children import serve
+from drgs.data.reader_process import serve
 
 def fail(path, kind, tell):
     raise {"ValueError": ValueError, "FileNotFoundError": FileNotFoundError, "KeyError": KeyError}[kind](f"{path}: no")

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from drgs.features.segmentation import Classes
     from drgs.information.semantics import SemanticMetric
 
-__all__ = ["Given"]
+__all__ = ["SceneInput"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Given:
+class SceneInput:
     """Gaussians, and the run that they are of.
 
     Attributes:
@@ -47,7 +47,7 @@ class Given:
     moving: Scene | None = None
 
     @classmethod
-    def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> Given:
+    def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> SceneInput:
         """What the command line names, and says about settings.
 
         Raises:
@@ -59,7 +59,7 @@ class Given:
         return dataclasses.replace(given, fields=fitted | replaced)
 
     @classmethod
-    def at(cls, path: Path) -> Given:
+    def at(cls, path: Path) -> SceneInput:
         """What a file of Gaussians, a folder of them (SOG, INRIA's), or a run folder holds.
 
         Raises:
