@@ -1,0 +1,103 @@
+"""Registries of what is chosen by name, which other packages add rows to: policies, loaders, codecs, responses."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.metadata
+from collections.abc import Iterator, Mapping, MutableMapping
+from typing import Any, Generic, TypeVar
+
+from drgs.guards.imports import imported_function
+
+__all__ = ["Registry"]
+
+T = TypeVar("T")
+
+
+class Registry(MutableMapping[str, T], Generic[T]):
+    """Name -> what it stands for, in the order in which rows were added.
+
+    A row of this package is written where the table is made, as the value itself or as `module:attribute`, which is
+    imported when it is first asked for: a table that the command line reads for its names loads nothing heavy. Another
+    package adds rows by entry points of the group, which are found when it is installed:
+
+        [project.entry-points."drgs.policies"]
+        mine = "my_package.policies:mine"
+
+    and a script by an assignment, `POLICIES["mine"] = mine`. A row of this package cannot be replaced by an entry
+    point, so that installing something never changes what a name means.
+
+    Args:
+        kind: What a row is, for messages: "policy".
+        group: Of the entry points: "drgs.policies".
+        rows: Those of this package.
+    """
+
+    def __init__(self, kind: str, group: str, rows: Mapping[str, T | str]) -> None:
+        self.kind, self.group = kind, group
+        self._rows: dict[str, Any] = dict(rows)
+
+    def __getitem__(self, name: str) -> T:
+        if name in self._rows:
+            row = self._rows[name]
+            if isinstance(row, str):
+                module, _, attribute = row.partition(":")
+                self._rows[name] = row = getattr(importlib.import_module(module), attribute)
+            return row
+        point = _entry_points(self.group)[name]
+        try:
+            row = self._rows[name] = point.load()
+        except Exception as error:  # whatever the other package raises, the line names it
+            raise ValueError(
+                f"{self.kind} {name!r} of {_package(point)}: must be importable, got {type(error).__name__}: {error}"
+            ) from error
+        return row
+
+    def __setitem__(self, name: str, value: T) -> None:
+        self._rows[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self._rows[name]
+
+    def __iter__(self) -> Iterator[str]:
+        yield from dict.fromkeys([*self._rows, *_entry_points(self.group)])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._rows or name in _entry_points(self.group)
+
+    def find(self, where: str, name: str) -> T:
+        """The row of a name that a user typed, or the function of another package that `package.module:function` names.
+
+        Never for a name that a file holds: importing runs the module.
+
+        Args:
+            where: What an error begins with, e.g. `--policy`.
+            name: A row's, or `package.module:function`.
+        Raises:
+            ValueError: If there is neither; one line that names all rows.
+        """
+        if name in self:
+            return self[name]
+        if ":" in name:
+            return imported_function(where, name)  # type: ignore[return-value]  # its caller checks what it gets
+        known = ", ".join(self)
+        raise ValueError(
+            f"{where}: {self.kind} must be one of {known}, or package.module:function, got {name!r}; choose one"
+        )
+
+
+@functools.cache
+def _entry_points(group: str) -> dict[str, importlib.metadata.EntryPoint]:
+    """Rows of installed packages by name; of two of a name the first that is found."""
+    found: dict[str, importlib.metadata.EntryPoint] = {}
+    for point in importlib.metadata.entry_points(group=group):
+        found.setdefault(point.name, point)
+    return found
+
+
+def _package(point: importlib.metadata.EntryPoint) -> str:
+    return point.dist.name if point.dist else point.value
