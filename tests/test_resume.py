@@ -189,7 +189,7 @@ def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
     """A file, or a folder that cannot be made, as -o: found out before anything is loaded, by every command."""
     (tmp_path / "file").write_text("mine")
     readers = (
-        "commands.given.SceneInput.at",
+        "commands.scene_input.SceneInput.at",
         "data.load",
         "commands.stress.rows",
         "files.load_ply",
