@@ -24,14 +24,20 @@ from drgs import reference  # noqa: E402
 from drgs.gain import dense  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 
-BEGIN, END = "<!-- chain: begin -->", "<!-- chain: end -->"
+BEGIN = "<!-- chain: begin -->"
+END = "<!-- chain: end -->"
 FORMS = ("trace_bound", "eig", "logdet", "block_logdet")
-GAUSSIANS, CANDIDATES, TRAIN, LAMBDAS = 12, 8, (1, 2, 4), (1e-6, 1e-3, 1.0)
+GAUSSIANS = 12
+CANDIDATES = 8
+TRAIN = (1, 2, 4)
+LAMBDAS = (1e-6, 1e-3, 1.0)
 
 
 def views(seed: int) -> tuple[list[torch.Tensor], torch.Tensor]:
     """Jacobians of max(TRAIN) + CANDIDATES views of a random scene, and the Gaussian of each column."""
-    rng, settings, rows = np.random.default_rng(seed), RenderSettings.preset("exact"), []
+    rng = np.random.default_rng(seed)
+    settings = RenderSettings.preset("exact")
+    rows = []
     g = gaussians(rng, GAUSSIANS, 1, scale=0.25)
     for _ in range(max(TRAIN) + CANDIDATES):
         out = reference.render(g, camera(rng, (12, 10), turn=1.5), settings)
@@ -77,7 +83,8 @@ def main():
     page = ROOT / "docs" / "information.md"
     if not args.print:
         text = page.read_text(encoding="utf-8")
-        start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+        start = text.index(BEGIN) + len(BEGIN)
+        end = text.index(END)
         page.write_text(text[:start] + "\n" + "\n".join(lines) + "\n" + text[end:], encoding="utf-8")
 
 

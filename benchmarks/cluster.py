@@ -64,7 +64,9 @@ def ring(count: int) -> list[Camera]:
     K = intrinsics_from_fov(50.0, *SIZE)
     found = []
     for i in range(count):
-        angle, height = 2.399963 * i, 0.25 + 1.0 * (i + 0.5) / count  # the golden angle
+        # the golden angle
+        angle = 2.399963 * i
+        height = 0.25 + 1.0 * (i + 0.5) / count
         across = np.sqrt(max(2.6**2 - (2 * height) ** 2, 0.2))
         eye = (across * np.cos(angle), across * np.sin(angle), 2 * height)
         w2c = look_at(eye, (0.0, 0.0, 0.2), (0.0, 0.0, 1.0))
@@ -89,10 +91,13 @@ def bandwidth(cluster) -> float:
 
 def measured(arguments: argparse.Namespace) -> dict:
     """Rows for each number of workers, the first one for none."""
-    g, cameras = scene(arguments.gaussians), ring(arguments.candidates + KNOWN)
-    known, candidates = cameras[:: len(cameras) // KNOWN][:KNOWN], []
+    g = scene(arguments.gaussians)
+    cameras = ring(arguments.candidates + KNOWN)
+    known = cameras[:: len(cameras) // KNOWN][:KNOWN]
+    candidates = []
     candidates = [camera for camera in cameras if all(camera is not other for other in known)]
-    rows, reference = [], None
+    rows = []
+    reference = None
     for count in (0, *arguments.counts):
         load = os.getloadavg()[0]
         began = time.perf_counter()
@@ -105,7 +110,9 @@ def measured(arguments: argparse.Namespace) -> dict:
                 cluster.view_seconds.clear()
                 cluster.views.clear()
                 cluster.cpu_seconds = 0.0
-                sent, took, back = cluster.sent_bytes, cluster.sent_seconds, cluster.received_bytes
+                sent = cluster.sent_bytes
+                took = cluster.sent_seconds
+                back = cluster.received_bytes
             fresh = g.replace(means=g.means + 0)  # the same values in the same bytes, which workers have already
             began, cpu = time.perf_counter(), time.process_time()
             found = select(fresh, candidates, known, workers=cluster, **TOLD)

@@ -84,7 +84,8 @@ def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int
     colors = [fisher.diagonal(g, view, settings, groups=(*GEOMETRY, "sh")) for view in views]
 
     def features(m: SemanticMetric) -> list[dict]:
-        groups, none = (*GEOMETRY, "features"), (0.0, 0.0, 0.0)
+        groups = (*GEOMETRY, "features")
+        none = (0.0, 0.0, 0.0)
         return [fisher.diagonal(g, x, settings, semantics=m, channel_weights=none, groups=groups) for x in views]
 
     def scores(found: list[dict], criterion: str) -> np.ndarray:
@@ -175,7 +176,8 @@ def main():
         sys.exit(f"{args.run}: must be a run with features, has none; fit a data set with teacher maps")
     views = load(Run(args.run).config()["data"], points=False).views
     cameras = [view.camera.undistorted() for view in views]
-    g, metric = loaded.gaussians.detach(), SemanticMetric(loaded.decoder.metric())
+    g = loaded.gaussians.detach()
+    metric = SemanticMetric(loaded.decoder.metric())
     sizes = {"fast": (40, 30) if args.quick else (320, 240), "exact": (40, 30) if args.quick else (160, 120)}
     count, width = (4, 40) if args.quick else (14, 80)
     few = [cameras[k].resized(width, width * 3 // 4) for k in np.linspace(0, len(cameras) - 1, count).astype(int)]

@@ -110,7 +110,8 @@ def wolf(count: int, width: int, height: int) -> tuple | None:
 
 def alarms(runs: Path, seeds: int, table_only: bool = False) -> list[str]:
     """One line a rasterizer: verdicts of `seeds` seeds on each real scene."""
-    rows, scenes = studies.read_rows(ROWS, {}), real_scenes(runs)
+    rows = studies.read_rows(ROWS, {})
+    scenes = real_scenes(runs)
     counts = {scene: min(seeds, FEWER) if scene in CHOSEN_ON else seeds for scene in scenes}
     names = [n for n in CORRECT if n.startswith("drgs:") or importlib.util.find_spec("gsplat")]
     for seed in range(0 if table_only else seeds):
@@ -138,7 +139,8 @@ def alarms(runs: Path, seeds: int, table_only: bool = False) -> list[str]:
 
 def poses(runs: Path) -> list[str]:
     """One line a rasterizer: the pose's gradient and that of six channels, on each real scene."""
-    rows, scenes = studies.read_rows(POSES, {}), real_scenes(runs)
+    rows = studies.read_rows(POSES, {})
+    scenes = real_scenes(runs)
     names = [n for n in CORRECT if n.startswith("drgs:") or importlib.util.find_spec("gsplat")]
     for seed in range(POSE_SEEDS):
         for scene, (g, cameras) in scenes.items():
@@ -162,7 +164,8 @@ def poses(runs: Path) -> list[str]:
 
 def _alarm(name: str, g: Gaussians, camera: Camera, seed: int) -> dict:
     """What is said of one rasterizer on one view's crop."""
-    fields, start = {"background": BACKGROUND}, time.process_time()
+    fields = {"background": BACKGROUND}
+    start = time.process_time()
     views = [camera]
     if not name.startswith("drgs:"):  # what the command crops for ours is cropped for it here: it is slow
         g, views, _ = crops(g, views, RenderSettings.preset("gsplat", **fields))
@@ -202,7 +205,8 @@ def broken(runs: Path) -> list[str]:
     ]
     for name in ("correct", *torch_rasterizer.DEFECTS):
         what = "nothing" if name == "correct" else torch_rasterizer.DEFECTS[name].what
-        cells, named = [], {}
+        cells = []
+        named = {}
         for scene, (g, cameras) in scenes.items():
             key = f"{name} {scene}"
             if key not in rows:
@@ -240,7 +244,8 @@ def _found(name: str, g: Gaussians, cameras: list[Camera]) -> dict:
 
 def _same(a, b, g: Gaussians, camera: Camera) -> bool:
     """Whether two rasterizers' images and gradients of a view are equal, bit for bit."""
-    raw, u = with_pose(raw_of(g)), cotangents([camera], 0)[0]
+    raw = with_pose(raw_of(g))
+    u = cotangents([camera], 0)[0]
     if not torch.equal(*(x.image(raw, camera, BACKGROUND)[0] for x in (a, b))):
         return False
     slopes = [x.gradient(raw, camera, BACKGROUND, u) for x in (a, b)]

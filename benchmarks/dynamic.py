@@ -195,10 +195,8 @@ def main() -> None:
         g, motion, shown = of_run(args.run, size, count)
         shares = {f"{100 * float((motion >= 0).float().mean()):.0f} %": motion}
     else:
-        g, shown = (
-            cubes.cube(count, sh_degree=1),
-            frames(size, orbit((0, 0, 0), 4.0, CAMERAS, width=size[0], height=size[1])),
-        )
+        g = cubes.cube(count, sh_degree=1)
+        shown = frames(size, orbit((0, 0, 0), 4.0, CAMERAS, width=size[0], height=size[1]))
         draw = torch.rand(count, generator=torch.Generator().manual_seed(1))
         shares = {
             "all" if share == 1 else f"{100 * share:.0f} %": torch.where(draw < share, 2.0, -2.0) for share in SHARES

@@ -58,7 +58,8 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
         source = DATA / name
         if not source.is_dir():
             return None
-    dataset, run = data.load(source), folder / name.replace(" ", "-")
+    dataset = data.load(source)
+    run = folder / name.replace(" ", "-")
     if not (run / "point_cloud.ply").exists():
         fit(dataset, run, FitConfig(max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"))
     view = dataset.views[len(dataset.views) // 2]
@@ -115,9 +116,11 @@ def task_oracle(name: str, folder: Path, turns: int) -> dict | None:
     K = cam.K.copy()
     K[:2, 2] -= (cam.width // 2 - CROP[0] // 2, cam.height // 2 - CROP[1] // 2)
     crop = dataclasses.replace(cam, K=K, width=CROP[0], height=CROP[1])
-    g, s = g.detach(), Preset("exact")
+    g = g.detach()
+    s = Preset("exact")
     with torch.no_grad():
-        true, out = drgs.reference.render(g, crop, s), drgs.render(g, crop, s, outputs=())
+        true = drgs.reference.render(g, crop, s)
+        out = drgs.render(g, crop, s, outputs=())
     clear = ~true.ambiguous
     error = (out.rgb - true.rgb).abs().amax(-1)
     return {"near a tie": int((~clear).sum()), "error": float(error[clear].max()), "pixels": clear.numel()}
@@ -156,10 +159,13 @@ def task_torch(name: str, folder: Path, turns: int) -> dict:
     """gsplat's torch code against our preset of its model, on a cube that its memory allows."""
     from examples.gsplat_torch import rasterization
 
-    g, cam, s = cubes.cube(SMALL[0]), cubes.camera(SMALL[1]), Preset("gsplat")
+    g = cubes.cube(SMALL[0])
+    cam = cubes.camera(SMALL[1])
+    s = Preset("gsplat")
     raw = {"means": g.means, "quats": g.quats, "log_scales": g.log_scales, "logits": g.logit_opacities, "sh": g.sh}
     leaves = {key: x.clone().requires_grad_() for key, x in raw.items()}
-    view, K = torch.tensor(np.array(cam.w2c))[None].float(), torch.tensor(cam.K)[None].float()
+    view = torch.tensor(np.array(cam.w2c))[None].float()
+    K = torch.tensor(cam.K)[None].float()
 
     def drawn(x: dict) -> torch.Tensor:
         shape = x["means"], x["quats"], x["log_scales"].exp(), x["logits"].sigmoid(), x["sh"]
@@ -216,9 +222,11 @@ def scene_rows(rows: dict) -> list[str]:
             if row is None:
                 lines.append(f"| {name} | not there | | | | | | | |")
                 continue
-            t, cells = row["seconds"], []
+            t = row["seconds"]
+            cells = []
             for kind in (*KINDS, "with depth"):
-                fast, exact = t[f"fast, {kind if kind in KINDS else KINDS[0]}"], t[f"exact, {kind}"]
+                fast = t[f"fast, {kind if kind in KINDS else KINDS[0]}"]
+                exact = t[f"exact, {kind}"]
                 cells.append(f"{exact / fast:.1f}x ({1e3 * fast:.0f} to {1e3 * exact:.0f} ms)")
             size = "x".join(map(str, row["size"]))
             lines.append(
@@ -316,7 +324,8 @@ def main() -> None:
         return
     for name in FITTED:
         scene(name, args.fits)
-    store, parts = ROOT / "benchmarks" / "exact.json", args.parts
+    store = ROOT / "benchmarks" / "exact.json"
+    parts = args.parts
     result = ran() if set(parts) == set(PARTS) else json.loads(store.read_text())
     if "scenes" in parts:
         result["scenes"] = {

@@ -60,7 +60,8 @@ def traversals():
 def frame(gaussians: drgs.Gaussians, settings: drgs.RenderSettings, couple: bool, products: bool = True):
     """A frame and the gradients of the sum of its images with respect to every parameter."""
     leaves = {k: v.clone().requires_grad_() for k, v in gaussians.parameters().items()}
-    moving, cam = gaussians.replace(**leaves), camera()
+    moving = gaussians.replace(**leaves)
+    cam = camera()
 
     def run():
         with contextlib.nullcontext() if products else traversals():
@@ -103,7 +104,10 @@ def against_colors(count: int, preset: str, width: int, ways: dict, turns: int, 
 
 def held(count: int, preset: str, width: int) -> dict:
     """Bytes of the largest buffer of weights of a frame and its gradients, and how full it is."""
-    zeros, survey, sizes, shares = weights.Weights.zeros, weights.Weights.survey, [], []
+    zeros = weights.Weights.zeros
+    survey = weights.Weights.survey
+    sizes = []
+    shares = []
 
     def noted(self):
         sizes.append(4 * (self.rows + 1) * weights.PIXELS)
@@ -114,11 +118,13 @@ def held(count: int, preset: str, width: int) -> dict:
         shares.append((int((buffer.torch() != 0).sum()), buffer.torch().numel()))
         survey(self, buffer)
 
-    weights.Weights.zeros, weights.Weights.survey = noted, looked
+    weights.Weights.zeros = noted
+    weights.Weights.survey = looked
     try:
         frame(with_features(count, width), Preset(preset), True)()
     finally:
-        weights.Weights.zeros, weights.Weights.survey = zeros, survey
+        weights.Weights.zeros = zeros
+        weights.Weights.survey = survey
     return {"bytes": max(sizes), "blocks": len(shares), "share": sum(a for a, _ in shares) / sum(b for _, b in shares)}
 
 

@@ -52,7 +52,9 @@ def headline(turns: int) -> list[dict]:
     """One view of the cube scene, SH 0 and 3, `fast` and `exact`."""
     rows = []
     for preset, degree in (("fast", 0), ("fast", 3), ("exact", 0)):
-        g, cam, s = cubes.cube(sh_degree=degree), cubes.camera(), Preset(preset)
+        g = cubes.cube(sh_degree=degree)
+        cam = cubes.camera()
+        s = Preset(preset)
         runs = {
             "forward": forward(g, cam, s),
             "forward+backward": backward(g, cam, s),
@@ -69,7 +71,9 @@ def headline(turns: int) -> list[dict]:
 
 def tangents(turns: int) -> dict:
     """K columns carried through one traversal, against as many traversals."""
-    g, cam, s = cubes.cube(), cubes.camera(), Preset("fast")
+    g = cubes.cube()
+    cam = cubes.camera()
+    s = Preset("fast")
     columns = torch.randn(16, len(g), 3, generator=torch.Generator().manual_seed(0))
     run = lambda x: lambda: drgs.render_jvp(g, cam, {"means": x}, s, outputs=())  # noqa: E731
     pose = torch.eye(6, dtype=torch.float64)
@@ -86,7 +90,8 @@ def tangents(turns: int) -> dict:
 
 def candidates(g, cameras: list, count: int, turns: int) -> dict:
     """Seconds of one pick among `count` poses at 320x240, H of the training views included, and of scores alone."""
-    rng, poses = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    poses = []
     for k in range(count):
         camera = cameras[k % len(cameras)]
         c2w = camera.c2w.copy()
@@ -96,7 +101,8 @@ def candidates(g, cameras: list, count: int, turns: int) -> dict:
     train = [camera.undistorted().resized(320, 240) for camera in cameras[:12]]
     rows = []
     for policy, criterion, blocks, preset in PICKS:
-        s, seconds = Preset(preset), []
+        s = Preset(preset)
+        seconds = []
         # Policies of their own criterion say nothing about it, nor about blocks.
         own = {"criterion": criterion, "blocks": blocks} if blocks else {}
         select(g, poses[:2], train[:2], 1, policy, settings=s, **own)  # kernels
@@ -157,7 +163,9 @@ def growth(turns: int, quick: bool) -> list[dict]:
     shapes += [(100_000, size, 1) for size in (() if quick else (64, 128, 256, 1024))]
     shapes += [(10_000, 128, views) for views in ((1, 4) if quick else (1, 10, 100))]
     for count, size, views in shapes:
-        g, cam, s = cubes.cube(count), cubes.camera(size), Preset("fast")
+        g = cubes.cube(count)
+        cam = cubes.camera(size)
+        s = Preset("fast")
         run = interleaved({"diagonal": lambda g=g, c=[cam] * views, s=s: fisher.diagonal(g, c, s)}, turns)
         rows.append({"gaussians": count, "pixels": size, "views": views, **run})
         print(rows[-1], flush=True)
@@ -249,7 +257,8 @@ def main():
     if args.task:
         print(score(args.run, args.task))
         return
-    turns, parts = 2 if args.quick else 5, [part for part in PARTS if part in args.parts]
+    turns = 2 if args.quick else 5
+    parts = [part for part in PARTS if part in args.parts]
     run = args.run or next((p for p in (ROOT / "runs/real/office", ROOT / "out/demo/run") if p.is_dir()), None)
     if parts == ["picks"] and run is None:
         parser.error("--parts picks needs a fitted run; name one by --run")

@@ -40,8 +40,10 @@ from where import ran  # noqa: E402
 
 from drgs.studies.tables import fill_between  # noqa: E402
 
-COUNTS, PAGE = ROOT / "benchmarks" / "fuzz.json", ROOT / "docs" / "reliability.md"
-FINDINGS, LOCK = ROOT / "runs" / "fuzz" / "findings", ROOT / "runs" / "fuzz" / "lock"
+COUNTS = ROOT / "benchmarks" / "fuzz.json"
+PAGE = ROOT / "docs" / "reliability.md"
+FINDINGS = ROOT / "runs" / "fuzz" / "findings"
+LOCK = ROOT / "runs" / "fuzz" / "lock"
 WORKER = ROOT / "benchmarks" / "fuzz_worker.py"
 _MEMORY = Path("/dev/shm")  # noqa: S108 (millions of files are not for disks)
 _KEPT = 3  # inputs of one cause
@@ -59,7 +61,9 @@ class Reader:
     """
 
     def __init__(self, name: str, row: dict[str, Any], corpus: Path | None = None) -> None:
-        self.name, self.row, self.corpus = name, row, corpus
+        self.name = name
+        self.row = row
+        self.corpus = corpus
         for key in ("inputs", "findings", "crashes", "hangs"):
             row.setdefault(key, 0)
         row.setdefault("ends", {})
@@ -81,7 +85,11 @@ class Reader:
         with (scratch / "said").open("w") as said:
             pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": said}
             process = subprocess.Popen([*line, str(scratch), *([str(self.corpus)] if self.corpus else [])], **pipes)
-        ended, number, since, spent, ready = "", begin - 1, time.monotonic(), 0.0, False
+        ended = ""
+        number = begin - 1
+        since = time.monotonic()
+        spent = 0.0
+        ready = False
         try:
             while True:
                 if select.select([process.stdout], [], [], 0.25)[0]:
@@ -103,7 +111,9 @@ class Reader:
                     ended = "time"
                     break
                 if (now := _number(scratch)) != number:
-                    number, since, spent = now, time.monotonic(), _processor(process.pid)
+                    number = now
+                    since = time.monotonic()
+                    spent = _processor(process.pid)
                 elif _processor(process.pid) - spent > SLOW or time.monotonic() - since > _STUCK:
                     ended = "hang"
                     break
@@ -257,7 +267,8 @@ def main() -> None:
     for name in args.readers:
         corpus = ROOT / "runs" / "fuzz" / "reached" / re.sub(r"\W+", "-", name) if args.atheris else None
         row = {} if args.fresh else counted().get(kind, {}).get(name, {})
-        began, before = time.monotonic(), row.get("inputs", 0)
+        began = time.monotonic()
+        before = row.get("inputs", 0)
         reader = Reader(name, row, corpus)
         reader.go_on(args.inputs, args.seconds)
         if corpus is not None:

@@ -71,7 +71,8 @@ def _safetensors(data: bytes, draw: Random) -> bytes:
     size = int.from_bytes(data[:8], "little")
     if not 0 < size <= len(data) - 8:
         return damaged(data, draw)
-    head, body = data[8 : 8 + size], data[8 + size :]
+    head = data[8 : 8 + size]
+    body = data[8 + size :]
     if draw.random() < 0.4:
         return data[: 8 + size] + damaged(body, draw)
     try:
@@ -108,7 +109,8 @@ def _zip(data: bytes, draw: Random) -> bytes:
         return damaged(data, draw)
     if not parts:
         return damaged(data, draw)
-    i, how = draw.randrange(len(parts)), zipfile.ZIP_STORED
+    i = draw.randrange(len(parts))
+    how = zipfile.ZIP_STORED
     name, content = parts[i]
     what = draw.random()
     if what < 0.75:
@@ -131,14 +133,16 @@ def _zip(data: bytes, draw: Random) -> bytes:
 
 def _png(data: bytes, draw: Random) -> bytes:
     """Chunks that are damaged, gone, or there twice, with check sums that hold."""
-    chunks, at = [], 8
+    chunks = []
+    at = 8
     while at + 12 <= len(data):
         size = int.from_bytes(data[at : at + 4], "big")
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
         at += 12 + size
     if not chunks:
         return damaged(data, draw)
-    i, what = draw.randrange(len(chunks)), draw.random()
+    i = draw.randrange(len(chunks))
+    what = draw.random()
     kind, body = chunks[i]
     if kind == b"IDAT" and what < 0.4:
         try:

@@ -57,7 +57,8 @@ def _flip(data: bytes, draw: Random, others: Sequence[bytes]) -> bytes:
 
 
 def _set(data: bytes, draw: Random, others: Sequence[bytes]) -> bytes:
-    out, at = bytearray(data), draw.randrange(len(data))
+    out = bytearray(data)
+    at = draw.randrange(len(data))
     length = min(draw.choice((1, 1, 2, 4, 16, 256)), len(out) - at)
     out[at : at + length] = bytes([draw.choice((0, 255, 127, 128, 10, 32, draw.randrange(256)))]) * length
     return bytes(out)
@@ -68,7 +69,8 @@ def _cut(data: bytes, draw: Random, others: Sequence[bytes]) -> bytes:
 
 
 def _insert(data: bytes, draw: Random, others: Sequence[bytes]) -> bytes:
-    at, kind = draw.randrange(len(data) + 1), draw.random()
+    at = draw.randrange(len(data) + 1)
+    kind = draw.random()
     new = draw.randbytes(draw.choice((1, 2, 4, 8, 100))) if kind < 0.5 else draw.choice(WORDS)
     return data[:at] + new + data[at:]
 
@@ -134,7 +136,9 @@ def _text_number(data: bytes, draw: Random, others: Sequence[bytes] = ()) -> byt
 def lines_of(data: bytes, draw: Random, others: Sequence[bytes] = ()) -> bytes:
     """A line that is gone, there twice, elsewhere, cut, or of other words."""
     lines = data.split(b"\n")
-    i, j, what = draw.randrange(len(lines)), draw.randrange(len(lines)), draw.randrange(6)
+    i = draw.randrange(len(lines))
+    j = draw.randrange(len(lines))
+    what = draw.randrange(6)
     words = lines[i].split(b" ")
     k = draw.randrange(len(words))
     if what == 0:
@@ -185,7 +189,8 @@ def _changed(value: Any, draw: Random) -> Any:
     parent, key = _place(value, draw)
     if parent is None:
         return copy.deepcopy(draw.choice(_ODD)) if draw.random() < 0.2 else value
-    held, what = parent[key], draw.randrange(9)
+    held = parent[key]
+    what = draw.randrange(9)
     if what <= 2:
         parent[key] = copy.deepcopy(draw.choice(_ODD))
     elif what == 3:
@@ -213,7 +218,8 @@ def _place(value: Any, draw: Random) -> tuple[Any, Any]:
     """A random entry somewhere in a value, as (what holds it, its key)."""
     parent = key = None
     while isinstance(value, dict | list) and value:
-        parent, key = value, draw.choice(list(value)) if isinstance(value, dict) else draw.randrange(len(value))
+        parent = value
+        key = draw.choice(list(value)) if isinstance(value, dict) else draw.randrange(len(value))
         value = parent[key]
         if draw.random() < 0.25:
             break

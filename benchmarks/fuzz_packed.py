@@ -54,8 +54,11 @@ def _frames(data: bytes, draw: Random) -> bytes:
     head = data[:_HEAD_4]
     if len(head) < _HEAD_4:
         return damaged(data, draw)
-    number, at = head[15], struct.unpack_from("<I", head, 16)[0]
-    extensions, frames, start = data[_HEAD_4:at], [], at + 16 * number
+    number = head[15]
+    at = struct.unpack_from("<I", head, 16)[0]
+    extensions = data[_HEAD_4:at]
+    frames = []
+    start = at + 16 * number
     for i in range(number):
         if at + 16 * i + 16 > len(data):
             return damaged(data, draw)
@@ -110,7 +113,8 @@ def webp_of(data: bytes, draw: Random) -> bytes:
         return damaged(data, draw)
     width, height = image.size
     if draw.random() < 0.3:
-        width, height = max(1, width + draw.choice((-1, 1, 64, -width))), max(1, height + draw.choice((-1, 1, 0, 64)))
+        width = max(1, width + draw.choice((-1, 1, 64, -width)))
+        height = max(1, height + draw.choice((-1, 1, 0, 64)))
     size = 4 * width * height
     pixels = damaged(image.tobytes(), draw)[:size]
     pixels += bytes([draw.choice((0, 255))]) * (size - len(pixels))
@@ -124,14 +128,16 @@ def webp_of(data: bytes, draw: Random) -> bytes:
 
 def glb_of(data: bytes, draw: Random) -> bytes:
     """Another document, or another buffer, in chunks of the lengths that are stated."""
-    chunks, at = [], 12
+    chunks = []
+    at = 12
     while at + 8 <= len(data):
         size = int.from_bytes(data[at : at + 4], "little")
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
         at += 8 + size
     if data[:4] != b"glTF" or not chunks:
         return damaged(data, draw)
-    i, what = draw.randrange(len(chunks)), draw.random()
+    i = draw.randrange(len(chunks))
+    what = draw.random()
     kind, body = chunks[i]
     if what < 0.85:
         body = json_of(body, draw) if kind == b"JSON" else damaged(body, draw)

@@ -23,7 +23,8 @@ __all__ = [
 ]
 
 _ROOT = Path(__file__).resolve().parent.parent
-_W, _H = 12, 8
+_W = 12
+_H = 8
 _K = intrinsics(10, 11, 6.0, 4.0)
 _VIEWS = 4
 

@@ -94,9 +94,12 @@ class Watch:
     """
 
     def __init__(self, bench: Any, scratch: Path, begin: int) -> None:
-        self.bench, self.scratch, self.number = bench, scratch, begin
+        self.bench = bench
+        self.scratch = scratch
+        self.number = begin
         self.counts: Counter[str] = Counter()
-        self.slowest, self._told = 0.0, time.monotonic()
+        self.slowest = 0.0
+        self._told = time.monotonic()
         self.address, self.resident = peak()
         self._first = self.resident
         for pid in (0, *children()):
@@ -123,7 +126,8 @@ class Watch:
             fault = f"asks for {more / 2**30:.1f} GiB for {len(data)} bytes"
         if fault is None and error is not None and any(word in str(error).lower() for word in _IN_MEMORY):
             fault = "an error of memory"
-        self.address, self.resident = max(self.address, now_address), max(self.resident, now_resident)
+        self.address = max(self.address, now_address)
+        self.resident = max(self.resident, now_resident)
         self.counts["ended" if error is not None and _ENDED in str(error) else how] += 1
         if fault is not None:
             news = {"finding": self.number, "fault": fault, "file": str(path.relative_to(folder)), "damaged": str(path)}
@@ -203,7 +207,10 @@ def by_reach(name: str, scratch: Path, begin: int, end: int, corpus: Path) -> No
 
 
 def main() -> None:
-    name, begin, end, scratch = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+    name = sys.argv[1]
+    begin = int(sys.argv[2])
+    end = int(sys.argv[3])
+    scratch = Path(sys.argv[4])
     tempfile.tempdir = str(scratch / "tmp")
     os.makedirs(tempfile.tempdir, exist_ok=True)
     logging.disable()

@@ -59,9 +59,11 @@ def fit_line(kind: str, folder: Path, run: str) -> list[str]:
 
 def killed(line: list[str], run: Path, draw: random.Random) -> int | None:
     """Start a fit and kill it at a random moment; None where it was done before, else the signal."""
-    log, signum = run / "log.jsonl", signal.SIGTERM if draw.random() < 0.25 else signal.SIGKILL
+    log = run / "log.jsonl"
+    signum = signal.SIGTERM if draw.random() < 0.25 else signal.SIGKILL
     held = log.stat().st_size if log.exists() else 0
-    began, process = time.monotonic(), subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=environment())
+    began = time.monotonic()
+    process = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=environment())
     try:
         if draw.random() < _EARLY:
             time.sleep(draw.uniform(0.0, 5.0))
@@ -86,7 +88,8 @@ def environment() -> dict[str, str]:
 
 def check_whole(path: Path) -> int:
     """Every file of a run folder is whole; the step of its checkpoint, which is as far as the log says."""
-    run, logged = Run(path), 0
+    run = Run(path)
+    logged = 0
     for file in sorted(path.rglob("*")):
         if not file.is_file() or unfinished.PATTERN.fullmatch(file.name) or file.name.startswith("."):
             continue
@@ -130,7 +133,8 @@ def campaign(kind: str, folder: Path, kills: int, seed: int = 0) -> dict:
         Kind, kills, those by SIGTERM and before the first checkpoint, fits that were finished, how many of these are
         the undisturbed one to the last bit, and seconds.
     """
-    draw, began = random.Random(f"{kind} {seed}"), time.monotonic()
+    draw = random.Random(f"{kind} {seed}")
+    began = time.monotonic()
     subprocess.run(fit_line(kind, folder, f"{kind}-whole"), check=True, env=environment(), timeout=_LONGEST)
     wanted = outcome(folder / f"{kind}-whole")
     row = {"kind": kind, "kills": 0, "by SIGTERM": 0, "before a checkpoint": 0, "finished": 0, "same bits": 0}

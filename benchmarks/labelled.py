@@ -136,13 +136,16 @@ def _fill(folder: Path, source: Dataset, capture: Capture, parameters: dict) -> 
         (folder / part).mkdir(exist_ok=True)
     vectors = teacher.embeddings(names, parameters["seed"], capture.confusions)
     views = sorted(source.views, key=lambda view: view.name)
-    frames, tested, found = [], [], []
+    frames = []
+    tested = []
+    found = []
     counts = np.zeros(len(names) + 1, np.int64)
     with Bar("labels to features", len(views)) as bar:
         for k, view in enumerate(views):
             labels = _labels(view, source, capture)
             counts += np.bincount(labels.ravel(), minlength=len(counts))
-            stem, image = Path(view.name).name, Path(view.image_path)
+            stem = Path(view.name).name
+            image = Path(view.image_path)
             shutil.copyfile(image, folder / "images" / image.name)
             output.write_png(folder / "semantic_class" / f"{stem}.png", labels.astype(np.uint8))
             frame = {"file_path": f"images/{image.name}", **_camera(view)}
@@ -241,7 +244,8 @@ def main() -> None:
     with Bar("making the data set", show=True):
         folder = generate(args.name, args.output, args.offset, args.seed, size, args.mask_moving)
     counted = json.loads((folder / "labelled.json").read_text())
-    right, moving = counted["teacher"], 100 * counted["moving"]
+    right = counted["teacher"]
+    moving = 100 * counted["moving"]
     print(f"{counted['views']} photographs, {counted['test_views']} of them for testing, {counted['points']} points")
     print(f"teacher: {100 * right['pixel_accuracy']:.1f} % of the labelled pixels, mean IoU {right['miou']:.3f}")
     print(f"{moving:.1f} % of the labelled pixels are of classes that move")

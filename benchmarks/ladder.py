@@ -35,7 +35,8 @@ from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 
-BEGIN, END = "<!-- ladder: begin -->", "<!-- ladder: end -->"
+BEGIN = "<!-- ladder: begin -->"
+END = "<!-- ladder: end -->"
 FOVS = (20, 45, 70, 95, 120)
 STARTS = ("inria", "gsplat")
 PIXELS = 19_200  # 160 x 120
@@ -90,7 +91,8 @@ def office(fov: float, path: Path) -> tuple:
 def measure(scene: tuple, crop: int) -> dict:
     """A report a start."""
     g, cameras, background = scene
-    pictures, found = Pictures(g, cameras, crop), {}
+    pictures = Pictures(g, cameras, crop)
+    found = {}
     for name in STARTS:
         start = RenderSettings.preset(name, background=background)
         found[name] = rounded(ladder(g, cameras, start, pictures=pictures))
@@ -218,7 +220,8 @@ def page(result: dict, made: str) -> str:
         if not places:
             continue
         reports, others = ([found[place][start] for place in places] for start in STARTS)
-        heads, sizes = [f"{place}{unit}" for place in places], [found[place]["sigma"] for place in places]
+        heads = [f"{place}{unit}" for place in places]
+        sizes = [found[place]["sigma"] for place in places]
         out += [
             "",
             f"### {name}, from `{SHOWN}`",

@@ -30,7 +30,10 @@ from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.select import Cache, select  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
-KNOWN, CANDIDATES, NEW, PICKS = 2, 24, 2, 10
+KNOWN = 2
+CANDIDATES = 24
+NEW = 2
+PICKS = 10
 PRESETS = ("fast", "exact")
 
 
@@ -52,8 +55,11 @@ class Robot:
     """A loop of picks, one a call."""
 
     def __init__(self, g: Gaussians, cameras: list[Camera], preset: str, cache: Cache | None) -> None:
-        self.g, self.cache, self.settings = g, cache, drgs.RenderSettings.preset(preset)
-        self.known, self.left = cameras[:KNOWN], cameras[KNOWN : KNOWN + CANDIDATES]
+        self.g = g
+        self.cache = cache
+        self.settings = drgs.RenderSettings.preset(preset)
+        self.known = cameras[:KNOWN]
+        self.left = cameras[KNOWN : KNOWN + CANDIDATES]
         self.coming = cameras[KNOWN + CANDIDATES :]
         self.seconds: list[float] = []
         self.picks: list[str] = []
@@ -80,7 +86,8 @@ def report(r: dict) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for preset, row in r["rows"].items():
-        (all_a, all_b), (one_a, one_b) = row["all"], row["later"]
+        (all_a, all_b) = row["all"]
+        (one_a, one_b) = row["later"]
         cells = f"{all_a:.0f} s | {all_b:.0f} s | {all_a / all_b:.1f} | {one_a:.1f} s | {one_b:.1f} s"
         lines.append(f"| `{preset}` | {cells} | {one_a / one_b:.1f} |")
     return "\n".join(lines)
@@ -92,10 +99,12 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", help="do not touch docs/information.md")
     args = parser.parse_args()
     if args.quick:
-        g, size = drgs.testing.random_scene(0)[0].detach(), (24, 16)
+        g = drgs.testing.random_scene(0)[0].detach()
+        size = (24, 16)
     else:
         folder = Path(os.environ.get("DRGS_DATA") or ROOT.parent / "shared" / "data")
-        g, size = drgs.load_gaussians(folder / "splats/wolf/wolf.ply"), (220, 147)
+        g = drgs.load_gaussians(folder / "splats/wolf/wolf.ply")
+        size = (220, 147)
     cameras = around(g, size, KNOWN + CANDIDATES + NEW * PICKS)
     result: dict = {**ran(), "gaussians": len(g), "size": f"{size[0]}x{size[1]}", "rows": {}}
     for preset in PRESETS:

@@ -23,7 +23,8 @@ from drgs.lab.extremes import CASES  # noqa: E402
 from drgs.lab.refusals import REFUSALS  # noqa: E402
 from drgs.lab.stress import rows  # noqa: E402
 
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+BEGIN = "<!-- table: begin -->"
+END = "<!-- table: end -->"
 
 
 def main() -> int:

@@ -27,8 +27,11 @@ from drgs.scenes import kitchen  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 COUNTS = (2, 3, 4, 6, 8)
-CAMERAS, TIMES, SIZE = 9, 4, (64, 48)
-STEPS, GAUSSIANS = 240, 1200
+CAMERAS = 9
+TIMES = 4
+SIZE = (64, 48)
+STEPS = 240
+GAUSSIANS = 1200
 
 
 def some(made: Path, folder: Path, count: int) -> Path:

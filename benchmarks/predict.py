@@ -23,7 +23,9 @@ from drgs.gain import Prior
 from drgs.select import Cache, select
 from drgs.studies.tables import fill_between
 
-VIEWS, STEPS, MORE = 6, 1000, 200
+VIEWS = 6
+STEPS = 1000
+MORE = 200
 ALONE = {"policy": "fisher", "blocks": ("geometry",)}
 RELATIVE = {**ALONE, "prior": Prior(1e-3, relative=True)}
 BOTH = ("geometry", "backdrop")
@@ -61,13 +63,15 @@ def drops(name: str, runs: Path) -> dict:
     """Scores and realised drops of every candidate of a scene."""
     trainer, pool, chosen, held_out = studies.base(name, runs, VIEWS, STEPS)
     left = [i for i in range(len(pool)) if i not in chosen]
-    train, settings = [pool[i] for i in chosen], trainer.config.settings
+    train = [pool[i] for i in chosen]
+    settings = trainer.config.settings
     g = trainer.gaussians()
     store = runs / "predict" / f"{name}.json"
     done = studies.read_rows(store, {})
     if "scores" not in done:
         cache = Cache()
-        candidates, known = [pool[i].camera for i in left], [frame.camera for frame in train]
+        candidates = [pool[i].camera for i in left]
+        known = [frame.camera for frame in train]
         told = {"settings": settings, "cache": cache, "masks": [frame.mask for frame in train]}
         done["scores"] = {
             label: select(g, candidates, known, **told, **options).scores for label, options in SCORES.items()

@@ -48,7 +48,8 @@ PEERS = {
 
 def run(name: str, data: Path, runs: Path) -> dict:
     """metrics.json of a fit, made now if it is not there, with the previews of its log."""
-    folder, (scene, options) = runs / name, FITS[name]
+    folder = runs / name
+    (scene, options) = FITS[name]
     if not (folder / "metrics.json").exists():
         source = data / scene
         if name.endswith("-sfm"):  # its photographs alone
@@ -77,9 +78,11 @@ def cross(runs: Path, data: Path, models: list[str]) -> list[tuple[str, list[flo
     from drgs.fitting.frames import load_frames
 
     _, test = load(data / "banana").split(8)
-    frames, rows = load_frames(test, SMALL["max_pixels"], "auto"), []
+    frames = load_frames(test, SMALL["max_pixels"], "auto")
+    rows = []
     for trained in models:
-        g, row = drgs.load_ply(runs / f"model-{trained}" / "point_cloud.ply"), []
+        g = drgs.load_ply(runs / f"model-{trained}" / "point_cloud.ply")
+        row = []
         for shown in ("exact", "inria", "fast"):
             values = []
             for frame in frames:
@@ -104,7 +107,8 @@ def report(results: dict, crossed: list, machine: str) -> str:
     for name, r in results.items():
         if name.startswith("model-"):
             continue
-        mean, (width, height) = r["mean"], r["size"][0]
+        mean = r["mean"]
+        (width, height) = r["size"][0]
         rows.append(
             f"| {name} | {r['train']} + {r['count']} | {width}x{height} | {r['points']} | {r['steps']:,} "
             f"| {r['seconds'] / 60:.1f} | {r['gaussians']:,} | {mean['psnr']:.2f} | {mean['ssim']:.3f} "

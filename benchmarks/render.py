@@ -149,7 +149,8 @@ def volprim_hits(gaussians, camera) -> int:
     origin = mi.Point3f(*[mi.Float(np.full(len(d), v, np.float32)) for v in camera.center])
     mean = mi.Float(gaussians.means.numpy().ravel())
     capacity = 400 * len(d)
-    used, pairs = mi.UInt32(0), dr.zeros(mi.UInt64, capacity)
+    used = mi.UInt32(0)
+    pairs = dr.zeros(mi.UInt64, capacity)
     lane = dr.arange(mi.UInt32, len(d))
 
     def body(o, go):
@@ -181,7 +182,8 @@ def volprim_hits(gaussians, camera) -> int:
 
 def hits() -> dict:
     """Share of the true hits that each traversal finds, and what one of them costs."""
-    g, cam = cubes.cube(), cubes.camera(256)
+    g = cubes.cube()
+    cam = cubes.camera(256)
     all_hits = Preset("fast").replace(transmittance_min=0.0)
     on_bvh = all_hits.replace(traversal="bvh", order="entry")
     true = int(drgs.render(g, cam, all_hits, outputs=("count",)).count.sum())
@@ -208,7 +210,8 @@ def peak_flops() -> float:
     """float32 operations a second of fused multiply-adds in registers: what a Dr.Jit kernel can reach here."""
     import drjit as dr
 
-    t, rounds = runtime.dr_types(), 20_000
+    t = runtime.dr_types()
+    rounds = 20_000
     start = [dr.opaque(t.Float, 1.0 + k, 1 << 16) for k in range(8)]
 
     def body(i, x):
@@ -229,7 +232,8 @@ def rates(seconds: float) -> dict:
     out = drgs.render(g, cam, Preset("fast"), outputs=("count",))
     # Every entry of a tile's list is tested on 64 pixels until the tile is opaque: an upper bound of the tests. One
     # test is about 62 operations (kernels.py: 31 for rho^2 and t*, 19 for exp, 12 for compositing).
-    tests, peak = 64.0 * out.certificate["pairs"], peak_flops()
+    tests = 64.0 * out.certificate["pairs"]
+    peak = peak_flops()
     return {
         "hits per second": float(out.count.sum()) / seconds,
         "tests per second at most": tests / seconds,
@@ -273,7 +277,8 @@ def task_memory() -> dict:
 def task_first() -> dict:
     """First frame of a process minus a warm one: tracing and compilation."""
     g, cam = cubes.cube(1000), cubes.camera(64)
-    run, times = backward(g, cam, Preset("fast")), []
+    run = backward(g, cam, Preset("fast"))
+    times = []
     for _ in range(4):
         start = time.perf_counter()
         run()
@@ -371,7 +376,8 @@ def main():
         return
     result = ran()
     with tempfile.TemporaryDirectory() as cache:
-        result["first"], result["second"] = child("first", cache), child("first", cache)
+        result["first"] = child("first", cache)
+        result["second"] = child("first", cache)
     result["memory"] = child("memory")
     turns = 2 if args.quick else 7
     result["headline"] = headline(turns)

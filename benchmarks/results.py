@@ -30,7 +30,8 @@ TOLD = {
 
 def text() -> str:
     """The four sections."""
-    at, parts = ran(), []
+    at = ran()
+    parts = []
     for name, experiment in EXPERIMENTS.items():
         study = study_of(experiment.study, "small", ROOT / "runs" / "studies" / "scenes")
         rows = read_study(ROOT / "benchmarks" / f"{experiment.study}.jsonl")

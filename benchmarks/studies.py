@@ -76,7 +76,8 @@ def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") ->
     size = SCALES[scale]
     config = FitConfig(max_pixels=size["max_pixels"], max_gaussians=size["max_gaussians"], max_steps=steps)
     chosen = initial_views([view.camera for view in train], views)
-    pool, held_out = load_frames(train, config.max_pixels), load_frames(test, config.max_pixels)
+    pool = load_frames(train, config.max_pixels)
+    held_out = load_frames(test, config.max_pixels)
     frames = [pool[i] for i in chosen]
     path = runs / "base" / f"{name}-{scale}-{views}-{steps}.safetensors"
     if path.exists():

@@ -43,7 +43,9 @@ METHODS = {
 
 def made_cube() -> tuple:
     """Random Gaussians in a cube, 20 cameras around it."""
-    g, rng, cameras = cube(15_000, scale=0.03, sh_degree=1), np.random.default_rng(0), []
+    g = cube(15_000, scale=0.03, sh_degree=1)
+    rng = np.random.default_rng(0)
+    cameras = []
     for k in range(20):
         eye = rng.normal(size=3)
         eye *= 4 / np.linalg.norm(eye)
@@ -71,7 +73,9 @@ def information(g, camera, settings, method: str, share: float) -> fisher.Inform
 
 def measure(g, train: list, candidates: list) -> list[dict]:
     """A row a method."""
-    views, found, seconds = [*train, *candidates], {}, {}
+    views = [*train, *candidates]
+    found = {}
+    seconds = {}
     for name, (settings, method, share) in METHODS.items():
         information(g, views[0], settings, method, share)  # compiles
         start = time.process_time()

@@ -49,7 +49,8 @@ ROWS = ROOT / "benchmarks" / "uncertainty.jsonl"
 
 def ause(scene: drgs.Gaussians, train: list[Frame], held_out: list[Frame], settings: drgs.RenderSettings) -> dict:
     """Map -> AUSE; and `covered`, the share of held-out pixels with alpha above 0.5."""
-    cameras, masks = [frame.camera for frame in train], [frame.mask for frame in train]
+    cameras = [frame.camera for frame in train]
+    masks = [frame.mask for frame in train]
     H = fisher.diagonal(scene, cameras, settings, masks=masks)
     sphere = fisher.backdrop_sphere(scene, [*cameras, *(frame.camera for frame in held_out)])
     H["backdrop"] = fisher.backdrop(scene, cameras, settings, sphere=sphere)
@@ -58,7 +59,9 @@ def ause(scene: drgs.Gaussians, train: list[Frame], held_out: list[Frame], setti
         counted = {group: x for group, x in H.items() if group != "backdrop" or which == "both"}
         weights[name] = variances(counted, prior)
     maps: dict[str, list[torch.Tensor]] = {name: [] for name in (*MAPS, *PLAIN)}
-    wrong, covered, generator = [], [], torch.Generator().manual_seed(0)
+    wrong = []
+    covered = []
+    generator = torch.Generator().manual_seed(0)
     for frame in held_out:
         camera = frame.camera
         with torch.no_grad():
@@ -92,7 +95,8 @@ def measured(study: Study, cell: Cell, runs: Path) -> dict | None:
     known = json.loads((run.path / "selection.json").read_text())
     names = {one["name"] for one in (*known["start"], *known["picks"])}
     train, test = study.dataset(cell).split()
-    loaded, pixels = load_run(run), study.fit.max_pixels
+    loaded = load_run(run)
+    pixels = study.fit.max_pixels
     step = -(-len(test) // VIEWS)
     seen = load_frames([view for view in train if view.name in names], pixels)
     found = ause(loaded.gaussians, seen, load_frames(test[::step], pixels), study.fit.settings)
@@ -122,7 +126,8 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
     args = parser.parse_args()
-    study, rows = active.study_of(args.scale, args.runs), []
+    study = active.study_of(args.scale, args.runs)
+    rows = []
     if ROWS.exists():
         rows = [json.loads(line) for line in ROWS.read_text().splitlines()]
     units = [unit for unit in active.units_of(study, args.seeds, active.SETS[args.set]) if unit[3] == "blind"]

@@ -277,7 +277,8 @@ def rigid(w2c: Any) -> tuple[Any, Any]:
     Args:
         w2c: (4,4) or (3,4), NumPy or torch; gradients pass, and what they have across rigid motions is gone.
     """
-    R, t = w2c[:3, :3], w2c[:3, 3]
+    R = w2c[:3, :3]
+    t = w2c[:3, 3]
     inverse, rotation = R.T, R
     for _ in range(3):  # Newton's iterations: an error e becomes e^2
         inverse = 2 * inverse - inverse @ R @ inverse
@@ -305,7 +306,10 @@ def c2w_from_llff(pose: np.ndarray) -> np.ndarray:
     """LLFF pose (3,4) or (3,5), camera axes in columns (down, right, backward), to an OpenCV camera-to-world (4,4)."""
     pose = np.asarray(pose, dtype=np.float64)
     c2w = np.eye(4)
-    c2w[:3, 0], c2w[:3, 1], c2w[:3, 2], c2w[:3, 3] = pose[:, 1], pose[:, 0], -pose[:, 2], pose[:, 3]
+    c2w[:3, 0] = pose[:, 1]
+    c2w[:3, 1] = pose[:, 0]
+    c2w[:3, 2] = -pose[:, 2]
+    c2w[:3, 3] = pose[:, 3]
     return c2w
 
 
@@ -353,7 +357,8 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 0.0, 1.0)) -> np.ndarray:
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = rotation, -rotation @ eye
+    w2c[:3, :3] = rotation
+    w2c[:3, 3] = -rotation @ eye
     return w2c
 
 
@@ -388,7 +393,8 @@ def orbit(
     first = np.cross(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]), axis)
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
-    K, rise = intrinsics_from_fov(fov, width, height), np.radians(elevation)
+    K = intrinsics_from_fov(fov, width, height)
+    rise = np.radians(elevation)
     cameras = []
     for index in range(n):
         turn = 2 * np.pi * index / n

@@ -229,7 +229,9 @@ class DynamicGaussians:
                     f"DynamicGaussians: motion must be {len(gaussians)} floats, one a Gaussian, got {motion.dtype} of "
                     f"shape {tuple(motion.shape)}; pass None to let all move"
                 )
-        self.gaussians, self.field, self.motion = gaussians, field, motion
+        self.gaussians = gaussians
+        self.field = field
+        self.motion = motion
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -269,7 +271,9 @@ class DynamicGaussians:
             raise ArgumentError("DynamicGaussians.at: the view must have a time, got None; set Camera.time")
         fields = dict(parameters)
         phi = {name.removeprefix(PHI): fields.pop(name) for name in parameters if name.startswith(PHI)}
-        motion, means, index = fields.pop("motion", None), fields["means"], None
+        motion = fields.pop("motion", None)
+        means = fields["means"]
+        index = None
         if motion is not None:
             index = (motion.detach() >= 0).nonzero()[:, 0]  # who moves has no derivative
             means = means[index]
@@ -310,7 +314,8 @@ def _checked_bounds(bounds: ArrayLike | torch.Tensor) -> torch.Tensor:
             f"DeformationField: bounds must be (2, 3), lowest and highest corner, finite, got {box.tolist()}; take "
             "torch.stack([means.amin(0), means.amax(0)])"
         )
-    middle, size = box.mean(0), box[1] - box[0]
+    middle = box.mean(0)
+    size = box[1] - box[0]
     size = size.clamp_min(_FLATTEST * float(size.max()) or 1.0)
     return torch.stack([middle - size / 2, middle + size / 2])
 

@@ -136,11 +136,15 @@ def diagonal(
             Gaussians of a scene are not as many in all views.
     """
     backgrounds: list[tuple[float, ...]] = []
-    weights, channels = three_weights("fisher.diagonal", channel_weights), 3
+    weights = three_weights("fisher.diagonal", channel_weights)
+    channels = 3
     if splats or isinstance(gaussians, torch.Tensor):
         scene = _scene_of_tensors(gaussians, cameras, splats)
         settings = settings or RenderSettings.preset("gsplat")
-        gaussians, cameras, backgrounds, channels = scene.gaussians, scene.cameras, scene.backgrounds, scene.channels
+        gaussians = scene.gaussians
+        cameras = scene.cameras
+        backgrounds = scene.backgrounds
+        channels = scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
     check_any_scene("fisher.diagonal", gaussians)
     cameras = some_cameras("fisher.diagonal", cameras)

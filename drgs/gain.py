@@ -201,7 +201,8 @@ def variances(train: Information, prior: Prior | None = None) -> dict[str, torch
         ValueError: If the prior names a group that H does not have, or an entry of H is negative, NaN or infinite.
     """
     check("variances", train)  # else what is broken had the variance of what is perfectly known
-    lambdas, result = (prior or Prior()).per_group(train), {}
+    lambdas = (prior or Prior()).per_group(train)
+    result = {}
     for name, H in train.items():
         precision = H.to(torch.float64) + lambdas[name]
         # 1 / 0 would be inf and inf * 0 NaN; a variance of 0 drops the parameter from every criterion.
@@ -257,7 +258,8 @@ class _Diagonal:
                 raise ValueError(f"information_gain: weights must be of {', '.join(train)}, got {name!r}; drop it")
             if not 0 <= weight < math.inf:
                 raise ValueError(f"information_gain: weight of {name} must be in [0, inf), got {weight}; correct it")
-        self.criterion, self.weights = criterion, weights
+        self.criterion = criterion
+        self.weights = weights
         self.inverse = variances(train, prior)
         self.left_out = {name: int((x == 0).sum()) for name, x in self.inverse.items()}
         self.unseen = {name: (H == 0).to(torch.float64) for name, H in train.items()}
@@ -269,9 +271,13 @@ class _Diagonal:
     def __call__(self, candidate: Information) -> Gain:
         """The gain of one candidate."""
         _check_alike("candidate", candidate, self.inverse)
-        parts, unseen, terms_of = {}, {}, _TERMS[self.criterion]
+        parts = {}
+        unseen = {}
+        terms_of = _TERMS[self.criterion]
         for name, variance in self.inverse.items():
-            weight, seen_or_not, only_unseen = float(self.weights.get(name, 1.0)), 0.0, 0.0
+            weight = float(self.weights.get(name, 1.0))
+            seen_or_not = 0.0
+            only_unseen = 0.0
             rows = _told(candidate[name])
             each = (candidate[name], variance, self.wanted[name], self.unseen[name])
             chunks = (x[rows].flatten().split(_CHUNK) for x in each)
@@ -279,7 +285,8 @@ class _Diagonal:
                 terms = terms_of(new.to(torch.float64, copy=True).mul_(known), wanted)
                 seen_or_not += float(terms.sum())
                 only_unseen += float(terms @ is_unseen)
-            parts[name], unseen[name] = weight * seen_or_not, weight * only_unseen
+            parts[name] = weight * seen_or_not
+            unseen[name] = weight * only_unseen
         return Gain(_total(self.criterion, parts), parts, dict(self.left_out), unseen)
 
 
@@ -359,7 +366,8 @@ class _Blocks:
             raise ValueError(
                 f"block_gain: layout must cover 0..{train.shape[1] - 1} once, got {dict(layout)}; correct it"
             )
-        self.rounding, self.H = rounding, train
+        self.rounding = rounding
+        self.H = train
         diagonal = train.diagonal(dim1=1, dim2=2).to(torch.float64)
         lambdas = prior.per_group({name: diagonal[:, place] for name, place in layout.items()})
         self.added = torch.empty(train.shape[1], dtype=torch.float64)

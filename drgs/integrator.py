@@ -66,7 +66,8 @@ def render(
         Kerbl et al. 2023 (compositing, SH); Moenne-Loccoz et al. 2024 (response at the peak of the ray).
     """
     if isinstance(camera, list | tuple):
-        cameras, wanted = cameras_of_one_size("render", camera), _wanted(outputs)
+        cameras = cameras_of_one_size("render", camera)
+        wanted = _wanted(outputs)
         return _batch([_view(gaussians, each, settings, wanted, couple_features) for each in cameras])
     return _view(gaussians, camera, settings, _wanted(outputs), couple_features)
 
@@ -125,7 +126,8 @@ def render_jvp(
         tangents |= {f"phi.{name}": x for name, x in phi.items()}
     settings = settings or RenderSettings.preset("exact")
     # The tangents are given: a graph of torch would lead nowhere.
-    want, timed = _wanted(outputs) & {"depth"}, "time" in tangents and camera.time is not None
+    want = _wanted(outputs) & {"depth"}
+    timed = "time" in tangents and camera.time is not None
     call = Call(seen.detach(), camera, settings, want, scene=scene, couple=couple_features, timed=timed)
     with own_errors():
         return push_forward(call, tangents)

@@ -51,11 +51,9 @@ def compiled_for() -> Target | None:
     """The target of Dr.Jit's LLVM backend, which must have started; None where its library does not tell."""
     try:
         core = _core()
-        cpu, features, lanes = (
-            core._Z19jit_llvm_target_cpuv,
-            core._Z24jit_llvm_target_featuresv,
-            core._Z21jit_llvm_vector_widthv,
-        )
+        cpu = core._Z19jit_llvm_target_cpuv
+        features = core._Z24jit_llvm_target_featuresv
+        lanes = core._Z21jit_llvm_vector_widthv
     except (OSError, AttributeError):  # another version of Dr.Jit
         return None
     cpu.restype = features.restype = ctypes.c_char_p
@@ -76,7 +74,8 @@ def compile_for(text: str, where: str) -> None:
         ValueError: If it is not written so, the lanes are none of `LANES`, this machine lacks instructions, or this
             Dr.Jit cannot be told.
     """
-    found, here = _WRITTEN.fullmatch(text), _own()
+    found = _WRITTEN.fullmatch(text)
+    here = _own()
     if here is None or here.features is None or not _is_x86():
         raise ValueError(f"{where} must be left out but on x86-64 with Dr.Jit 1.5, got {platform.machine()}")
     if found is None or int(found["lanes"]) not in LANES or found["cpu"] not in _PROCESSORS:
@@ -90,7 +89,8 @@ def compile_for(text: str, where: str) -> None:
     if absent := [name for name in wanted if f"+{name}" not in here.features]:
         raise ValueError(f"{where} must be of instructions that {here.cpu} has, got {text!r} with {', '.join(absent)}")
     choose = _core()._Z19jit_llvm_set_targetPKcS0_j
-    choose.argtypes, choose.restype = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32), None
+    choose.argtypes = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32)
+    choose.restype = None
     choose(found["cpu"].encode(), None if features is None else features.encode(), int(found["lanes"]))
 
 

@@ -210,7 +210,8 @@ def evaluate(
         result = _evaluated(g, frames, settings, lpips, pictures, segmentation, moving, bar)
     result["scores"] = dict(result["mean"])
     if isinstance(segmentation, str):
-        result["segmentation"], result["reasons"]["segmentation"] = None, segmentation
+        result["segmentation"] = None
+        result["reasons"]["segmentation"] = segmentation
     elif segmentation is not None:
         found = result["segmentation"] = segmentation.result()
         numbers = [name for name in found["variants"] if name != "iou"]  # a list
@@ -229,7 +230,8 @@ def _evaluated(
     bar: Bar,
 ) -> dict:
     """`evaluate`, under a bar that it has begun."""
-    views, reasons = [], {}
+    views = []
+    reasons = {}
     if lpips is None:
         reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
     measured = None if isinstance(segmentation, str) else segmentation
@@ -330,7 +332,8 @@ def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, spl
     if viewers is None or not frames:
         return None
     frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
-    models, values = {"psnr": viewers, "own_psnr": settings}, {}
+    models = {"psnr": viewers, "own_psnr": settings}
+    values = {}
     with Bar("views as viewers of PLY files draw them", len(models) * len(frames)) as bar:
         for name, model in models.items():
             found = []

@@ -168,7 +168,8 @@ def sh_colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
     """max(0.5 + SH, 0) of coefficients (N, K, 3) for directions (..., N, 3) of any length."""
     length = towards.norm(dim=-1, keepdim=True)
     if sh.shape[1] == 1:  # no direction, so no gradient to it either
-        towards, length = torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 1)
+        towards = torch.zeros(1, 3, dtype=torch.float64)
+        length = torch.ones(1, 1)
     basis = sh_basis(towards / torch.where(length > 0, length, 1.0), sh.shape[1])
     return (0.5 + (basis[..., None] * sh).sum(-2)).clamp(min=0)
 
@@ -201,7 +202,8 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
                     f"window: must lie in the image of {cam.width}x{cam.height} pixels, got x, y, width, height = "
                     f"{tuple(window)}; correct it"
                 )
-            shape, inside = (height, width), inside.reshape(-1)
+            shape = (height, width)
+            inside = inside.reshape(-1)
             pixels, directions = pixels[inside], directions[inside]
         origins = center.expand_as(directions)
     else:
@@ -209,7 +211,8 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
             raise ValueError("window: must come with a camera's own rays, got rays; choose among them instead")
         pair = torch.broadcast_tensors(*map(float64, rays))
         shape = pair[0].shape[:-1]
-        origins, directions = pair[0].reshape(-1, 3) - offset, pair[1].reshape(-1, 3)
+        origins = pair[0].reshape(-1, 3) - offset
+        directions = pair[1].reshape(-1, 3)
         pixels = torch.zeros(len(directions), 2, dtype=torch.float64)
     directions = directions / directions.norm(dim=-1, keepdim=True)
     return SimpleNamespace(
@@ -225,7 +228,9 @@ def within(
     Compares each bounding sphere with the cone around the rays; rays without a common origin keep all.
     """
     # What is left out has no derivative; 1e-300 keeps 0 / 0 out of directions that do not matter.
-    n, o, d = len(scene.means), origins.detach(), directions.detach()
+    n = len(scene.means)
+    o = origins.detach()
+    d = directions.detach()
     if not len(d) or not bool((o == o[:1]).all()):
         return torch.ones(n, dtype=torch.bool)
     axis = d.mean(0)

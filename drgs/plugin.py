@@ -78,7 +78,8 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[nam
 
     def _trace(self, scene: Any, ray: Any) -> tuple[Any, Float]:
         """(Color3f, alpha) of every ray."""
-        lib, s = runtime.dr_types(), self.settings
+        lib = runtime.dr_types()
+        s = self.settings
         p, coefficients = _parameters(lib, scene)
         # Sensors are not differentiated.
         o, d = (list(dr.detach(v)) for v in (ray.o, dr.normalize(ray.d)))

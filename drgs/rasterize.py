@@ -28,7 +28,9 @@ __all__ = ["rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 # Defaults of gsplat's signature: another preset's own constants hold unless an argument differs from these.
-_NEAR, _FAR, _DILATION = 0.01, 1e10, 0.3
+_NEAR = 0.01
+_FAR = 1e10
+_DILATION = 0.3
 # What to do instead of an option that does not exist here.
 _RAYS = "use drgs.integrator.render_rays with your own rays"
 _LENSES = "lenses are traced by drgs.render with traversal='bvh'"
@@ -210,7 +212,8 @@ def _view(
         splats = splats.take(kept.nonzero()[:, 0])
     gaussians, shift = splats.gaussians(with_color="RGB" in mode)
     out = render(gaussians, camera, settings, outputs=("depth",) if "D" in mode else ())
-    alpha, channels = out.alpha[..., None], []
+    alpha = out.alpha[..., None]
+    channels = []
     if "RGB" in mode:
         width = 3 if splats.degree is not None else min(3, splats.colors.shape[1])
         color = out.rgb[..., :width] - shift * alpha
@@ -259,7 +262,9 @@ def _projected(
         a, b = half_axes.unbind(1)
         # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.
         sharp = torch.linalg.cross(a, b).square().sum(1)
-        xx, yy, xy = a.square().sum(1), b.square().sum(1), (a * b).sum(1)
+        xx = a.square().sum(1)
+        yy = b.square().sum(1)
+        xy = (a * b).sum(1)
         eps = settings.dilation
         blurred = sharp + eps * (xx + yy + eps)
         compensation = None

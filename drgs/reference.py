@@ -116,7 +116,8 @@ def render(
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
-    scene, view = activate(g, s), view_rays(g, cam, rays, window)
+    scene = activate(g, s)
+    view = view_rays(g, cam, rays, window)
     rotation, center, directions = view.rotation, view.center, view.directions
     if cam is not None:
         scene = cull_near(scene, rotation, center, s, tolerance)
@@ -162,12 +163,15 @@ def _project(
     if s.culling == "extent":
         return mean2d, rows, diagonal, None
     # Culling has no derivative.
-    m, cov, alpha = mean2d.detach(), diagonal.detach(), torch.sigmoid(scene.logits.detach())
+    m = mean2d.detach()
+    cov = diagonal.detach()
+    alpha = torch.sigmoid(scene.logits.detach())
     bounds = []
     for slack in (-tolerance, 0.0, tolerance):
         if s.culling == "inria":
             # 0.1 is the rasterizer's own floor; no derivative, as above.
-            mid, det = cov.mean(-1), cov.prod(-1) - rows.detach().prod(1).sum(-1) ** 2
+            mid = cov.mean(-1)
+            det = cov.prod(-1) - rows.detach().prod(1).sum(-1) ** 2
             largest = mid + (mid * mid - det).clamp(min=0.1).sqrt()
             radius = torch.ceil(3 * largest.sqrt() * (1 + slack))[:, None]
             # A pixel is at its integer there, hence the half.
@@ -204,7 +208,8 @@ def _in_window(
         first, last = bounds[-1]
         keep = ((last > torch.floor(low / _TILE)) & (first <= torch.floor(high / _TILE))).all(1)
         bounds = [(first[keep], last[keep]) for first, last in bounds]
-    screen, scene.screen = (mean2d[keep], rows[keep], diagonal[keep], bounds), None
+    screen = (mean2d[keep], rows[keep], diagonal[keep], bounds)
+    scene.screen = None
     return SimpleNamespace(**{**vars(take(scene, keep)), "screen": screen})
 
 
@@ -224,18 +229,22 @@ def _responses(
     to the nearest cut-off of existence, negative beyond it), distance from a to alpha_max, distance
     to the mean.
     """
-    away, form = scene.means - o[:, None, :], _FORMS[s.response]
+    away = scene.means - o[:, None, :]
+    form = _FORMS[s.response]
     rho2, t, length = form.meet(scene, s, rotation, away, d, pixels)
     a, rest = form.opacity(scene, rho2, t, length)
     # Where it is clamped, and how near to that, are numbers; the value of a clamp that the gradient passes is one, too.
-    over, to_max = (a > s.alpha_max).detach(), (a / s.alpha_max - 1).abs().detach()
-    top, left = torch.full_like(a, s.alpha_max), torch.full_like(a, 1 - s.alpha_max)
+    over = (a > s.alpha_max).detach()
+    to_max = (a / s.alpha_max - 1).abs().detach()
+    top = torch.full_like(a, s.alpha_max)
+    left = torch.full_like(a, 1 - s.alpha_max)
     if s.alpha_max_gradient == "pass":  # the value of the clamp with the derivative of a
         top, left = a + (top - a).detach(), rest + (left - rest).detach()
     a, rest = torch.where(over, top, a), torch.where(over, left, rest)
     with torch.no_grad():  # which hits exist, and in which order, has no derivative
         distance = away.norm(dim=-1)
-        exists, margin = torch.ones_like(over), torch.full_like(a, math.inf)
+        exists = torch.ones_like(over)
+        margin = torch.full_like(a, math.inf)
 
         def cut(inside: Tensor, relative: Tensor) -> None:
             exists.logical_and_(inside)
@@ -268,7 +277,8 @@ def _sway(scene: SimpleNamespace, o: Tensor, d: Tensor) -> Tensor:
     """(P, N) by how much a peak moves along its ray if means and origins are rounded: to float32 where they are world
     coordinates, to float64 where they become those of the camera.
     """
-    middle, rounding = scene.means.new_tensor(scene.middle), 0.0
+    middle = scene.means.new_tensor(scene.middle)
+    rounding = 0.0
     for origin, relative in ((middle, _FLOAT32), (0 * middle, _FLOAT64)):
         rounding = rounding + relative * ((scene.means - origin).norm(dim=-1) + (o - origin).norm(dim=-1)[:, None])
     turned = torch.einsum("nij,pj->pni", scene.whiten, d)
@@ -367,7 +377,8 @@ def _composite(
     stops = tested < s.transmittance_min
     if s.stop == "before_eq":
         stops = tested <= s.transmittance_min
-    alive, rank = exists & ~stops, exists.cumsum(dim=1)
+    alive = exists & ~stops
+    rank = exists.cumsum(dim=1)
     if s.max_hits:
         alive &= rank <= s.max_hits
     w = torch.where(alive, a * before, 0.0)

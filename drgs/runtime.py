@@ -344,7 +344,8 @@ def info() -> dict:
         try:
             usable, reason = status()
         except ImportError as problem:
-            usable, reason = False, f"drjit cannot be imported ({problem})"
+            usable = False
+            reason = f"drjit cannot be imported ({problem})"
         report[key] = {"available": usable, "reason": reason}
     report["cuda"]["device"] = machine.gpu_name() if report["cuda"]["available"] else None
     return report
@@ -357,7 +358,8 @@ def _wanted_variant(variant: str | None) -> str | None:
         current = sys.modules["mitsuba"].variant()
         variant = current if current in VARIANTS else None
     if variant in (None, "auto"):
-        where, variant = "drgs: DRGS_VARIANT", os.environ.get("DRGS_VARIANT") or None
+        where = "drgs: DRGS_VARIANT"
+        variant = os.environ.get("DRGS_VARIANT") or None
     if variant in (None, "auto"):
         return None
     if variant not in VARIANTS:
@@ -367,9 +369,11 @@ def _wanted_variant(variant: str | None) -> str | None:
 
 def _wanted_threads(threads: int | None) -> int | None:
     """The number asked for by argument or by environment; None: as many as there are cores."""
-    where, text = "setup: threads", typing.cast("int | str | None", threads)
+    where = "setup: threads"
+    text = typing.cast("int | str | None", threads)
     if threads is None:
-        where, text = "drgs: DRGS_THREADS", os.environ.get("DRGS_THREADS") or None
+        where = "drgs: DRGS_THREADS"
+        text = os.environ.get("DRGS_THREADS") or None
     if text is None:
         return None
     try:

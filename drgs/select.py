@@ -94,7 +94,8 @@ def select(
     """
     started = time.perf_counter()
     check_any_scene("select", gaussians)
-    candidates, train = camera_list("select", "candidates", candidates), camera_list("select", "train", train)
+    candidates = camera_list("select", "candidates", candidates)
+    train = camera_list("select", "train", train)
     if not candidates:
         raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
     if not (isinstance(k, int) and 1 <= k <= len(candidates)):
@@ -131,10 +132,13 @@ def select(
 
 def _returned(policy: str, pool: Pool, found: object) -> Selection:
     """What a policy has returned, if it is a choice from the pool."""
-    where, advice = f"select: policy {policy}", "make picks with pool.pick(index, score)"
+    where = f"select: policy {policy}"
+    advice = "make picks with pool.pick(index, score)"
     must_be(where, "what it returns", found, Selection, f"e.g. Selection(picks, scores); {advice}")
     assert isinstance(found, Selection)
-    picks, scores, count = found.picks, found.scores, len(pool.candidates)
+    picks = found.picks
+    scores = found.scores
+    count = len(pool.candidates)
     if not isinstance(picks, list | tuple) or any(not isinstance(pick, Pick) for pick in picks):
         raise ValueError(f"{where}: picks must be a list of Pick, got {kind_of(picks)}; {advice}")
     indices = [pick.index for pick in picks]

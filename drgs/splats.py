@@ -33,7 +33,9 @@ __all__ = [
     "scene_of",
 ]
 
-_LEAST_SCALE, _LEAST_OPACITY, _MOST_OPACITY = 1e-20, 1e-12, 1 - 2.0**-26
+_LEAST_SCALE = 1e-20
+_LEAST_OPACITY = 1e-12
+_MOST_OPACITY = 1 - 2.0**-26
 
 
 class SplatTensors(TypedDict, total=False):
@@ -133,7 +135,8 @@ def scene_of(where: str, splats: SplatTensors) -> SplatScene:
 
 def color_of(colors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, float]:
     """SH (N, 1, 3), features (N, D - 3) or None, and the shift of the first three channels, of plain colors (N, D)."""
-    first, rest = colors[:, :3], colors[:, 3:]
+    first = colors[:, :3]
+    rest = colors[:, 3:]
     # At exactly 0 the clamp would end the gradient; one half is exact and keeps black clear of it.
     # The shift is taken off the image again: whatever it is, the gradient is the same.
     shift = 0.5 - min(0.0, float(first.detach().min()) if first.numel() else 0.0)
@@ -204,7 +207,9 @@ def check_shapes(
             f"{where}: viewmats must have shape (..., C, 4, 4), got {tuple(viewmats.shape)}; add an axis for the "
             "cameras, viewmat[None]"
         )
-    lead, n, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
+    lead = tuple(means.shape[:-2])
+    n = means.shape[-2]
+    cameras = viewmats.shape[-3]
     if degree is None:
         shown: list[tuple] = [(n, "D"), (cameras, n, "D")]
     else:

@@ -95,10 +95,13 @@ def random_scene(
     local = np.stack([z * rng.uniform(-0.9, 0.9, count), z * rng.uniform(-0.75, 0.75, count), z], 1)
     log_scales = math.log(0.25) + 0.7 * rng.normal(size=(count, 3))
     logits = 1.5 * rng.normal(size=count)
-    opaque, near, behind = count // 3, count // 8, max(2, count // 15)
+    opaque = count // 3
+    near = count // 8
+    behind = max(2, count // 15)
     logits[:opaque] = rng.uniform(3, 5, opaque)
     # Clamped alpha needs a center within a tenth of sigma of a pixel's, and not on it: there its slope is 0.
-    turn, sigma = rng.uniform(0, 2 * np.pi, near), 2.5
+    turn = rng.uniform(0, 2 * np.pi, near)
+    sigma = 2.5
     pixel = np.floor(rng.uniform((4, 4), (width - 4, height - 4), (near, 2))) + 0.5
     pixel += 0.03 * sigma * np.stack([np.cos(turn), np.sin(turn)], 1)
     depth = rng.uniform(1.5, 1.9, near)

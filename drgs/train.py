@@ -151,7 +151,8 @@ def _fit(
     if tensors is not None and header is not None:
         made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
-        seconds, source = seconds_of(run, header) or 0.0, header["point_source"]
+        seconds = seconds_of(run, header) or 0.0
+        source = header["point_source"]
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
         trainer, source = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
@@ -266,8 +267,14 @@ class _Loop:
         taught: SemanticRecord | None,
         measured: Callable[[], dict],
     ) -> None:
-        self.run_folder, self.trainer, self.held_out, self.source = run, trainer, held_out, source
-        self.seconds, self.plan, self.taught, self._measured = seconds, plan, taught, measured
+        self.run_folder = run
+        self.trainer = trainer
+        self.held_out = held_out
+        self.source = source
+        self.seconds = seconds
+        self.plan = plan
+        self.taught = taught
+        self._measured = measured
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
@@ -328,7 +335,8 @@ class _Loop:
         keep_previous(self.run_folder)
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index, seconds=self.seconds)
-        self._saved, self._saved_at = now, time.monotonic()
+        self._saved = now
+        self._saved_at = time.monotonic()
 
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""

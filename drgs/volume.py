@@ -151,7 +151,8 @@ def render_volume(
         raise ValueError(
             f"reference.render_volume: split must be >= 1 and tolerance in (0, 1), got {split}, {tolerance}"
         )
-    scene, view = activate(g, s), view_rays(g, cam, rays, window)
+    scene = activate(g, s)
+    view = view_rays(g, cam, rays, window)
     scene.softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
     if cam is not None:
         scene = cull_near(scene, view.rotation, view.center, s, 0.0)
@@ -160,7 +161,8 @@ def render_volume(
     # What can be left out, and where to sum, are choices without a derivative.
     reach = (2 * torch.log((scene.softplus.detach() / _CUT).clamp(min=1))).sqrt()
     keep = within(scene, reach, view.origins, view.directions)
-    scene, reach = take(scene, keep), reach[keep]
+    scene = take(scene, keep)
+    reach = reach[keep]
     if s.sh_direction == "gaussian" and view.center is not None:
         scene.colors = sh_colors(scene.sh, scene.means - view.center)
     parts = [
@@ -188,7 +190,8 @@ def _chunk(
         M = int(used.sum(1).max()) if used.numel() else 0
         # Those that are used, nearest first, padded with others that get tau = 0.
         order = torch.where(used, t, math.inf).argsort(dim=1, stable=True)[:, :M]
-        index, used = index[order], used.gather(1, order)
+        index = index[order]
+        used = used.gather(1, order)
     differentiate = torch.is_grad_enabled()
 
     def line(o: Tensor, d: Tensor) -> tuple[Tensor, ...]:
@@ -214,7 +217,8 @@ def _chunk(
         h = (h / split).repeat_interleave(split)
         nodes = tried + torch.bincount(ray, minlength=len(o)) * (2 * len(_NODES) - 1)
     shape = (len(o), made.values.shape[-1])
-    total, moment = torch.zeros(shape, dtype=torch.float64), torch.zeros(len(o), dtype=torch.float64)
+    total = torch.zeros(shape, dtype=torch.float64)
+    moment = torch.zeros(len(o), dtype=torch.float64)
     with torch.no_grad():  # only says which Gaussians matter where
         batches = list(_batches(fixed, ray, a, h))
     for part, active in batches:
@@ -260,7 +264,8 @@ def _plan(line: _Line, tolerance: float) -> tuple:
     last = torch.where(line.tau > 0, line.t + _FAR / line.slope, 0.0)
     b = last.amax(1) if last.numel() else torch.zeros(rays, dtype=torch.float64)
     ray = torch.nonzero(b > 0)[:, 0]
-    b, a = b[ray], torch.zeros(len(ray), dtype=torch.float64)
+    b = b[ray]
+    a = torch.zeros(len(ray), dtype=torch.float64)
     accepted = [(ray[:0], a[:0], a[:0])]
     for _ in range(_ROUNDS):
         if not len(ray):
@@ -349,7 +354,8 @@ def _integrate(
     gauss[1::2] = torch.tensor(_GAUSS + _GAUSS[::-1], dtype=torch.float64) / 2
     if before is None:
         before = _depths(line, ray, a, h)[0].sum(1)
-    pick, row = active.clamp(min=0), ray[:, None]
+    pick = active.clamp(min=0)
+    row = ray[:, None]
     tau = torch.where(active >= 0, line.tau[row, pick], 0.0)
     slope = line.slope[row, pick]
     offset = a[:, None] - line.t[row, pick]

@@ -30,7 +30,8 @@ def noise(rng, height, width, cells, octaves=4, stretch=1.0):
     """
     import cv2
 
-    total, weight = np.zeros((height, width), np.float32), 0.0
+    total = np.zeros((height, width), np.float32)
+    weight = 0.0
     for octave in range(octaves):
         nx = min(cells << octave, width)
         ny = int(max(2, min(height, round(nx * stretch * height / width))))
@@ -62,7 +63,10 @@ def spline(points, count):
     s = np.linspace(0, len(p) - 3, 16 * count)
     i = np.minimum(s.astype(int), len(p) - 4)
     t = (s - i)[:, None]
-    a, b, c, d = p[i], p[i + 1], p[i + 2], p[i + 3]
+    a = p[i]
+    b = p[i + 1]
+    c = p[i + 2]
+    d = p[i + 3]
     curve = 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     at = np.linspace(0, length[-1], count)
@@ -148,7 +152,10 @@ def box(size, center, turn):
     corners = ((1, 5, 3, 7), (4, 0, 6, 2), (0, 4, 1, 5), (6, 2, 7, 3), (4, 6, 5, 7), (2, 0, 3, 1))
     faces = []
     for k, quad in enumerate(corners):  # lower left, lower right, upper left, upper right
-        u, v, e = k % 3 / 3, 0.5 - k // 3 / 2, 2e-3  # e: lookups stay inside their cell
+        # e: lookups stay inside their cell
+        u = k % 3 / 3
+        v = 0.5 - k // 3 / 2
+        e = 2e-3
         uv = np.meshgrid((u + e, u + 1 / 3 - e), (v + e, v + 0.5 - e))
         faces.append(grid(p[list(quad)].reshape(2, 2, 3), uv=np.stack(uv, -1)))
     return join(faces)
@@ -254,7 +261,8 @@ def first_hits(scene, K, c2w, width, height):
     origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in c2w[:3, 3]))
     ray = mi.Ray3f(origin, mi.Vector3f(*(mi.Float(d[:, k].copy()) for k in range(3))))
     hit = scene.ray_intersect_preliminary(ray, coherent=True)
-    t, number = hit.t.numpy(), dr.reinterpret_array(mi.UInt32, hit.shape).numpy()
+    t = hit.t.numpy()
+    number = dr.reinterpret_array(mi.UInt32, hit.shape).numpy()
     return np.where(np.isfinite(t), t, 0).reshape(height, width), number.reshape(height, width)
 
 
@@ -287,10 +295,12 @@ def dome(views, seed, center, distance, arc, elevations):
         eye *= distance * (1 + 0.07 * jitter[2])
         forward = center + 0.03 * distance * jitter[3:6] - eye
         forward /= np.linalg.norm(forward)
-        (right, down, _), roll = axes(forward).T, np.radians(3.0 * jitter[6])
+        (right, down, _) = axes(forward).T
+        roll = np.radians(3.0 * jitter[6])
         poses[i, :3, 0] = np.cos(roll) * right + np.sin(roll) * down
         poses[i, :3, 1] = np.cos(roll) * down - np.sin(roll) * right
-        poses[i, :3, 2], poses[i, :3, 3] = forward, eye
+        poses[i, :3, 2] = forward
+        poses[i, :3, 3] = eye
     return poses
 
 

@@ -6,7 +6,9 @@ import numpy as np
 
 __all__ = ["SparsePoints", "back_project", "project", "sparse_points", "write_model"]
 
-_SIDE, _ALONG = 0.002, 0.006  # standard deviations in every direction and along the ray, shares of the distance
+# standard deviations in every direction and along the ray, shares of the distance
+_SIDE = 0.002
+_ALONG = 0.006
 _OUTLIERS = 0.02  # share of the points that were matched wrongly, and how far along the ray they are
 _FAR = (0.6, 1.5)
 _PIXEL = 0.5  # standard deviation of what is observed, in pixels
@@ -25,7 +27,12 @@ class SparsePoints:
     """
 
     def __init__(self, xyz, exact, rgb, label, outlier, tracks):
-        self.xyz, self.exact, self.rgb, self.label, self.outlier, self.tracks = xyz, exact, rgb, label, outlier, tracks
+        self.xyz = xyz
+        self.exact = exact
+        self.rgb = rgb
+        self.label = label
+        self.outlier = outlier
+        self.tracks = tracks
 
 
 def back_project(K, c2w, depth):
@@ -61,7 +68,8 @@ def sparse_points(K, poses, views, count, seed):
     import cv2
 
     rng = np.random.default_rng([seed, 21])
-    each, found = max(1, round(count / len(poses))), []
+    each = max(1, round(count / len(poses)))
+    found = []
     for k, c2w in enumerate(poses):
         image, depth, labels = views(k)
         gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
@@ -75,7 +83,8 @@ def sparse_points(K, poses, views, count, seed):
     outlier = rng.random(len(exact)) < _OUTLIERS
     along = np.where(outlier, rng.uniform(*_FAR, len(exact)) - 1, _ALONG * rng.standard_normal(len(exact)))
     xyz = exact + along[:, None] * ray + _SIDE * far * rng.standard_normal(exact.shape)
-    tracks, seen = [], np.zeros(len(exact), int)
+    tracks = []
+    seen = np.zeros(len(exact), int)
     for k, c2w in enumerate(poses):
         _, depth, _ = views(k)
         height, width = depth.shape
@@ -104,7 +113,8 @@ def write_model(folder, K, poses, names, width, height, points):
     (folder / "cameras.txt").write_text(
         f"1 PINHOLE {width} {height} {K[0, 0]:.17g} {K[1, 1]:.17g} {K[0, 2]:.17g} {K[1, 2]:.17g}\n"
     )
-    lines, observed = [], [[] for _ in points.xyz]
+    lines = []
+    observed = [[] for _ in points.xyz]
     for k, (c2w, name, (ids, pixels)) in enumerate(zip(poses, names, points.tracks, strict=True)):
         rotation = c2w[:3, :3].T
         pose = [*_quaternion(rotation), *(-rotation @ c2w[:3, 3])]

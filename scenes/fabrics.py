@@ -22,7 +22,8 @@ def plaster(rng, color, kind, height=320, width=640):
         out[(x % 40) < 2] = 0.62 * color
     elif kind == "rings":
         cell = 40
-        u, v = (x + cell // 2 * ((y // cell) % 2)) % cell - cell / 2, y % cell - cell / 2
+        u = (x + cell // 2 * ((y // cell) % 2)) % cell - cell / 2
+        v = y % cell - cell / 2
         radius = np.hypot(u, v)
         out[np.abs(radius - 13) < 2.2] = 0.66 * color
         out[radius < 4.5] = 0.5 * color + (70, 50, 10)
@@ -126,7 +127,8 @@ def art(rng, kind, height=256, width=320):
     else:
         out = ramp(noise(rng, height, width, 5), (40, 58, 66), (74, 98, 100))
         for _ in range(7):
-            at, tone = rng.integers((50, 40), (width - 50, height - 60)), rng.integers((170, 70, 60), (250, 190, 150))
+            at = rng.integers((50, 40), (width - 50, height - 60))
+            tone = rng.integers((170, 70, 60), (250, 190, 150))
             cv2.line(out, at.tolist(), (width // 2, height), (60, 110, 64), 4, cv2.LINE_AA)
             for angle in range(0, 360, 45):
                 tip = at + 20 * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
@@ -168,7 +170,8 @@ def outdoors(rng, height=256, width=320):
     for dx in (14, 58):
         cv2.rectangle(out, (x + dx, 136), (x + dx + 22, 162), (70, 84, 98), -1)
     for _ in range(26):
-        at, r = rng.integers((0, 118), (width, 180)), int(rng.integers(12, 28))
+        at = rng.integers((0, 118), (width, 180))
+        r = int(rng.integers(12, 28))
         cv2.circle(out, at.tolist(), r, (rng.integers((60, 104, 48), (110, 150, 80))).tolist(), -1, cv2.LINE_AA)
     lawn = ramp(noise(rng, height, width, 40), (104, 142, 66), (146, 178, 92))
     out[184:] = lawn[184:]

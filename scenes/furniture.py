@@ -39,7 +39,8 @@ def soft(size, center, power=0.3, repeat=1.0):
     def bent(wave, exponent):
         return np.sign(wave) * np.abs(wave) ** exponent
 
-    up, around = np.linspace(-np.pi / 2, np.pi / 2, 40), np.linspace(-np.pi, np.pi, 81)
+    up = np.linspace(-np.pi / 2, np.pi / 2, 40)
+    around = np.linspace(-np.pi, np.pi, 81)
     level = bent(np.cos(up), power)[:, None]
     parts = level * bent(np.cos(around), power), level * bent(np.sin(around), power), bent(np.sin(up), power)[:, None]
     points = np.stack(np.broadcast_arrays(*parts), -1) * np.asarray(size) / 2
@@ -137,15 +138,19 @@ def chair(wood, seat):
 
 def bookcase(rng, wood, clay):
     """Five boards, rows of books, and a vase."""
-    wide, deep, high = rng.uniform(0.9, 1.25), 0.3, rng.uniform(1.85, 2.05)
+    wide = rng.uniform(0.9, 1.25)
+    deep = 0.3
+    high = rng.uniform(1.85, 2.05)
     case = [slab((0.035, deep, high), (s * wide / 2, deep / 2, high / 2), 0.8) for s in (-1, 1)]
     levels = np.linspace(0.08, high - 0.02, 6)
     case += [slab((wide, deep, 0.03), (0, deep / 2, z), 0.8) for z in levels]
     case.append(slab((wide, 0.02, high), (0, 0.01, high / 2), 0.8))
     yield "shelf", join(case), SATIN, wood
-    books, empty = [], int(rng.integers(1, 4))
+    books = []
+    empty = int(rng.integers(1, 4))
     for level, z in enumerate(levels[:-1]):
-        x, end = -wide / 2 + 0.04, wide / 2 - 0.06
+        x = -wide / 2 + 0.04
+        end = wide / 2 - 0.06
         end -= rng.uniform(0.1, 0.45) if level != empty else 0.55 * wide
         while x < end:
             thick, tall, long = rng.uniform((0.025, 0.2, 0.16), (0.055, 0.29, 0.22))
@@ -160,7 +165,9 @@ def bookcase(rng, wood, clay):
 
 def cabinet(rng, wood, clay):
     """A sideboard with doors, a vase and books on it."""
-    wide, deep, high = rng.uniform(1.2, 1.5), 0.42, 0.72
+    wide = rng.uniform(1.2, 1.5)
+    deep = 0.42
+    high = 0.72
     yield "cabinet", slab((wide, deep, high - 0.12), (0, deep / 2, high / 2 + 0.06), 0.9), SATIN, wood
     fronts = [
         slab((wide / 3 - 0.03, 0.02, high - 0.18), ((k - 1) * wide / 3, deep, high / 2 + 0.06), 0.9) for k in range(3)
@@ -205,8 +212,11 @@ def plant(rng, clay):
     yield "plant", revolve(np.array(pot), segments=48), SATIN, clay
     leaves, stems = [], []
     for k in range(22):
-        turn, lean, high = 2.4 * k + rng.uniform(-0.3, 0.3), rng.uniform(0.08, 0.3), rng.uniform(0.25, 0.95)
-        way, up = np.array([np.cos(turn), np.sin(turn), 0]), np.array([0, 0, 1.0])
+        turn = 2.4 * k + rng.uniform(-0.3, 0.3)
+        lean = rng.uniform(0.08, 0.3)
+        high = rng.uniform(0.25, 0.95)
+        way = np.array([np.cos(turn), np.sin(turn), 0])
+        up = np.array([0, 0, 1.0])
         path = spline(
             np.array([0.27 * up, 0.4 * lean * way + (0.27 + 0.6 * high) * up, lean * way + (0.3 + high) * up]), 10
         )
@@ -242,7 +252,8 @@ def door(rng, color):
 def window(rng, width, height, middle, glow):
     """A frame with bars and a sill, and daylight."""
     yield "window", flat(width, height, (0, 0.012, middle)), MATTE, fabrics.outdoors(rng), False, glow
-    low, high = middle - height / 2, middle + height / 2
+    low = middle - height / 2
+    high = middle + height / 2
     bars = [slab((0.07, 0.06, height + 0.14), (s * (width / 2 + 0.03), 0.03, middle), 1) for s in (-1, 1)]
     bars += [slab((width + 0.06, 0.06, 0.07), (0, 0.03, z), 1) for z in (low - 0.03, high + 0.03)]
     bars += [slab((0.045, 0.04, height), (0, 0.03, middle), 1), slab((width, 0.035, 0.035), (0, 0.03, middle + 0.2), 1)]

@@ -61,7 +61,10 @@ _BACK = ((-0.38, 0.235), (-0.145, 0.25), (0.125, 0.25), (0.365, 0.235))  # (x, y
 
 _FOV_X = 46.0  # degrees across the image width
 _TARGET = (0.0, 0.05, 0.085)
-_ARC, _DISTANCE, _ELEVATIONS = 88.0, 1.08, (20.0, 33.0)  # degrees, meters, degrees
+# degrees, meters, degrees
+_ARC = 88.0
+_DISTANCE = 1.08
+_ELEVATIONS = (20.0, 33.0)
 _EXPOSURE = 1.25
 # Samples of the lights, beside one of the surface, of each light path; the light `room` stands for further bounces.
 _LIGHT_SAMPLES = 3
@@ -71,7 +74,8 @@ _POINTS = 8000  # sparse points that are drawn
 def parts(seed):
     """Yields what is in the kitchen: `Mover`s, and for what stands still the arguments of `scenes.shape`."""
     rng = np.random.default_rng([seed, 31])
-    accents, light = rng.permutation(np.array(_ACCENTS)), rng.permutation(np.array(_LIGHT))
+    accents = rng.permutation(np.array(_ACCENTS))
+    light = rng.permutation(np.array(_LIGHT))
     order = list(itertools.permutations(_STATIONS))[(5 * seed + 2) % 6]  # six seeds, six arrangements
     for_mug, for_jelly, for_tongs = (np.array(at) + rng.uniform(-0.012, 0.012, 2) for at in order)
     back = [np.array(at) + rng.uniform(-0.02, 0.02, 2) * (1, 0.5) for at in rng.permutation(np.array(_BACK))]
@@ -108,7 +112,8 @@ class Stage:
 
     def __init__(self, seed):
         mi = runtime.mitsuba()
-        placed, self.movers = [], {}
+        placed = []
+        self.movers = {}
         for k, part in enumerate(parts(seed)):
             if isinstance(part, Mover):
                 self.movers[f"part{k:03d}"] = part
@@ -152,7 +157,8 @@ def intrinsics(width, height):
 def arc(cameras, seed):
     """Camera-to-world matrices (cameras, 4, 4): cam00 in the middle, the others from left to right around it."""
     rng = np.random.default_rng([seed, 32])
-    poses, middle = np.tile(np.eye(4), (cameras, 1, 1)), cameras // 2
+    poses = np.tile(np.eye(4), (cameras, 1, 1))
+    middle = cameras // 2
     places = [middle, *(k for k in range(cameras) if k != middle)]
     for pose, place, jitter in zip(poses, places, rng.uniform(-1, 1, (cameras, 6)), strict=True):
         part = (place - middle) / max(cameras - 1, 1)
@@ -163,7 +169,8 @@ def arc(cameras, seed):
         eye = np.array(_TARGET) + _DISTANCE * (1 + 0.04 * jitter[2]) * way
         forward = np.array(_TARGET) + 0.015 * jitter[3:6] - eye
         forward /= np.linalg.norm(forward)
-        pose[:3, :3], pose[:3, 3] = scenes.axes(forward), eye
+        pose[:3, :3] = scenes.axes(forward)
+        pose[:3, 3] = eye
     return poses
 
 
@@ -172,10 +179,17 @@ class _Recording:
     """Films a kitchen into a folder, frame by frame, and makes the data set of what was filmed."""
 
     def __init__(self, folder, poses, times, size, teacher_size, spp, seed):
-        self.folder, self.poses, self.times, (self.width, self.height) = folder, poses, times, size
-        self.teacher_size, self.spp, self.seed, self.K = teacher_size, scenes.strata(spp), seed, intrinsics(*size)
+        self.folder = folder
+        self.poses = poses
+        self.times = times
+        (self.width, self.height) = size
+        self.teacher_size = teacher_size
+        self.spp = scenes.strata(spp)
+        self.seed = seed
+        self.K = intrinsics(*size)
         digits = max(2, len(str(len(poses) - 1)))  # readers sort by name
-        self.names, self.digits = [f"cam{k:0{digits}d}" for k in range(len(poses))], max(4, len(str(times - 1)))
+        self.names = [f"cam{k:0{digits}d}" for k in range(len(poses))]
+        self.digits = max(4, len(str(times - 1)))
         for name in ("rgb_feature_langseg", "frame0/images", "frame0/sparse/0", *map("frames/{}".format, self.names)):
             (folder / name).mkdir(parents=True, exist_ok=True)
         for name in self.names:
@@ -188,7 +202,8 @@ class _Recording:
 
     def paths(self, camera, k):
         """(image, labels, features) of a camera's frame; images are gone when the videos are made."""
-        name, number = self.names[camera], f"{k:0{self.digits}d}"
+        name = self.names[camera]
+        number = f"{k:0{self.digits}d}"
         return (
             self.folder / "frames" / name / f"{number}.png",
             self.folder / "semantic_class" / name / f"semantic_class_{number}.png",
@@ -215,7 +230,8 @@ class _Recording:
         import mitsuba as mi
 
         image_path, label_path, feature_path = self.paths(camera, k)
-        c2w, number = self.poses[camera], k * len(self.poses) + camera
+        c2w = self.poses[camera]
+        number = k * len(self.poses) + camera
         labels, points, _ = self._seen(camera)
         feature = teacher.feature_map(labels, points, CLASSES, self.teacher_size, self.seed, number, CONFUSIONS)
         sensor = scenes.sensor(self.K, self.width, self.height)
@@ -237,7 +253,8 @@ class _Recording:
         """What belongs to all frames; with poses_bounds.npy, the last file, the data set is complete."""
         import cv2
 
-        folder, first = self.folder, []
+        folder = self.folder
+        first = []
         vectors = teacher.embeddings(CLASSES, self.seed, CONFUSIONS)
         np.save(folder / "text_embeddings.npy", vectors)
         some = [(c, k) for k in range(0, self.times, 10) for c in range(len(self.poses))]

@@ -25,7 +25,8 @@ def build(parts, classes, lights=None):
     mi = runtime.mitsuba()
     import drjit as dr
 
-    content, materials = {"type": "scene"}, {}
+    content = {"type": "scene"}
+    materials = {}
     for k, (name, mesh, bsdf, paint, *rest) in enumerate(parts):
         # Pictures are told apart by their identity: `parts` keeps them all.
         color = tuple(paint) if np.ndim(paint) == 1 else id(paint)

@@ -64,7 +64,8 @@ def _rigid(mesh, pose):
 
 def _wave(rng, low, high):
     """A sine of the time, of `low` to `high` periods in the sequence, with a phase that is drawn."""
-    periods, phase = rng.uniform(low, high), rng.uniform(0, 2 * np.pi)
+    periods = rng.uniform(low, high)
+    phase = rng.uniform(0, 2 * np.pi)
     return lambda time: np.sin(2 * np.pi * periods * time + phase)
 
 
@@ -75,7 +76,8 @@ def mug(rng, station, color, accent):
     body = revolve(spline(np.array([*profile, (0.042, 0.09), (0.041, 0.02), (0.036, 0.009), (0, 0.008)]), 80))
     curve = [(0.044, 0, 0.09), (0.07, 0, 0.092), (0.083, 0, 0.06), (0.068, 0, 0.03), (0.044, 0, 0.026)]
     handle = tube(spline(np.array(curve), 28), 0.007)
-    radii, start = rng.uniform((0.04, 0.03), (0.05, 0.045)), rng.uniform(0, 360)
+    radii = rng.uniform((0.04, 0.03), (0.05, 0.045))
+    start = rng.uniform(0, 360)
     slide, spin = _wave(rng, 0.8, 1.2), _wave(rng, 0.7, 1.1)
 
     def pose(time):
@@ -92,11 +94,13 @@ def _glaze(rng, color, accent, height=256, width=512):
     import cv2
 
     out = ramp(noise(rng, height, width, 20, 3), 0.93 * np.asarray(color), 1.03 * np.asarray(color))
-    accent, kind = tuple(float(v) for v in accent), rng.integers(3)
+    accent = tuple(float(v) for v in accent)
+    kind = rng.integers(3)
     for y, thick in ((0.87, 8), (0.82, 3), (0.58, 3), (0.52, 9)):
         cv2.line(out, (0, int(y * height)), (width, int(y * height)), accent, thick)
     for k in range(10):
-        x, y = int((k + 0.5) * width / 10), int(0.72 * height)
+        x = int((k + 0.5) * width / 10)
+        y = int(0.72 * height)
         if kind == 0:
             cv2.circle(out, (x, y), 17, accent, -1, cv2.LINE_AA)
             cv2.circle(out, (x, y), 8, (240, 230, 205), -1, cv2.LINE_AA)
@@ -113,7 +117,9 @@ def orange(rng, start, end):
     """Rolls from `start` to `end` (x, y) and back, without slipping."""
     phi = np.linspace(-np.pi / 2, np.pi / 2, 48)
     ball = revolve(ORANGE * np.stack([np.cos(phi), np.sin(phi)], 1), turn=(90, 25, 0), segments=64)
-    start, end, roll = np.asarray(start), np.asarray(end), _wave(rng, 0.45, 0.65)
+    start = np.asarray(start)
+    end = np.asarray(end)
+    roll = _wave(rng, 0.45, 0.65)
     way = (end - start) / np.linalg.norm(end - start)
     axis = np.cross(_UP, [*way, 0.0])
     way_length = np.linalg.norm(end - start)
@@ -146,9 +152,12 @@ def _peel(rng, height=256, width=512):
 # ---------------------------------------------------------------------------- articulated
 def tongs(rng, station, accent):
     """Two arms on a pin close on what lies at `station` (x, y), open, and are lifted a little meanwhile."""
-    turn, lean = np.radians(rng.uniform(-25, 25)), np.radians(rng.uniform(12, 26) * (1 if rng.random() < 0.5 else -1))
+    turn = np.radians(rng.uniform(-25, 25))
+    lean = np.radians(rng.uniform(12, 26) * (1 if rng.random() < 0.5 else -1))
     base = _rotation(turn * _UP) @ _rotation((lean, 0, 0))
-    grasp, lift, rock = _wave(rng, 1.6, 2.2), _wave(rng, 0.8, 1.1), _wave(rng, 0.7, 1.0)
+    grasp = _wave(rng, 1.6, 2.2)
+    lift = _wave(rng, 0.8, 1.1)
+    rock = _wave(rng, 0.7, 1.0)
     tip = np.array([*station, LEMON])
     closed = np.arcsin((LEMON + 0.004) / _ARM)
 
@@ -157,7 +166,8 @@ def tongs(rng, station, accent):
         return rotation, tip + rotation @ (0, 0, 0.97 * _ARM) + (0, 0, 0.014 * (1 + lift(time)))
 
     def arm(side):
-        mesh, half = _arm(side), np.radians(10.5)
+        mesh = _arm(side)
+        half = np.radians(10.5)
 
         def at(time):
             open_by = _rotation((0, -side * (closed + half * (1 + grasp(time))), 0))
@@ -179,7 +189,8 @@ def tongs(rng, station, accent):
 
 def _arm(side):
     """One arm of the tongs: a bowed strip from its tip, below, to the pin at the origin; `side` is where it bows to."""
-    v, angle = np.linspace(0, 1, 40), np.linspace(0, 2 * np.pi, 21)
+    v = np.linspace(0, 1, 40)
+    angle = np.linspace(0, 2 * np.pi, 21)
     wide = 0.014 + 0.007 * np.exp(-(((v - 0.07) / 0.09) ** 2))
     wide[[0, -1]] *= 0.4
     thick = np.where(v < 0.22, 0.0075, 0.005)
@@ -199,7 +210,8 @@ def jelly(rng, station, colors):
     angle = np.linspace(0, 2 * np.pi, 96, endpoint=False)
     fluting = 0.055 * np.cos(lobes * angle)[None] * np.clip(1.6 - 1.6 * profile[:, 1:] / JELLY, 0, 1)
     rest = revolve(profile, segments=96, bumps=fluting)
-    shape, uv = (60, 97), rest[2].reshape(60, 97, 2)
+    shape = (60, 97)
+    uv = rest[2].reshape(60, 97, 2)
     squash, shear_x, shear_y, twist = (_wave(rng, *r) for r in ((2.0, 2.6), (1.4, 2.0), (1.0, 1.6), (0.8, 1.4)))
     much = rng.uniform((0.12, 0.2, 0.12, 0.25), (0.17, 0.3, 0.2, 0.45))
 

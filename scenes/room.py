@@ -73,7 +73,8 @@ class Layout:
         self.rng = rng = np.random.default_rng([seed, 7])
         self.size = np.round(rng.uniform((4.8, 4.0, 2.55), (5.5, 4.5, 2.75)), 2)
         # Walls of the window and of the sofa; with the seed added, neighbors among the seeds are arranged differently.
-        self.sunny, self.cozy = 2 + (int(rng.integers(2)) + seed) % 2, (int(rng.integers(2)) + seed // 2) % 2
+        self.sunny = 2 + (int(rng.integers(2)) + seed) % 2
+        self.cozy = (int(rng.integers(2)) + seed // 2) % 2
 
     def at(self, wall, along, out=0.0, up=0.0):
         """(turn, shift) that put a piece's origin on a wall, `along` it to the right of who faces the room."""
@@ -149,7 +150,8 @@ def parts(seed):
 
 def _shell(layout):
     """Walls with baseboards, floor and ceiling."""
-    rng, (x, y, z) = layout.rng, layout.size
+    rng = layout.rng
+    (x, y, z) = layout.size
     accent, plain = rng.permutation(len(_WALLS))[:2]
     for wall in range(4):
         color, kind = _WALLS[accent if wall == layout.cozy else plain]
@@ -194,7 +196,8 @@ def _clear(built, poses):
     import mitsuba as mi
 
     k = np.arange(400) + 0.5
-    z, around = 1 - 2 * k / 400, np.pi * (1 + 5**0.5) * k
+    z = 1 - 2 * k / 400
+    around = np.pi * (1 + 5**0.5) * k
     level = np.sqrt(1 - z**2)
     ways = [mi.Float(v.astype(np.float32)) for v in (level * np.cos(around), level * np.sin(around), z)]
     out = poses.copy()
@@ -219,8 +222,12 @@ class _Views:
     """Traces the views of a room into a folder, and reads them again."""
 
     def __init__(self, folder, size, teacher_size, spp, seed):
-        self.folder, (self.width, self.height), self.teacher_size = folder, size, teacher_size
-        self.spp, self.seed, self.K = scenes.strata(spp), seed, _intrinsics(*size)
+        self.folder = folder
+        (self.width, self.height) = size
+        self.teacher_size = teacher_size
+        self.spp = scenes.strata(spp)
+        self.seed = seed
+        self.K = _intrinsics(*size)
         for name in ("images", "semantic_class", "depth", "rgb_feature_langseg", "sparse/0"):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
@@ -244,7 +251,8 @@ class _Views:
             image_path, label_path, depth_path, feature_path = self.paths(k)
             if not image_path.exists():
                 depth, numbers = scenes.first_hits(built, self.K, c2w, self.width, self.height)
-                labels, points = table[numbers], back_project(self.K, c2w, depth)
+                labels = table[numbers]
+                points = back_project(self.K, c2w, depth)
                 feature = teacher.feature_map(labels, points, CLASSES, self.teacher_size, self.seed, k)
                 scenes.aim(camera, c2w)
                 seed = self.seed * 65536 + k
@@ -266,7 +274,8 @@ class _Views:
 
     def finish(self, poses, test_every):
         """What belongs to all views: the COLMAP model, names, and how good the teacher is."""
-        folder, count = self.folder, len(poses)
+        folder = self.folder
+        count = len(poses)
         names = [self.paths(k)[0].name for k in range(count)]
         points = sparse_points(self.K, poses, self.read, _POINTS, self.seed)
         write_model(folder / "sparse" / "0", self.K, poses, names, self.width, self.height, points)

@@ -71,7 +71,8 @@ def _porcelain(rng, height=640, width=1024):
     for y, thick in bands:
         cv2.line(art, (0, int(y * height)), (width, int(y * height)), 255, thick)
     for k in range(8):
-        x, y = int((k + 0.5) * width / 8), int(0.63 * height)
+        x = int((k + 0.5) * width / 8)
+        y = int(0.63 * height)
         if k % 2:
             _petals(art, x, y, 34, (22, 10), 45, 200)
             cv2.circle(art, (x, y), 11, 255, -1, cv2.LINE_AA)
@@ -117,7 +118,8 @@ def _cover(rng, color, ink, title, lines):
     front = (np.array(color) * (0.88 + 0.12 * noise(rng, h, w, 40, 3)[..., None])).astype(np.uint8)
     back, spine = front.copy(), front.copy()
     for k in range(5):
-        a, line = 12 + 7 * k, ink if k % 2 else (240, 232, 210)
+        a = 12 + 7 * k
+        line = ink if k % 2 else (240, 232, 210)
         cv2.rectangle(front, (a, a), (w - a, h - a), line, 3)
     font = cv2.FONT_HERSHEY_DUPLEX
     cv2.putText(front, title, (62, 110), font, 1.7, ink, 4, cv2.LINE_AA)
@@ -230,7 +232,8 @@ def _fruits(rng):
     """Two apples, an orange, a pear and a lemon; yields as `_objects`."""
     phi = np.linspace(-np.pi / 2, np.pi / 2, 60)
     r, h = np.cos(phi), np.sin(phi)
-    top, bottom = np.exp(-((r / 0.3) ** 2)) * (h > 0), np.exp(-((r / 0.22) ** 2)) * (h < 0)
+    top = np.exp(-((r / 0.3) ** 2)) * (h > 0)
+    bottom = np.exp(-((r / 0.22) ** 2)) * (h < 0)
     apple = 0.047 * np.stack([r * (1 + 0.10 * h), 0.88 * h * (1 - 0.42 * top - 0.2 * bottom)], 1)
     wobble = 0.05 * (noise(rng, 60, 72, 3, 2) - 0.5) * r[:, None]
     red = ((222, 178, 62), (206, 92, 40), (168, 22, 28), (140, 12, 26))
@@ -242,7 +245,8 @@ def _fruits(rng):
     for name, center, turn, skin in apples:
         tilt = (9, 13, 0)
         mesh = list(revolve(apple, turn=tilt, bumps=wobble))
-        mesh[0], mesh[3] = turned(mesh[0], turn) + center, turned(mesh[3], turn)
+        mesh[0] = turned(mesh[0], turn) + center
+        mesh[3] = turned(mesh[3], turn)
         yield name, mesh, _GLAZE, skin
         stem = spline([(-0.006, 0.002, 0.02), (-0.001, 0, 0.04), (0.014, -0.008, 0.058)], 10)
         yield name + "_stem", tube(turned(stem, turn) + center, 0.0022), _MATTE, (92, 62, 36)
@@ -266,13 +270,16 @@ def _fruits(rng):
 def _bouquet(rng, mouth):
     """Stems, leaves and flowers that rise from the vase's mouth; yields as `_objects`."""
     stems, leaves = [], []
-    angle, out = np.linspace(0, 2 * np.pi, 145)[None], np.linspace(0, 1, 16)[:, None]
-    white, rose = ((244, 240, 226), (248, 226, 186)), ((222, 88, 112), (246, 184, 190))
+    angle = np.linspace(0, 2 * np.pi, 145)[None]
+    out = np.linspace(0, 1, 16)[:, None]
+    white = ((244, 240, 226), (248, 226, 186))
+    rose = ((222, 88, 112), (246, 184, 190))
     gold = ((244, 190, 54), (222, 116, 26))
     for k in range(9):
         turn = 2 * np.pi * k / 9 + rng.uniform(-0.2, 0.2)
         lean, height, size = rng.uniform((0.05, 0.07, 0.026), (0.13, 0.17, 0.036))
-        way, up = np.array([np.cos(turn), np.sin(turn), 0]), np.array([0, 0, 1.0])
+        way = np.array([np.cos(turn), np.sin(turn), 0])
+        up = np.array([0, 0, 1.0])
         path = [0.012 * way - 0.06 * up, 0.02 * way, 0.3 * lean * way + 0.55 * height * up]
         path = spline(mouth + np.array([*path, lean * way + height * up]), 24)
         stems.append(tube(path, 0.0022, 8))

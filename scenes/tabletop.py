@@ -62,7 +62,9 @@ def _tiles(rng, base, accent, side=40, across=30, up=9):
     out = ramp(noise(rng, height, width, 90, 4), 0.94 * base, 1.04 * base) * tone
     for i in range(up):
         for j in range(across):
-            x, y, kind = j * side + side // 2, i * side + side // 2, (3 * i + 2 * j + int(rng.integers(2))) % 7
+            x = j * side + side // 2
+            y = i * side + side // 2
+            kind = (3 * i + 2 * j + int(rng.integers(2))) % 7
             ink = tuple((accent * rng.uniform(0.85, 1.15)).tolist())
             if kind == 0:
                 cv2.circle(out, (x, y), 13, ink, 3, cv2.LINE_AA)
@@ -211,14 +213,17 @@ def herbs(rng, place, clay):
     yield "plant", revolve(pot, (*place, 0), segments=56), MATTE, paint
     leaves, stems = [], []
     for k in range(34):
-        turn, lean, high = 2.4 * k, rng.uniform(0.01, 0.075), rng.uniform(0.03, 0.13)
+        turn = 2.4 * k
+        lean = rng.uniform(0.01, 0.075)
+        high = rng.uniform(0.03, 0.13)
         way = np.array([np.cos(turn), np.sin(turn), 0])
         path = spline(
             np.array([(0, 0, 0.085), 0.5 * lean * way + (0, 0, 0.09 + 0.6 * high), lean * way + (0, 0, 0.09 + high)]), 8
         )
         stems.append(tube(path + (*place, 0), 0.002, 6))
         u, v = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(0, 1, 7))
-        wide, across = 0.019 * np.sin(np.pi * np.clip(v, 0.03, 1) ** 0.8), np.cross(way, (0, 0, 1.0))
+        wide = 0.019 * np.sin(np.pi * np.clip(v, 0.03, 1) ** 0.8)
+        across = np.cross(way, (0, 0, 1.0))
         blade = (u * wide)[..., None] * across + (0.05 * v)[..., None] * (0.8 * way + (0, 0, 0.35))
         leaves.append(grid(blade + (0.3 * wide * u**2 - 0.02 * v**2)[..., None] * (0, 0, 1.0) + path[-1] + (*place, 0)))
     yield "plant", join(stems), MATTE, (84, 110, 56)

@@ -55,7 +55,9 @@ CONFUSED = {
     "cabinet": "shelf", "shelf": "cabinet", "book": "shelf", "lamp": "vase", "vase": "lamp", "plant": "vase",
 }  # fmt: skip
 _NORM = 4.0
-_PATCH, _PLACE = 1.405, 1.881  # where a normal field of unit variance exceeds its 92 % and 97 % quantile
+# where a normal field of unit variance exceeds its 92 % and 97 % quantile
+_PATCH = 1.405
+_PLACE = 1.881
 _PATCH_ALONE = 1.239  # and 89.2 %: what both together leave right, 0.92 * 0.97
 
 
@@ -79,7 +81,8 @@ def embeddings(names, seed=0, confusions=ROOM):
     """Unit embeddings (classes, 512) float32 of class names; those of a group are alike."""
     rng = np.random.default_rng([seed, 11])
     partner, groups = confusions.partner, confusions.groups
-    common, own = rng.standard_normal(DIMENSIONS), {name: rng.standard_normal(DIMENSIONS) for name in partner}
+    common = rng.standard_normal(DIMENSIONS)
+    own = {name: rng.standard_normal(DIMENSIONS) for name in partner}
     grouped = {name for group in groups for name in group}
     groups = (*groups, *((name,) for name in partner if name not in grouped))
     shared = {name: vector for group in groups for vector in [rng.standard_normal(DIMENSIONS)] for name in group}
@@ -120,7 +123,9 @@ def feature_map(labels, points, names, size, seed, view, confusions=ROOM):
     import cv2
 
     rng = np.random.default_rng([seed, 13, view])
-    (w, h), count, vectors = size, len(names), embeddings(names, seed, confusions)
+    (w, h) = size
+    count = len(names)
+    vectors = embeddings(names, seed, confusions)
     height, width = labels.shape
     shares = np.zeros((height, width, count), np.float32)
     y, x = np.nonzero(labels)

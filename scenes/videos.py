@@ -30,9 +30,11 @@ def write(path, frames):
             codec = cv2.VideoWriter_fourcc(*"FFV1")
             writer = cv2.VideoWriter(str(hidden), cv2.CAP_FFMPEG, codec, RATE, frame.shape[1::-1])
         writer.write(frame)
-        count, last = count + 1, frame
+        count = count + 1
+        last = frame
     writer.release()
-    reader, again = cv2.VideoCapture(str(hidden)), None
+    reader = cv2.VideoCapture(str(hidden))
+    again = None
     for _ in range(count):
         again = reader.read()[1]
     reader.release()
@@ -56,5 +58,6 @@ def llff_rows(K, poses, width, height, bounds):
     for row, c2w, near_far in zip(rows, poses, bounds, strict=True):
         right, down, forward, eye = c2w[:3].T
         size = np.array([height, width, K[0, 0]])
-        row[:15], row[15:] = np.stack([down, right, -forward, eye, size], 1).ravel(), near_far
+        row[:15] = np.stack([down, right, -forward, eye, size], 1).ravel()
+        row[15:] = near_far
     return rows

@@ -48,7 +48,8 @@ def _code() -> str:
     """Version, commit, and a hash of what is really there: a checkout may have been edited, an installation has none
     of its commit.
     """
-    root, found = Path(__file__).resolve().parents[1], hashlib.sha256()
+    root = Path(__file__).resolve().parents[1]
+    found = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     commit = f"commit {(machine.commit() or 'unknown')[:16]}"

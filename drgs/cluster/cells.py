@@ -120,8 +120,14 @@ class _Round:
         token: Path,
         say: Callable[[str], object],
     ) -> None:
-        self.cluster, self.study, self.cells, self.count = cluster, study, cells, count
-        self.runs, self.rows, self.token, self.say = runs, rows, token, say
+        self.cluster = cluster
+        self.study = study
+        self.cells = cells
+        self.count = count
+        self.runs = runs
+        self.rows = rows
+        self.token = token
+        self.say = say
         self.parcel = cluster.send(study)
         self.topic = _TOPIC + uuid.uuid4().hex
         self.news: queue.Queue = queue.Queue()
@@ -134,7 +140,8 @@ class _Round:
 
     def all(self) -> tuple[list[Cell], dict[Cell, str]]:
         """Until every cell is done, taken or failed."""
-        named, client = dict(self.cells), self.cluster.client
+        named = dict(self.cells)
+        client = self.cluster.client
         client.subscribe_topic(self.topic, lambda event: self.news.put(("begun", event[1])))
         try:
             for number, cell in self.cells:
@@ -167,7 +174,8 @@ class _Round:
 
     def tell(self, number: int, cell: Cell, worker: str, address: str) -> None:
         """That a worker has begun with a cell, and whether it has the cell of one that is gone."""
-        before, self.begun[number] = self.begun.get(number), (worker, address)
+        before = self.begun.get(number)
+        self.begun[number] = (worker, address)
         again = "" if before is None else ", again"
         if before is not None and before[1] not in self.cluster.workers():
             again += f": {before[0]} has gone"
@@ -193,7 +201,8 @@ class _Round:
             raise ValueError(_not_shared(found["worker"], self.runs))
         elif "taken" in found:
             # A worker that is far away may have it again, when all that are near are busy, or have gone.
-            tried, far = self.moved.get(number, 0), found["host"] != found["taken"]
+            tried = self.moved.get(number, 0)
+            far = found["host"] != found["taken"]
             if far and tried < _TRIES and (near := self.cluster.workers_of(found["taken"])):
                 self.moved[number] = tried + 1
                 self.hand_out(number, cell, near)

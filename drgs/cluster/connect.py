@@ -78,7 +78,8 @@ def opened(scheduler: str | None = None, workers: int | None = None) -> Iterator
         stack.enter_context(_silent())
         if address is not None:
             with Bar(f"the scheduler {scheduler}"):
-                client, local = _joined(address), None
+                client = _joined(address)
+                local = None
         else:
             folder = stack.enter_context(temporary_folder("cluster"))
             with Bar(f"starting {workers} workers"):
@@ -236,9 +237,12 @@ class Cluster:
     """
 
     def __init__(self, client: Client, local: LocalCluster | None = None) -> None:
-        self.client, self._local = client, local
+        self.client = client
+        self._local = local
         self.ours = {**statement()["must"], "threads": "1"}
-        self.sent_bytes, self.sent_seconds, self.received_bytes = 0, 0.0, 0
+        self.sent_bytes = 0
+        self.sent_seconds = 0.0
+        self.received_bytes = 0
         self.views: Counter[str] = Counter()
         self.view_seconds: list[float] = []
         self.cpu_seconds = 0.0

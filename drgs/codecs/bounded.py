@@ -16,7 +16,9 @@ from drgs.guards.foreign import is_file
 __all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd"]
 
 _DAMAGED = "it is truncated or damaged, copy it again"
-_NAME, _SHOWN = 200, 120  # characters of names, and of what libraries say
+# characters of names, and of what libraries say
+_NAME = 200
+_SHOWN = 120
 _PIECE = 1 << 20  # bytes of a stream that are unpacked at once
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, OSError, OverflowError,
@@ -28,7 +30,9 @@ class GzipReader:
     """A gzip stream that is read piece by piece."""
 
     def __init__(self, path: Path, data: bytes):
-        self._path, self._rest, self._stream = path, data, zlib.decompressobj(wbits=31)
+        self._path = path
+        self._rest = data
+        self._stream = zlib.decompressobj(wbits=31)
 
     def read(self, count: int) -> bytes:
         """Exactly so many bytes.
@@ -197,7 +201,8 @@ def _webp_size(where: str, data: bytes) -> tuple[int, int]:
         raise ValueError(f"{where}: must be a WebP image, got {data[:12]!r}; export it again")
     at = 12
     while at + 13 <= len(data):
-        kind, length = data[at : at + 4], int.from_bytes(data[at + 4 : at + 8], "little")
+        kind = data[at : at + 4]
+        length = int.from_bytes(data[at + 4 : at + 8], "little")
         if kind == b"VP8 ":
             raise ValueError(f"{where}: must be a lossless WebP image, is a lossy one; export it again without loss")
         if kind == b"VP8L":

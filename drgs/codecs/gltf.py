@@ -31,11 +31,13 @@ __all__ = ["encode_glb", "load_glb"]
 
 _AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"
-_FLOAT, _BYTE = 5126, 5121
+_FLOAT = 5126
+_BYTE = 5121
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 # Component type -> its dtype and, where it is normalized, what 1 is.
 _KINDS = {5126: ("<f4", 1), 5120: ("i1", 127), 5121: ("u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535)}
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
 _LEAST = float(np.finfo(np.float32).tiny)  # what a scale of 0 is taken for
 _ADVICE = "export it as a GLB that is not compressed, or as a PLY"
 _log = logging.getLogger(__name__)
@@ -198,7 +200,9 @@ class _Accessors:
     """Arrays of a GLB by their numbers, each compared with the buffer before it is read."""
 
     def __init__(self, path: Path, document: dict[str, Any], buffer: memoryview):
-        self._path, self._document, self._buffer = path, document, buffer
+        self._path = path
+        self._document = document
+        self._buffer = buffer
 
     def _accessor(self, index: Any) -> dict[str, Any]:
         accessors = self._document["accessors"]
@@ -214,7 +218,8 @@ class _Accessors:
 
     def read(self, index: Any, width: int) -> np.ndarray:
         """(N, width) numbers, normalized where the file says so."""
-        accessor, where = self._accessor(index), f"{self._path}: accessor {index}"
+        accessor = self._accessor(index)
+        where = f"{self._path}: accessor {index}"
         views, number = self._document["bufferViews"], accessor["bufferView"]
         known = accessor["componentType"] in _KINDS and _WIDTHS.get(accessor["type"]) == width
         if not known or "sparse" in accessor or not 0 <= number < len(views):

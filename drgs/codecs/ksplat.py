@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["load_ksplat"]
 
-_HEADER, _SECTION = 4096, 1024
+_HEADER = 4096
+_SECTION = 1024
 _LEAST_HALF = 2.0**-26  # the middle of what rounds to 0 as a half float
 _DAMAGED = "it is truncated or damaged, copy it again"
 
@@ -73,7 +74,8 @@ def load_ksplat(path: Path) -> Gaussians:
         raise ValueError(f"{path}: the compression level of a .ksplat file must be 0, 1 or 2, got {level}; {_DAMAGED}")
     if _HEADER + sections * _SECTION > len(data):
         raise ValueError(f"{path}: the header claims {sections} sections, the file holds {len(data)} bytes; {_DAMAGED}")
-    found, start = [], _HEADER + sections * _SECTION
+    found = []
+    start = _HEADER + sections * _SECTION
     for i in range(sections):
         section, start = _section(path, data, i, level, start)
         found.append(section)

@@ -64,7 +64,10 @@ class _Reader:
     """One scene: its files, what meta.json says, and the bytes of its Gaussians."""
 
     def __init__(self, path: Path, files: Archive, meta: Any, version: int):
-        self.path, self.files, self.meta, self.version = path, files, meta, version
+        self.path = path
+        self.files = files
+        self.meta = meta
+        self.version = version
         check_json(f"{path}: meta.json", meta, _VERSION_2 if version == 2 else _VERSION_1, _ADVICE)
         self.has_sh = meta.get("shN") is not None
         if self.has_sh:
@@ -86,11 +89,13 @@ class _Reader:
         scales, base = self._image("scales"), self._image("sh0")
         if self.version == 2:
             log_scales = self._chosen("scales", scales[:, :3])
-            dc, logits = self._chosen("sh0", base[:, :3]), logits_of_bytes(base[:, 3])
+            dc = self._chosen("sh0", base[:, :3])
+            logits = logits_of_bytes(base[:, 3])
         else:
             log_scales = self._lerped("scales", scales[:, :3] / 255.0, 3)
             lerped = self._lerped("sh0", base / 255.0, 4)
-            dc, logits = lerped[:, :3], lerped[:, 3]
+            dc = lerped[:, :3]
+            logits = lerped[:, 3]
         sh = np.concatenate([dc[:, None, :].astype(np.float32), self._higher(degree)], axis=1)
         return assembled(self.path, means, self._quats(), log_scales, logits, sh)
 

@@ -32,7 +32,8 @@ class Rivals:
     """
 
     def __init__(self, told: Told, prior: Prior) -> None:
-        self.told, self.prior = told, prior
+        self.told = told
+        self.prior = prior
         self.known: dict[str, torch.Tensor] = {}  # as FisherRF's code computes it
 
     def know(self, camera: Camera) -> None:

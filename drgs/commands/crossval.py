@@ -66,7 +66,8 @@ def run(args: Crossval) -> int:
 
 def _print(result: Result, args: Crossval) -> None:
     """What was found, on stdout."""
-    report, rows = result.report, []
+    report = result.report
+    rows = []
     for name, row in result.groups.items():
         numbers = f"{row.relative:.1e}", f"{row.cosine:.6f}", f"{row.bias:+.1e}"
         rows.append((name, row.verdict, *numbers, row.why))
@@ -77,6 +78,7 @@ def _print(result: Result, args: Crossval) -> None:
     for line in result.lines():
         if line.startswith(("convention:", "view ")):
             print(line)
-    rms, share = max(view.rms for view in result.views), max(view.share for view in result.views)
+    rms = max(view.rms for view in result.views)
+    share = max(view.share for view in result.views)
     print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
     print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json")

@@ -129,7 +129,8 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
 def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> dict:
     """The tour, in folders that belong to it: six stages, each timed, and demo.json at the end."""
     run_folder.check_all(_OWN)
-    began, seconds = time.perf_counter(), {}
+    began = time.perf_counter()
+    seconds = {}
 
     def say(text: str) -> None:
         if progress:
@@ -259,7 +260,8 @@ def _seconds(work: Callable) -> float:
 
 def _check(g: Gaussians, frame: Frame, image: torch.Tensor, crop: tuple[int, int]) -> dict:
     """The middle of an `exact` image against the float64 oracle."""
-    camera, (width, height) = frame.camera, crop
+    camera = frame.camera
+    (width, height) = crop
     x, y = (camera.width - width) // 2, (camera.height - height) // 2
     K = camera.K.copy()
     K[:2, 2] -= x, y
@@ -314,7 +316,8 @@ def _sheet(frames: list[Frame], images: dict[str, list[torch.Tensor]]) -> np.nda
     """Rows of photograph, render and differences, for up to three views."""
     rows = []
     for i, frame in enumerate(frames[:3]):
-        exact, photo = images["exact"][i], frame.image()
+        exact = images["exact"][i]
+        photo = frame.image()
         parts = {f"view {frame.name}": photo, "exact": exact}
         parts[f"|exact - photograph| x {_GAIN // 2}"] = (_GAIN // 2) * (exact.clamp(0, 1) - photo).abs()
         for name in ("fast", "inria", "gsplat"):
@@ -330,7 +333,8 @@ def _turntable(g: Gaussians, path: Path, plan: Plan, progress: bool) -> None:
     with pictures.Video(path) as movie, Bar("turntable", plan.frames, progress) as bar:
         for i in range(plan.frames):
             phase = 2 * np.pi * i / plan.frames
-            azimuth, rise = np.radians(-90 + 75 * np.sin(phase)), np.radians(30 + 10 * np.cos(phase))
+            azimuth = np.radians(-90 + 75 * np.sin(phase))
+            rise = np.radians(30 + 10 * np.cos(phase))
             level = np.cos(rise)
             eye = _DISTANCE * np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(rise)])
             camera = Camera(K=K, w2c=look_at(eye, _TARGET), width=plan.width, height=plan.height)

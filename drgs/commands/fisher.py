@@ -148,8 +148,10 @@ class Told:
     @classmethod
     def of(cls, given: SceneInput, args: Fisher, settings: RenderSettings, cameras: Sequence[Camera]) -> Told:
         """As the options say, of a run in the metric of its decoder, and of all these cameras."""
-        g, scoring = given.gaussians, Scoring(method=args.method, blocks=args.blocks)
-        blocks, metric = scoring.blocks_of(g, "fisher", given.scene), None
+        g = given.gaussians
+        scoring = Scoring(method=args.method, blocks=args.blocks)
+        blocks = scoring.blocks_of(g, "fisher", given.scene)
+        metric = None
         if "semantic" in blocks:
             assert g.features is not None  # else there is no such block
             metric = given.semantics() or SemanticMetric.of(None, g.features.shape[1])
@@ -300,7 +302,8 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     Returns:
         Those of `variance` and of `share`.
     """
-    variance, share = variances(H, prior), {}
+    variance = variances(H, prior)
+    share = {}
     for name in H:
         Hc = candidate[name].double()
         # log(1 + x) / Hc tends to the variance where the view says nothing about a parameter.
@@ -315,7 +318,8 @@ def _view(
     Hc = added(told.said(camera))
     weights = dict(zip(KINDS, map_weights(H, Hc, prior), strict=True))
     maps = {kind: told.maps(camera, x) for kind, x in weights.items()}
-    files, totals = [], {}
+    files = []
+    totals = {}
     for kind, parts in maps.items():
         totals[kind] = sum(parts.values())
         shown = {"": totals[kind]} | ({f"{block}.": x for block, x in parts.items()} if len(parts) > 1 else {})
@@ -336,7 +340,8 @@ def _view(
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
     """What was found, as tables on stdout."""
-    rows, several = [], blocks if len(blocks := tuple(next(iter(groups.values())).blocks)) > 1 else ()
+    rows = []
+    several = blocks if len(blocks := tuple(next(iter(groups.values())).blocks)) > 1 else ()
     for name, row in groups.items():
         share = f"{row.zero / max(math.prod(row.shape), 1):.1%}"
         shape = "x".join(map(str, row.shape))

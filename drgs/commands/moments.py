@@ -109,7 +109,8 @@ def write_plys(scene: Scene, cameras: list[Camera], folder: Path, moving: bool, 
     chosen = getattr(scene, "moving", None)
     if moving and (chosen is None or not bool(chosen.any())):
         raise ValueError("--moving must have a scene where something moves, nothing does here; drop it")
-    names, written = ply_names(cameras), []
+    names = ply_names(cameras)
+    written = []
     with Bar("PLY files", len(names)) as bar:
         for name, time in names.items():
             seen = scene.at(time).detach()  # a file holds values

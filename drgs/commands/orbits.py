@@ -122,7 +122,8 @@ def scene_orbit(
     wish = wish or Wish()
     center, offsets, reach = _shape(gaussians)
     if wish.center is not None:
-        offsets, center = offsets + center - wish.center, np.asarray(wish.center, np.float64)
+        offsets = offsets + center - wish.center
+        center = np.asarray(wish.center, np.float64)
     up = _unit(wish.up or UP["minus-y"])
     elevation = _ELEVATION if wish.elevation is None else wish.elevation
     lens = _Lens(intrinsics_from_fov(wish.fov or _FOV, width, height), width, height)
@@ -199,7 +200,8 @@ def dome(circle: list[Camera], count: int) -> list[Camera]:
         count: How many.
     """
     centers = np.stack([camera.center for camera in circle])
-    middle, up = centers.mean(axis=0), -circle[0].c2w[:3, 1]
+    middle = centers.mean(axis=0)
+    up = -circle[0].c2w[:3, 1]
     radius = float(np.linalg.norm(centers - middle, axis=1).mean())
     rings = max(1, round(math.sqrt(count * math.pi / 8)))  # as far apart as the cameras of a ring are
     elevations = 90 * (np.arange(rings) + 0.5) / rings
@@ -224,7 +226,8 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
         with torch.no_grad():  # looked at, not optimized
             out = render(gaussians, small, RenderSettings.preset("fast"), ("depth",))
         rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
-        depth, alpha = out.depth[rows, columns].cpu().numpy(), out.alpha[rows, columns].cpu().numpy()
+        depth = out.depth[rows, columns].cpu().numpy()
+        alpha = out.alpha[rows, columns].cpu().numpy()
         solid = alpha > _OPAQUE
         return float(np.quantile(depth[solid], _NEARER)) if solid.any() else None
 
@@ -243,7 +246,8 @@ def _shape(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     means, sizes = means[::step], sizes[::step]
     distance = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     near = distance <= _FAR * np.median(distance)
-    means, reach = means[near], 2 * sizes[near]
+    means = means[near]
+    reach = 2 * sizes[near]
     # The median says what belongs to the scene; the middle of that is what to turn around, since
     # the median lies where the detail is.
     center = np.quantile(means, (1 - _INSIDE, _INSIDE), axis=0).mean(axis=0)
@@ -281,7 +285,8 @@ def _around(
     lens: _Lens,
 ) -> list[Camera]:
     """Cameras at azimuths (radians) from the direction `front`, looking at the center."""
-    side, rise = np.cross(up, front), math.radians(elevation)
+    side = np.cross(up, front)
+    rise = math.radians(elevation)
     made = []
     for index, turn in enumerate(turns):
         outward = math.cos(rise) * (math.cos(turn) * front + math.sin(turn) * side) + math.sin(rise) * up

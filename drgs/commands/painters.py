@@ -38,7 +38,9 @@ def painters(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, 
     kinds = tuple(kinds)
     if not kinds:
         return {}
-    features, decoder, classes = given.gaussians.features, given.decoder, given.classes
+    features = given.gaussians.features
+    decoder = given.decoder
+    classes = given.classes
     if features is None:
         raise ValueError(
             f"{scene}: --{kinds[0]} must have Gaussians with semantic features, these have none; fit a data set with a "
@@ -58,7 +60,8 @@ def painters(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, 
                 f"{scene}: --{next(kind for kind in kinds if kind != 'features')} must have a run with a decoder and "
                 "text embeddings of classes, has not; fit a data set that has text_embeddings.npy"
             )
-        known, count = classes, len(classes)
+        known = classes
+        count = len(classes)
 
         def labels(out: Output) -> np.ndarray:
             """Where next to nothing is, the decoder answers by its bias alone: that is no label."""

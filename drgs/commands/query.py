@@ -46,7 +46,8 @@ def run(args: Query) -> None:
     inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
     output = claim(args.output, "query", ["query.json", ply], inputs)
     given = SceneInput.of(args)
-    g, decoder = given.gaussians, _decoder(args, given)
+    g = given.gaussians
+    decoder = _decoder(args, given)
     query = _query(args, given)
     with Bar("scores", show=not args.quiet):
         score, selected = query.score(g.features, decoder)

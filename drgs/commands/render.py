@@ -64,7 +64,8 @@ def run(args: Render) -> None:
     output = claim(args.output, "render", fixed, inputs=[args.scene, views])
     given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
-    gaussians, settings = given.gaussians if paint else given.colors, given.settings(args.preset)
+    gaussians = given.gaussians if paint else given.colors
+    settings = given.settings(args.preset)
     size = args.width, args.height
     cameras, source = drawn_views(args, views, given, args.frames, size, returns=True)
     cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)
@@ -138,7 +139,8 @@ def render_views(
         and views (camera, files, seconds, rays, redone).
     """
     outputs = ("depth",) if depth or "exr" in formats else ()
-    views, seen = [], False
+    views = []
+    seen = False
     wanted = {"": video, **{kind: _movie_of(video, kind) for kind in paint}} if "webm" in formats else {}
     with contextlib.ExitStack() as stack:
         movies = {kind: stack.enter_context(pictures.Video(out_dir / name, fps)) for kind, name in wanted.items()}
@@ -241,7 +243,8 @@ def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tupl
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     pixels = largest.width * largest.height
     pictures_need = max(memory.PICTURES.get(name, 0) for name in formats)
-    where, what = f"view {largest.name!r}", f"its {largest.width}x{largest.height} pixels"
+    where = f"view {largest.name!r}"
+    what = f"its {largest.width}x{largest.height} pixels"
     needed = memory.frame_bytes(pixels, settings, features)
     if runtime.backend().name == "cuda":
         memory.require(where, needed, what, "lower --width or --height", cuda=True)

@@ -25,7 +25,8 @@ def fit_command(config: FitConfig, active: ActiveConfig | None, data: Path, outp
         The line for a shell, and the fields of `config` that no option sets, as `name=value`: these need Python.
     """
     options = {field.name: field.default for field in dataclasses.fields(Fit)}
-    words, beyond = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings)], []
+    words = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings)]
+    beyond = []
     usual = FitConfig()
     for field in dataclasses.fields(FitConfig):
         value = getattr(config, field.name)

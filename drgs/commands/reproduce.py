@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["run"]
 
-_ROWS, _GIVEN = "rows.jsonl", "data.json"  # of all experiments in one folder: they share cells
+# of all experiments in one folder: they share cells
+_ROWS = "rows.jsonl"
+_GIVEN = "data.json"
 _FIGURE = "all views"  # is given what the others choose from: no row of the sheet is the better for it
 
 

@@ -54,7 +54,8 @@ class SceneInput:
             FileNotFoundError: If there is no such file, or the run has no checkpoint yet.
             ValueError: If --set is wrong or a file damaged.
         """
-        replaced, given = args.replaced(), cls.at(args.scene)
+        replaced = args.replaced()
+        given = cls.at(args.scene)
         fitted = {} if given.record is None else {"background": given.record.config.settings.background}
         return dataclasses.replace(given, fields=fitted | replaced)
 

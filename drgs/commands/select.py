@@ -54,7 +54,8 @@ def run(args: Select) -> None:
     )
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
-    candidates, train = timed(candidates, args, given), timed(known.cameras, args, given)
+    candidates = timed(candidates, args, given)
+    train = timed(known.cameras, args, given)
     views = len(known.cameras) + len(candidates)
     with workers_of(args) as workers, Bar("information", views, not args.quiet) as bar:
         selection = select(
@@ -117,7 +118,8 @@ def run(args: Select) -> None:
 def print_picks(report: dict, selection: Selection, output: Path) -> None:
     """The picks with each group's part of the score, and what to know about them, on stdout."""
     title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
-    compared, rows = selection.combine == "zscore", []
+    compared = selection.combine == "zscore"
+    rows = []
     groups = selection.blocks if compared else list(selection.picks[0].parts)
     for pick in selection.picks:
         margin = "-" if pick.margin is None else f"{pick.margin:.3g}"

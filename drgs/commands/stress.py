@@ -37,7 +37,8 @@ def run(args: Stress) -> int:
         raise ValueError(f"stress: --match must be part of a case's name, got {args.match!r}; drgs stress lists all")
     if args.output is not None:
         claim(args.output, "stress", ["stress.json", "stress.md"])
-    start, found = time.perf_counter(), []
+    start = time.perf_counter()
+    found = []
     if not args.quiet:
         print(f"{len(chosen)} cases; the first run compiles their kernels: minutes. Later ones take one or two.")
         print(_line("on", "", "image", "gradient", "forward", "adj/fwd", "Fisher"))

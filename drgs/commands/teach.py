@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 _FOLDER = TEACHER_FOLDERS[0]
-_RECORD, _EMBEDDINGS, _CLASSES = f"{_FOLDER}/teach.json", "text_embeddings.npy", CLASS_FILES[0]
+_RECORD = f"{_FOLDER}/teach.json"
+_EMBEDDINGS = "text_embeddings.npy"
+_CLASSES = CLASS_FILES[0]
 _LONG = 80  # cells of a map's longer side
 _LARGEST = 4096  # cells of a side
 

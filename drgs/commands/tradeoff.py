@@ -184,7 +184,9 @@ def _print(report: _Report) -> None:
 
 def _page(report: _Report, drawn: bool) -> str:
     """tradeoff.md."""
-    env, camera, measured = report.env, report.views[0], report.measured
+    env = report.env
+    camera = report.views[0]
+    measured = report.measured
     threads = env["threads"]["drjit"]
     lines = [
         f"{report.gaussians:,} Gaussians, {len(report.views)} views of {camera.width}x{camera.height} "
@@ -260,7 +262,8 @@ def _notes(report: _Report) -> list[str]:
 
 def _full_lines(report: _Report) -> list[str]:
     """Times at full size, one line a clock."""
-    lines, rows = [], {row.name: row for row in report.measured.rows}
+    lines = []
+    rows = {row.name: row for row in report.measured.rows}
     for clock, found in report.full.items():
         if not found.names:
             lines.append(
@@ -276,7 +279,8 @@ def _full_lines(report: _Report) -> list[str]:
 
 def _full_table(report: _Report) -> list[str]:
     """The same for the page."""
-    lines, rows = [], {row.name: row for row in report.measured.rows}
+    lines = []
+    rows = {row.name: row for row in report.measured.rows}
     lines.append("| at the size of the views as drawn | size | rounds | setting | seconds | times exact's |")
     lines.append("|---|---|---:|---|---:|---:|")
     for clock, found in report.full.items():

@@ -25,7 +25,9 @@ __all__ = ["run"]
 
 _EVERY = 2.0  # seconds between two looks at the files
 _LAST = 0.5  # seconds that what is being computed is given to end
-_LEAST, _MOST = 100, 1 << 24  # pixels of our pictures
+# pixels of our pictures
+_LEAST = 100
+_MOST = 1 << 24
 
 
 def run(args: View) -> None:

@@ -180,14 +180,16 @@ def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstVie
     """Where the photographs were taken, towards what they look at; of a bare PLY, so that all of it is seen."""
     if not len(gaussians):
         raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
-    wish, distance_of = Wish.of(args), seen_distance(gaussians)
+    wish = Wish.of(args)
+    distance_of = seen_distance(gaussians)
     captured = sorted(captured, key=lambda camera: camera.name)  # an active run has them as they were picked
     width, height = _FIRST_SIZE
     made, _ = capture_orbit(captured, 1, width=width, height=height, wish=wish, distance_of=distance_of)
     camera = (made or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, wish=wish))[0]
     up = np.array(wish.up or (upright(captured) if captured else UP["minus-y"]), np.float64)
     focus = Focus.of(captured, wish.center, distance_of) if made else None
-    pose, axis = pose_of(camera, gaussians.origin), camera.c2w[:3, 2]
+    pose = pose_of(camera, gaussians.origin)
+    axis = camera.c2w[:3, 2]
     if focus is not None:
         target = focus.center - gaussians.origin
     else:

@@ -268,7 +268,8 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
     if source.kind == "data":
         cameras = [_camera(view, {}, pixels) for view in views]
         return Known(cameras, where, pixels, Path(source.text).resolve())
-    place, names = source.record.data, fitted_views(Run(Path(source.text)))
+    place = source.record.data
+    names = fitted_views(Run(Path(source.text)))
     named = {view.name: view for view in views}
     if missing := [name for name in names if name not in named]:
         raise ValueError(

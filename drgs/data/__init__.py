@@ -131,7 +131,8 @@ def load(
         )
     held_out = {"test_every": test_every, "test_offset": test_offset, "times": times, "test_cameras": test_cameras}
     dataset = loader(path, background=background, lazy=lazy, points=points, strict=strict, **held_out)
-    dataset.test_every, dataset.test_offset = test_every, test_offset
+    dataset.test_every = test_every
+    dataset.test_offset = test_offset
     if test_cameras is not None:
         dataset.test_cameras = tuple(test_cameras)
     dataset.split()  # refuses numbers that cannot be

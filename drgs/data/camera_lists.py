@@ -172,7 +172,8 @@ def camera_described(where: str, value: object) -> Camera:
     if shapes != ([3] * 3, [4] * 4):
         raise ValueError(f"{where}: K must be 3x3 and c2w 4x4, got other sizes; {advice}")
     fields = {name: value[name] for name in ("name", "width", "height", "model")}
-    w2c, lens = inverse_pose(where, np.array(value["c2w"])), tuple(value["distortion"])
+    w2c = inverse_pose(where, np.array(value["c2w"]))
+    lens = tuple(value["distortion"])
     try:
         return Camera(K=np.array(value["K"]), w2c=w2c, distortion=lens, time=value.get("time"), **fields)
     except ValueError as error:

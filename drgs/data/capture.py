@@ -126,7 +126,8 @@ def upright(cameras: list[Camera]) -> np.ndarray:
     of the images' up, which leans towards what is looked down on from one side, decides where they leave it open.
     """
     poses = np.stack([camera.c2w for camera in cameras])
-    rights, mean = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    rights = poses[:, :3, 0]
+    mean = -poses[:, :3, 1].mean(axis=0)
     length = np.linalg.norm(mean)
     if length > 1e-9:  # below it they point everywhere, and what is left of the mean is rounding
         mean /= length
@@ -153,7 +154,9 @@ def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:
     stretch = max(np.split(np.arange(len(poses)), breaks), key=len)
     if len(stretch) < 3:
         return []
-    poses, walked, turned = poses[stretch], walked[stretch[:-1]], turned[stretch[:-1]]
+    poses = poses[stretch]
+    walked = walked[stretch[:-1]]
+    turned = turned[stretch[:-1]]
     # A turn by 30 degrees takes as long as a step; times increase even where a camera stays as it is.
     times = np.concatenate([[0.0], np.cumsum(np.maximum(walked / typical + turned / 30, 1e-3))])
     width = max(_SMOOTH * times[-1] / (len(times) - 1), times[-1] / _SMOOTHED)

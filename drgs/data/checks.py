@@ -335,7 +335,8 @@ def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
         raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; drop this view")
     check_distance(where, c2w)
     w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = c2w[:3, :3].T, -c2w[:3, :3].T @ c2w[:3, 3]
+    w2c[:3, :3] = c2w[:3, :3].T
+    w2c[:3, 3] = -c2w[:3, :3].T @ c2w[:3, 3]
     return w2c
 
 

@@ -68,7 +68,9 @@ def load_colmap(
         )
     reconstruction = read_model(model, points)
     folder = _image_folder(path, model)
-    views, absent, listed = [], [], []
+    views = []
+    absent = []
+    listed = []
     # By name: COLMAP numbers images in the order in which its threads finish them.
     registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
@@ -85,7 +87,8 @@ def load_colmap(
         camera = model_camera(reconstruction, image, where)
         view.camera = fit_to_image(camera, view.image_path, where, lazy)
         view.mask_path = mask_file(folder.parent / "masks", image.name)
-        view.background, view.is_checked = background, not lazy
+        view.background = background
+        view.is_checked = not lazy
         views.append(view)
     make_unique(listed)
     go_on_without(model, [view.image_path for view in absent], len(views), strict)
@@ -118,21 +121,27 @@ def _image_folder(path: Path, model: Path) -> Path:
 
 def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:
     """The `Camera` of a registered image; a lens whose coefficients are all 0 is a pinhole."""
-    w2c, camera = np.eye(4), reconstruction.cameras[image.camera_id]
+    w2c = np.eye(4)
+    camera = reconstruction.cameras[image.camera_id]
     w2c[:3] = image.cam_from_world().matrix()
     if not np.isfinite(w2c).all():
         raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model")
     p = [float(v) for v in camera.params]
     kind = camera.model_name
     if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        K, rest = intrinsics(p[0], p[0], p[1], p[2]), p[3:]
+        K = intrinsics(p[0], p[0], p[1], p[2])
+        rest = p[3:]
     else:
-        K, rest = intrinsics(*p[:4]), p[4:]
-    model, distortion = "pinhole", ()
+        K = intrinsics(*p[:4])
+        rest = p[4:]
+    model = "pinhole"
+    distortion = ()
     if kind == "OPENCV_FISHEYE":
-        model, distortion = "opencv_fisheye", tuple(rest)
+        model = "opencv_fisheye"
+        distortion = tuple(rest)
     elif any(rest):
-        model, distortion = "opencv", (*rest, *([0.0] * (4 - len(rest))))
+        model = "opencv"
+        distortion = (*rest, *([0.0] * (4 - len(rest))))
     try:
         return Camera(K, w2c, camera.width, camera.height, model, distortion, image.name)
     except ValueError as error:
@@ -191,7 +200,8 @@ def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
 
     reconstruction = pycolmap.Reconstruction()
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
     try:
         read(str(folder))
     except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
@@ -214,7 +224,9 @@ class _Walk:
     """A cursor over a binary file that never passes its end."""
 
     def __init__(self, path: Path, data: bytes | None = None) -> None:
-        self.path, self.data, self.at = path, path.read_bytes() if data is None else data, 0
+        self.path = path
+        self.data = path.read_bytes() if data is None else data
+        self.at = 0
 
     def need(self, size: int, what: str) -> None:
         if self.at + size > len(self.data):
@@ -236,7 +248,8 @@ class _Walk:
     def name(self, what: str) -> str:
         end = self.data.find(b"\0", self.at)
         self.need(end + 1 - self.at if end >= 0 else len(self.data), what)
-        raw, self.at = self.data[self.at : end], end + 1
+        raw = self.data[self.at : end]
+        self.at = end + 1
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError:
@@ -302,7 +315,8 @@ def _without_observations(path: Path, data: bytes) -> bytes:
 
 def _poses_only(data: bytes) -> bytes:
     """images.txt, already checked, with an empty line for the observations of every image."""
-    kept, wants_pose = [], True
+    kept = []
+    wants_pose = True
     for line in data.splitlines():
         if line.lstrip().startswith(b"#") or (wants_pose and not line.strip()):
             continue

@@ -29,7 +29,9 @@ _MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
 _MISSING = (0.02, 8)  # share or number of frames that a header may claim too many, where it states a duration alone
 _NEAR = 16  # frames ahead that are decoded rather than sought
 _SAME = 0.01  # milliseconds between time stamps of one frame
-_OPEN, _KNOWN = 4, 1024  # videos that are held open, and of which is known what is in them
+# videos that are held open, and of which is known what is in them
+_OPEN = 4
+_KNOWN = 1024
 _TOLD = 50  # frames between two reports
 _COPY = "it is truncated or damaged, copy it again"
 
@@ -79,9 +81,12 @@ def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, tell: Ca
 
 def _walk(path: Path, is_mp4: bool, tell: Callable[[int], None]) -> dict[str, Any]:
     """`walk`, of a file that is not known."""
-    raw, shown = _opened(path, [cv2.CAP_PROP_FORMAT, -1]), _opened(path, [])  # packets, undecoded; frames
+    # packets, undecoded; frames
+    raw = _opened(path, [cv2.CAP_PROP_FORMAT, -1])
+    shown = _opened(path, [])
     # Of frames as they are shown: phones turn them by a matrix in the header.
-    width, height = int(shown.get(cv2.CAP_PROP_FRAME_WIDTH)), int(shown.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    width = int(shown.get(cv2.CAP_PROP_FRAME_WIDTH))
+    height = int(shown.get(cv2.CAP_PROP_FRAME_HEIGHT))
     claimed = raw.get(cv2.CAP_PROP_FRAME_COUNT)
     if not 1 <= width * height <= _MAX_PIXELS:
         raise ValueError(f"{path}: a video must have 1 to 2^31 pixels, its header says {width}x{height}; {_COPY}")
@@ -137,7 +142,8 @@ def _decoded(path: Path, packets: int, tell: Callable[[int], None]) -> list[floa
         ValueError: A frame cannot be decoded. Where fewer are shown than there are packets, as a list of edits may say,
             the log tells.
     """
-    capture, stamps = _opened(path, []), []
+    capture = _opened(path, [])
+    stamps = []
     with native_stderr() as complaints:
         while len(stamps) <= _MAX_FRAMES and capture.grab():
             stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC))
@@ -157,8 +163,12 @@ class _Reader:
     """An open video and the place where it is."""
 
     def __init__(self, path: Path, stamps: list[float], count: int) -> None:
-        self._path, self._stamps, self._count = path, stamps, count
-        self._next, self._told, self._sought = 0, False, False
+        self._path = path
+        self._stamps = stamps
+        self._count = count
+        self._next = 0
+        self._told = False
+        self._sought = False
         self._capture = _opened(path, [])
 
     def frame(self, index: int) -> np.ndarray:
@@ -180,11 +190,14 @@ class _Reader:
             if self._forward(index):
                 return self._pixels()
         elif self._stamps and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
-            self._next, self._sought = index, True
+            self._next = index
+            self._sought = True
             if self._forward(index):
                 return self._pixels()
         self._capture.release()
-        self._capture, self._next, self._sought = _opened(self._path, []), 0, False
+        self._capture = _opened(self._path, [])
+        self._next = 0
+        self._sought = False
         return self._pixels() if self._forward(index) else None
 
     def _forward(self, index: int) -> bool:

@@ -72,7 +72,8 @@ def detect(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) ->
     gray = np.round(255 * image @ np.array([0.299, 0.587, 0.114], image.dtype)).clip(0, 255).astype(np.uint8)
     sift = cv2.SIFT_create(nfeatures=_MOST, contrastThreshold=_CONTRAST)
     points, descriptors = sift.detectAndCompute(gray, None if mask is None else mask.astype(np.uint8))
-    points, descriptors = points[:_MOST], np.zeros((0, 128), np.float32) if descriptors is None else descriptors[:_MOST]
+    points = points[:_MOST]
+    descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors[:_MOST]
     pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
     # A descriptor may be all 0.
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
@@ -138,7 +139,9 @@ def _match(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray
     F = np.linalg.inv(b.camera.K).T @ essential @ np.linalg.inv(a.camera.K)
     homogeneous = _homogeneous(b.pixels).astype(np.float32)
     rays_a, rays_b = a.rays(), b.rays()
-    rows, columns, likeness = [], [], []
+    rows = []
+    columns = []
+    likeness = []
     for start in range(0, len(a.pixels), _ROWS):
         lines = _homogeneous(a.pixels[start : start + _ROWS]) @ F.T
         # The line of the epipole itself is 0, and near everything.
@@ -149,7 +152,9 @@ def _match(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray
         rows.append(i)
         columns.append(j)
         likeness.append(np.einsum("nd,nd->n", a.descriptors[i], b.descriptors[j]))
-    i, j, likeness = np.concatenate(rows), np.concatenate(columns), np.concatenate(likeness)
+    i = np.concatenate(rows)
+    j = np.concatenate(columns)
+    likeness = np.concatenate(likeness)
     keep = _best(i, likeness, b.pixels[j], len(a.pixels))
     keep &= _best(j, likeness, a.pixels[i], len(b.pixels))
     i, j = i[keep], j[keep]
@@ -196,7 +201,8 @@ def _meet(
     baseline = eye_b - eye_a
     along_a, along_b = rays_a @ baseline, rays_b @ baseline
     sine = np.maximum(1 - between**2, 1e-12)  # of parallel rays, which the caller drops by their angle
-    depth_a, depth_b = (along_a - between * along_b) / sine, (between * along_a - along_b) / sine
+    depth_a = (along_a - between * along_b) / sine
+    depth_b = (between * along_a - along_b) / sine
     points = 0.5 * (eye_a + depth_a[:, None] * rays_a + eye_b + depth_b[:, None] * rays_b)
     return points, depth_a, depth_b, np.degrees(np.arccos(np.clip(between, -1, 1)))
 
@@ -250,7 +256,9 @@ def _tracks(
     rays = np.concatenate([picture.rays() for picture in pictures])[member]
     eyes = np.stack([picture.camera.center for picture in pictures])[picture_of[member]]
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    A, b, color = np.zeros((len(chosen), 3, 3)), np.zeros((len(chosen), 3)), np.zeros((len(chosen), 3), np.float32)
+    A = np.zeros((len(chosen), 3, 3))
+    b = np.zeros((len(chosen), 3))
+    color = np.zeros((len(chosen), 3), np.float32)
     np.add.at(A, match, across)
     np.add.at(b, match, (across @ eyes[:, :, None])[:, :, 0])
     np.add.at(color, match, np.concatenate([picture.colors for picture in pictures])[member])

@@ -23,7 +23,10 @@ __all__ = ["encoded_jpeg", "pixels", "size"]
 
 _SIDE = 1 << 15  # pixels, libheif's own limit; a compressed byte stands for any number of them
 _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy that is answered
-_ORIENTATION, _EXIF, _MARKER = 0x0112, b"Exif\0\0", 65_533  # the tag; what begins EXIF in a JPEG, and its most bytes
+# the tag; what begins EXIF in a JPEG, and its most bytes
+_ORIENTATION = 0x0112
+_EXIF = b"Exif\0\0"
+_MARKER = 65_533
 _COPY = "it is damaged, or no such photograph: copy it again, or convert it to JPEG"
 _SHOWN = 120  # characters of a library's own message
 

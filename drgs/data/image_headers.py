@@ -41,7 +41,8 @@ def is_whole(path: Path) -> bool:
     with path.open("rb") as file:
         if file.read(8) != _PNG:
             return True
-        size, at = path.stat().st_size, 8
+        size = path.stat().st_size
+        at = 8
         while at + 12 <= size:
             file.seek(at)
             length, kind = struct.unpack(">I4s", file.read(8))

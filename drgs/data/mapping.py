@@ -43,15 +43,20 @@ class _Told:
     """What `map_photos` tells of: poses found in the model that is being made, and what is being done."""
 
     def __init__(self, total: int, progress: Progress, doing: Callable[[str], None]) -> None:
-        self.total, self._progress, self._doing = total, progress, doing
-        self.registered, self._model, self._what = 0, 0, "reading the matches"
+        self.total = total
+        self._progress = progress
+        self._doing = doing
+        self.registered = 0
+        self._model = 0
+        self._what = "reading the matches"
         self._since = time.monotonic()
         self._lock = threading.Lock()  # COLMAP's thread calls back, another one follows the log
 
     def begun(self) -> None:
         """A model has its first two photographs, all adjusted."""
         with self._lock:
-            self.registered, self._model = 2, self._model + 1
+            self.registered = 2
+            self._model = self._model + 1
             self._tell()
 
     def one_more(self) -> None:
@@ -65,7 +70,8 @@ class _Told:
         what = next((what for begins, what in _DOING.items() if text.startswith(begins)), None)
         if what is not None:
             with self._lock:
-                self._what, self._since = what, time.monotonic()
+                self._what = what
+                self._since = time.monotonic()
                 self._tell()
 
     def still(self) -> None:
@@ -132,7 +138,10 @@ def _followed(folder: Path, told: _Told) -> Iterator[None]:
     for level in levels:  # would each have a file of their own in the system's temporary folder
         log.set_log_destination(level, "")
     log.set_log_destination(log.Level.INFO, str(folder / "log.0."))
-    log.logtostderr, log.alsologtostderr, log.stderrthreshold, log.minloglevel = False, False, 3, 0
+    log.logtostderr = False
+    log.alsologtostderr = False
+    log.stderrthreshold = 3
+    log.minloglevel = 0
     is_over = threading.Event()
 
     def follow() -> None:

@@ -143,7 +143,8 @@ def _extent(cameras: Iterable[Camera]) -> float:
 
 def _same_pose(a: Camera, b: Camera, extent: float) -> bool:
     """Whether two cameras, of several that are spread over `extent`, have one pose, but for errors of its estimate."""
-    moved, rounding = np.linalg.norm(a.center - b.center), _ROUNDING * max(1.0, float(np.abs(a.center).max()))
+    moved = np.linalg.norm(a.center - b.center)
+    rounding = _ROUNDING * max(1.0, float(np.abs(a.center).max()))
     return moved <= _SAME_POSE * extent + rounding and np.abs(a.c2w[:3, :3] - b.c2w[:3, :3]).max() <= _SAME_POSE
 
 
@@ -172,7 +173,8 @@ def _add_points(
     kept = {image_id for name, (image_id, _) in posed.items() if name not in (held_out or ())}
     xyz, colors = model_points(reconstruction, model, kept)
     if len(xyz):
-        dataset.points, dataset.colors = xyz, colors
+        dataset.points = xyz
+        dataset.colors = colors
         dataset.point_source = (
             f"COLMAP model {model.relative_to(dataset.path)}, {len(xyz)} points of {len(kept)} cameras"
         )

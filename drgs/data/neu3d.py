@@ -61,7 +61,8 @@ def load_neu3d(
         ValueError: a damaged video, poses for another number of them or of another shape, a pose that is none, or with
             `strict` videos of different length.
     """
-    videos, rows = find_videos(path), pose_rows(path / POSES_BOUNDS)
+    videos = find_videos(path)
+    rows = pose_rows(path / POSES_BOUNDS)
     files = videos or find_posed_frames(path)
     _check_rows(path / POSES_BOUNDS, len(rows), files, bool(videos))
     numbers, sources = _videos(path, videos, times, strict) if videos else frames_of(files, times)

@@ -166,7 +166,8 @@ def added_points(
         these are next to none, random ones where the views look.
     """
     points, colors, shown = _triangulated(views, matches, progress)
-    mine, rng = shown[-1] if len(points) else np.empty(0, bool), np.random.default_rng(seed)
+    mine = shown[-1] if len(points) else np.empty(0, bool)
+    rng = np.random.default_rng(seed)
     if mine.sum() >= FEWEST:
         more, more_colors = points_beside(views[-1:], points, shown[-1:], _MAX_RANDOM, rng)
     else:
@@ -217,14 +218,18 @@ def _check_ply_size(path: Path) -> None:
     end = head.find(b"end_header")
     if not head.startswith(b"ply") or end < 0:
         raise ValueError("no PLY header")
-    least, count, columns, text = 0, 0, 1, False
+    least = 0
+    count = 0
+    columns = 1
+    text = False
     for words in (line.split() for line in head[:end].decode("ascii").splitlines()):
         if words[:1] == ["format"]:
             text = words[1:2] == ["ascii"]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
             if count and not columns:
                 raise ValueError(f"{count} rows without a column")
-            count, columns = int(words[2]), 0
+            count = int(words[2])
+            columns = 0
         elif words[:1] == ["property"] and len(words) >= 3:
             # A list takes at least its length; a number in text at least a digit and a blank.
             columns += 1

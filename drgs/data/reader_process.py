@@ -45,8 +45,12 @@ class Child:
     """
 
     def __init__(self, module: str, wanted: str, advice: str) -> None:
-        self._module, self._wanted, self._advice = module, wanted, advice
-        self._lock, self._process, self._owner = threading.Lock(), None, 0
+        self._module = module
+        self._wanted = wanted
+        self._advice = advice
+        self._lock = threading.Lock()
+        self._process = None
+        self._owner = 0
         self._socket: Any = None
         self._file: Any = None
         self._shared: Any = None
@@ -112,7 +116,8 @@ class Child:
             process_group=0,
         )
         other.close()
-        self._file, self._owner = self._socket.makefile("rwb"), os.getpid()
+        self._file = self._socket.makefile("rwb")
+        self._owner = os.getpid()
         atexit.register(self.end)
 
     def end(self) -> None:
@@ -138,7 +143,8 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
         signal.signal(name, signal.SIG_IGN)
     warnings = _Kept()
     logging.getLogger().addHandler(warnings)
-    file, shared = socket.socket(fileno=int(sys.argv[1])).makefile("rwb"), _Shared(int(sys.argv[2]))
+    file = socket.socket(fileno=int(sys.argv[1])).makefile("rwb")
+    shared = _Shared(int(sys.argv[2]))
 
     def tell(number: int) -> None:
         file.write(json.dumps({"told": number}).encode() + b"\n")
@@ -172,7 +178,8 @@ class _Shared:
     """
 
     def __init__(self, fd: int) -> None:
-        self.fd, self._map = fd, None
+        self.fd = fd
+        self._map = None
 
     def array(self, shape: Sequence[int]) -> np.ndarray:
         """The first bytes of it as an array of uint8."""
@@ -204,5 +211,6 @@ class _Kept(logging.Handler):
 
     def taken(self) -> list[str]:
         """What was logged since."""
-        texts, self._texts = self._texts, []
+        texts = self._texts
+        self._texts = []
         return texts

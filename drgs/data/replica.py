@@ -86,8 +86,10 @@ def load_replica(
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
         depth = path / "depth" / f"depth_{_FRAME.fullmatch(view.image_path.stem)[1]}.png"
-        view.depth_path, view.depth_scale = (depth if depth.is_file() else None), _MILLIMETER
-        view.background, view.is_checked = background, not lazy
+        view.depth_path = depth if depth.is_file() else None
+        view.depth_scale = _MILLIMETER
+        view.background = background
+        view.is_checked = not lazy
     return dataset
 
 

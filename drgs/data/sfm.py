@@ -36,10 +36,13 @@ CAMERA_MODELS = (
     "OPENCV_FISHEYE",
 )
 MATCHING = ("auto", "exhaustive", "sequential")
-_MAX_EXHAUSTIVE, _MAX_EXHAUSTIVE_MASKED = 60, 150  # an object alone has a tenth of the features to compare
+# an object alone has a tenth of the features to compare
+_MAX_EXHAUSTIVE = 60
+_MAX_EXHAUSTIVE_MASKED = 150
 _WINDOW = 10
 # Matches that a pose needs where an object alone is looked at, which has few: half of COLMAP's own numbers.
-_MASKED_INLIERS_FIRST, _MASKED_INLIERS = 50, 15
+_MASKED_INLIERS_FIRST = 50
+_MASKED_INLIERS = 15
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,9 @@ def synchronous(
         FileNotFoundError: Too few of the images are there.
         ValueError: Images of another shape than their camera's, or of several sizes in one camera.
     """
-    digits, first, length = max(4, len(str(numbers[-1]))), numbers[0], max(numbers[-1] - numbers[0], 1)
+    digits = max(4, len(str(numbers[-1])))
+    first = numbers[0]
+    length = max(numbers[-1] - numbers[0], 1)
     for recording in recordings:
         size = None
         for number in numbers:
@@ -118,7 +120,8 @@ def _found(view: View, recording: Recording, number: int, lazy: bool) -> bool:
     where = f"{recording.where}: camera {recording.name}"
     camera, source = recording.cameras[number], recording.source
     if isinstance(source, VideoFile):
-        view.frame, view.is_checked = VideoFrame(source.path, number), True
+        view.frame = VideoFrame(source.path, number)
+        view.is_checked = True
         view.camera = resized_to(camera, (source.width, source.height), source.path, where)
         return True
     view.image_path = source[number]

@@ -24,7 +24,9 @@ from drgs.guards.json_files import check_json, read_json
 __all__ = ["META", "load_train_meta"]
 
 META = "train_meta.json"
-_TEST, _POINTS, _IMAGES = "test_meta.json", "init_pt_cld.npz", "ims"
+_TEST = "test_meta.json"
+_POINTS = "init_pt_cld.npz"
+_IMAGES = "ims"
 _KIND = {"w": int, "h": int, "k": [list], "w2c": [list], "fn": [[str]], "cam_id": [[int]]}
 _ADVICE = "write w, h, and a list by time of lists by camera of each of k, w2c, fn and cam_id"
 _CLEARLY = 0.25  # of what is seen, more with matrices read the other way round

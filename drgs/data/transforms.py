@@ -105,7 +105,9 @@ def load_transforms(
             ply = file_inside(file.parent, data["ply_file_path"], f"{file}: ply_file_path")
             xyz, colors = read_point_ply(ply)
             source = f"{ply.name}, {len(xyz)} points"
-    dataset.points, dataset.colors, dataset.point_source = xyz, colors, source
+    dataset.points = xyz
+    dataset.colors = colors
+    dataset.point_source = source
     return dataset
 
 
@@ -130,7 +132,8 @@ def _listed(read: dict[Path, dict], dataset: Dataset) -> dict[Path, list[View | 
     Returns:
         The view of every frame of every file, None where it is absent.
     """
-    rows, listed = {}, []
+    rows = {}
+    listed = []
     for file, data in read.items():
         rows[file] = []
         for index, (frame, split) in enumerate(zip(data["frames"], _splits(file, data), strict=True)):
@@ -169,7 +172,9 @@ class _FirstImage:
 
     def __init__(self, dataset: Dataset, *held_out: Any) -> None:
         """`held_out`: arguments of `Dataset.split`."""
-        self.dataset, self._held_out, self._size = dataset, held_out, None
+        self.dataset = dataset
+        self._held_out = held_out
+        self._size = None
 
     def size(self) -> tuple[int, int]:
         if self._size is None:
@@ -210,7 +215,8 @@ def _fill(
             f"{where}: depth_unit_scale_factor must be in (0, {_DEPTH_SCALE_MAX:g}), "
             f"got {view.depth_scale:g}; correct it"
         )
-    view.background, view.is_checked = background, first is None
+    view.background = background
+    view.is_checked = first is None
     return own
 
 
@@ -250,7 +256,8 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
             f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {str(kind)[:40]!r}; undistort the images"
         )
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model, distortion = _LENSES[kind], ()
+    model = _LENSES[kind]
+    distortion = ()
     if model == "opencv_fisheye":
         distortion = (k1, k2, k3, k4)
     elif model == "opencv":
@@ -258,7 +265,8 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
             raise ValueError(f"{where}: OPENCV takes k1, k2, k3, p1, p2, got k4 = {k4:g}; undistort the images")
         distortion = (k1, k2, p1, p2, k3)
         if not any(distortion):
-            model, distortion = "pinhole", ()
+            model = "pinhole"
+            distortion = ()
     try:
         return Camera(
             K=K, w2c=w2c, width=width, height=height, model=model, distortion=distortion, time=values.get("time")

@@ -18,7 +18,8 @@ __all__ = ["lens_maps", "undistorted_map"]
 # An undistorted border pixel may look this many pixels past the photo before it counts as unseen.
 _BORDER = 1.0
 # Of an undistorted image, the share that its photo did not see: ordinary lenses leave below a tenth in the corners.
-_LOST_WARNED, _LOST_MAX = 0.25, 0.9
+_LOST_WARNED = 0.25
+_LOST_MAX = 0.9
 _CHANNELS = 64  # of a feature map that are moved at once: 44 MB of 480x360
 
 _log = logging.getLogger(__name__)

@@ -29,7 +29,9 @@ __all__ = [
 ]
 
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
-_FEW_PLACES, _ENOUGH_PLACES = 4, 6  # of cameras that film what moves (docs/dynamic.md, Data)
+# of cameras that film what moves (docs/dynamic.md, Data)
+_FEW_PLACES = 4
+_ENOUGH_PLACES = 6
 _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
 _LONGEST = 400  # characters of a path in messages
@@ -51,7 +53,8 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
     """
     if not missing:
         return
-    names, count = [str(path)[:_LONGEST] for path in missing], len(missing) + left
+    names = [str(path)[:_LONGEST] for path in missing]
+    count = len(missing) + left
     shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
     told = f"{where}: {len(names)} of the {count} images that it lists are not there ({shown})"
     if strict or left < _FEWEST:
@@ -140,7 +143,8 @@ def check_times(dataset: Dataset) -> None:
             f"{dataset.path}: every view of a scene that moves must have a time, {len(without)} have none (as view "
             f"{without[0]!r}); state all, or remove all for a scene that stands still"
         )
-    first, last = min(view.camera.time for view in train), max(view.camera.time for view in train)
+    first = min(view.camera.time for view in train)
+    last = max(view.camera.time for view in train)
     beyond = [view.name for view in test if not first <= view.camera.time <= last]
     if beyond:
         _log.warning(

@@ -97,9 +97,11 @@ class View:
         import cv2
 
         if self.frame is not None:
-            data, path = self.frame.read(), self.frame.path
+            data = self.frame.read()
+            path = self.frame.path
         elif self.image_path is not None:
-            data, path = read_image(self.image_path), self.image_path
+            data = read_image(self.image_path)
+            path = self.image_path
         else:
             raise ValueError(f"view {self.name!r}: must have an image, has none; drop this view")
         data = unit_range(data, path)

@@ -39,7 +39,9 @@ _INK = (235, 235, 235)
 _UNKNOWN = 0.25  # gray of depth where nothing is
 _NOTHING = 64  # gray of pixels whose value is 0
 _DECADES = 3.0  # at most so many are told apart by color
-_WEBM_SEGMENT, _WEBM_HEAD = bytes.fromhex("18538067"), 1024  # what holds all of a WebM file, and where it begins
+# what holds all of a WebM file, and where it begins
+_WEBM_SEGMENT = bytes.fromhex("18538067")
+_WEBM_HEAD = 1024
 _NAME = 100  # bytes of a view's name in the name of a file
 _OPAQUE = 0.5  # depth is shown where at least this much of the light stops
 
@@ -171,7 +173,8 @@ def _with_bar(picture: np.ndarray, labels: tuple[tuple[float, float], ...], digi
     height = len(picture)
     bar = np.zeros((height, 76, 3), np.uint8)
     bar[:, 4:16] = inferno(np.linspace(1.0, 0.0, height)[:, None].repeat(12, 1))
-    font, inset = cv2.FONT_HERSHEY_SIMPLEX, min(12, max(height - 2, 0))
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    inset = min(12, max(height - 2, 0))
     for row, (share, value) in zip((inset, height // 2 + 4, height - 4), labels, strict=True):
         if share in (0.0, 1.0) or height >= 48:
             cv2.putText(bar, f"{value:{digits}}", (20, row), font, 0.4, _INK, 1, cv2.LINE_AA)
@@ -200,7 +203,8 @@ class Video:
     """
 
     def __init__(self, path: str | os.PathLike, fps: float = 24.0) -> None:
-        self.path, self.fps = Path(path), fps
+        self.path = Path(path)
+        self.fps = fps
         self._writer: Any = None
         self._size: tuple[int, int] | None = None
         self._stack = contextlib.ExitStack()
@@ -275,7 +279,8 @@ def _temporary(path: Path) -> Iterator[str]:
 @contextlib.contextmanager
 def _no_native_stderr() -> Iterator[None]:
     """Close the terminal to what C libraries print."""
-    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    saved = os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(null, 2)
         yield

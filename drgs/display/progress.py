@@ -36,9 +36,14 @@ class Bar:
     def __init__(
         self, label: str, total: int | None = None, show: bool | None = None, done: int = 0, lines_only: bool = False
     ) -> None:
-        self.label, self.total, self.done, self.text = label, total, done, ""
-        self.is_drawn, self.is_told = not lines_only, False
-        self._show, self._before = show, done
+        self.label = label
+        self.total = total
+        self.done = done
+        self.text = ""
+        self.is_drawn = not lines_only
+        self.is_told = False
+        self._show = show
+        self._before = done
         self._reached = 0.0  # when the last step was done
 
     def __enter__(self) -> Bar:
@@ -66,9 +71,13 @@ class Bar:
         if label is not None and label != self.label:
             if self.is_told and self.total is not None:
                 self.note(self.line())
-            self.label, self.began, self.is_told, self._before = label, time.monotonic(), False, done
+            self.label = label
+            self.began = time.monotonic()
+            self.is_told = False
+            self._before = done
         if done != self.done:
-            self.done, self._reached = done, time.monotonic()
+            self.done = done
+            self._reached = time.monotonic()
         self.total = self.total if total is None else total
         self.text = self.text if text is None else text
         if self.is_shown:

@@ -66,7 +66,8 @@ class HexPlane(torch.nn.ParameterList):
         """Of `.to(...)`: bounds of a world far from 0 and times keep their digits."""
         bounds, span = self.bounds, self.span
         super()._apply(fn, recurse)
-        self.bounds, self.span = bounds.to(self.bounds.device), span.to(self.span.device)
+        self.bounds = bounds.to(self.bounds.device)
+        self.span = span.to(self.span.device)
         return self
 
 
@@ -118,7 +119,8 @@ def _ends(first: torch.Tensor, step: int) -> torch.Tensor:
 
 def _bilinear(plane: torch.Tensor, column: tuple, row: tuple) -> torch.Tensor:
     """(N, C) of cells and parts along the second and the first axis of a plane."""
-    (a, s), (b, t) = column, row
+    (a, s) = column
+    (b, t) = row
     corners = _ends(_ends(b * plane.shape[1] + a, 1), plane.shape[1]).flatten(1)
     return _Lookup.apply(plane.reshape(-1, plane.shape[2]), corners, torch.stack([s, t], 1))
 

@@ -52,7 +52,8 @@ class _Bend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, axes: tuple[int, ...]) -> torch.Tensor:
-        total, slope = x.new_zeros(()), torch.zeros_like(x)
+        total = x.new_zeros(())
+        slope = torch.zeros_like(x)
         for axis in axes:
             inner = x.shape[axis] - 2
             if inner < 1:

@@ -36,7 +36,9 @@ TEMPLATES = ("a photo of a {}.", "a photo of the {}.", "a {} in a scene.", "{}")
 MAP_NORM = 4.0
 _SHORT = 2  # short side of the photograph at scale 1, in image sizes of the model
 _LONGEST = 4096  # pixels that the transformer may see along a side: its attention grows with their fourth power
-_MEAN, _STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # CLIP's own
+# CLIP's own
+_MEAN = (0.48145466, 0.4578275, 0.40821073)
+_STD = (0.26862954, 0.26130258, 0.27577711)
 _WEIGHTS = (
     "model.safetensors",
     "model.safetensors.index.json",
@@ -60,7 +62,8 @@ class ClipEncoder:
     """
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
-        self.folder, self.device = Path(folder), device
+        self.folder = Path(folder)
+        self.device = device
         self._config = _checked_config(self.folder)
         transformers = _transformers()
         weights = next((name for name in _WEIGHTS if (self.folder / name).is_file()), None)
@@ -237,7 +240,8 @@ def _checked_config(folder: Path) -> dict[str, Any]:
 
 def _colors(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation that colors are normalized with, (3,) float32 each."""
-    path, values = folder / "preprocessor_config.json", {}
+    path = folder / "preprocessor_config.json"
+    values = {}
     if path.is_file():
         values = read_json(path, "a preprocessor_config.json", "copy it again")
         check_json(str(path), values, {}, "copy it again")

@@ -21,8 +21,12 @@ NO_LABEL = (40, 40, 40)
 """Color of pixels without a label."""
 _PERCENTILES = 1.0, 99.0
 _ROWS = 5000  # samples of a basis: 20 MB of 512 channels in float64
-_INK, _BACK = (235, 235, 235), (18, 18, 18)
-_LINE, _SWATCH, _CHARACTER = 17, 12, 34  # pixels of a legend's line and of its square; characters of a name at most
+_INK = (235, 235, 235)
+_BACK = (18, 18, 18)
+# pixels of a legend's line and of its square; characters of a name at most
+_LINE = 17
+_SWATCH = 12
+_CHARACTER = 34
 _EDGE = 0.35  # how much darker the border between two classes is
 
 

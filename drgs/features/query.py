@@ -150,9 +150,11 @@ class TextQuery:
         """
         channels = features.shape[-1] if decoder is None else decoder.channels
         if channels != self.channels:
-            what, advice = "decoded features", "take those of the teacher's own text encoder"
+            what = "decoded features"
+            advice = "take those of the teacher's own text encoder"
             if decoder is None:
-                what, advice = "features, which no decoder was given for", "name theirs (--decoder), or other texts"
+                what = "features, which no decoder was given for"
+                advice = "name theirs (--decoder), or other texts"
             raise ValueError(
                 f"query: text embeddings must have the {channels} channels of the {what}, got {self.channels}; {advice}"
             )

@@ -128,7 +128,8 @@ def classify(features: torch.Tensor, classes: Classes, decoder: Decoder | None =
         ValueError: If widths differ, or a feature is not finite.
     """
     channels = features.shape[-1] if decoder is None else decoder.channels
-    matrix, offset = classes.vectors(channels), None
+    matrix = classes.vectors(channels)
+    offset = None
     if decoder is not None:
         _check_width("classify", features, decoder.width)
         # A label has no derivative.

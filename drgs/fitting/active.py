@@ -82,10 +82,14 @@ class ActiveViews:
 
         if not views:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
-        self.active, self.views, self._config, self._workers = active, list(views), config, workers
+        self.active = active
+        self.views = list(views)
+        self._config = config
+        self._workers = workers
         policy_named(active.policy)  # else the first pick would be where that is found out
         self.timetable = Timetable.of(active, self.views, config, moves)
-        first, last = len(self.timetable.start), len(self.timetable.start) + self.timetable.add - 1
+        first = len(self.timetable.start)
+        last = len(self.timetable.start) + self.timetable.add - 1
         for count in active.measure:
             if not first <= count <= last:
                 raise ValueError(
@@ -93,7 +97,8 @@ class ActiveViews:
                     f"{count}; drop it (with all views the end of the fit is measured)"
                 )
         self.chosen = list(self.timetable.start)
-        self.picks, self.measured = list[dict](), list[dict]()
+        self.picks = list[dict]()
+        self.measured = list[dict]()
         self.pool_leak = config.init_points == "all"
         # Photographs of another time do not say where things are at this one.
         wanted = not self.pool_leak and self.timetable.schedule == "views"
@@ -190,11 +195,13 @@ class ActiveViews:
         """
         from drgs.data import triangulated_count, triangulated_points
 
-        seen, restart = [self.views[i] for i in self.chosen], self.active.restart
+        seen = [self.views[i] for i in self.chosen]
+        restart = self.active.restart
         dense = any(view.depth_path is not None for view in seen)
         if restart == "never" or not self._share or dense:
             return None
-        seed, room = self._config.seed + len(self.picks), self._config.max_gaussians - self.reserved
+        seed = self._config.seed + len(self.picks)
+        room = self._config.max_gaussians - self.reserved
         began = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), self._began)
         with Bar("points of all views") as bar:
             if began is None:  # the first call: what is matched here is kept for the next one
@@ -270,7 +277,8 @@ class ActiveViews:
                 workers=self._workers,
             )
         best = selection.picks[0]
-        index, count = left[best.index], len(left)
+        index = left[best.index]
+        count = len(left)
         unseen: Sequence[float | None] = selection.unseen or [None] * count
         scored = zip(left, selection.scores, selection.parts or [{}] * count, unseen, strict=True)
         record = {
@@ -345,7 +353,8 @@ class ActiveViews:
         Raises:
             ValueError: If the checkpoint chose by another rule, or from other views.
         """
-        old, new = header["active"], self._resolved(self.active.to_json())
+        old = header["active"]
+        new = self._resolved(self.active.to_json())
         was = self._resolved(self.active.recorded(old["config"]))
         for key in new:
             if new[key] != was[key]:
@@ -358,7 +367,8 @@ class ActiveViews:
                 f"{where}: --resume must have the same training views, the data set, --test-every or --test-offset has "
                 "changed; repeat the options or choose another folder"
             )
-        self.picks, self.measured = old["picks"], old.get("measured", [])
+        self.picks = old["picks"]
+        self.measured = old.get("measured", [])
         self.chosen = self.chosen[: len(self.timetable.start)] + [pick["index"] for pick in self.picks]
         self._generator.set_state(tensors["policy_rng"])
 

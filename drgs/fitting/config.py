@@ -55,7 +55,10 @@ FieldPreset = Literal["neu3d", "dnerf"]
 SAVING = ("save_every", "save_minutes")
 """Fields of `FitConfig` that change nothing of what is fitted: a fit may go on with others."""
 
-_COUNT, _SHARE, _RATE, _WEIGHT = (1, 10**9), (0.0, 1.0), (0.0, 1e6), (0.0, 1e6)
+_COUNT = (1, 10**9)
+_SHARE = (0.0, 1.0)
+_RATE = (0.0, 1e6)
+_WEIGHT = (0.0, 1e6)
 _RANGES = {
     **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
     "save_minutes": (1e-3, 1e9),

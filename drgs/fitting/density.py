@@ -39,7 +39,8 @@ def divide(opacity: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, t
     new = -torch.expm1(torch.log1p(-old) / n)
     # sum_{i=k+1..n} C(i-1, k) = C(n, k+1): the double sum is a single one.
     k = torch.arange(_MAX_COPIES, dtype=torch.float64, device=old.device)
-    top, chosen = n.double()[:, None], k + 1
+    top = n.double()[:, None]
+    chosen = k + 1
     log_binomial = torch.lgamma(top + 1) - torch.lgamma(chosen + 1) - torch.lgamma((top - chosen).clamp(min=0) + 1)
     terms = torch.exp(log_binomial + chosen * new.log()[:, None]) * (-1) ** k / chosen.sqrt()
     bottom = torch.where(chosen <= top, terms, 0).sum(1)
@@ -57,7 +58,8 @@ def relocate(rows: GaussianRows, min_opacity: float, jitter: float, generator: t
     """
     opacity = rows.tensors["logit_opacities"].detach().sigmoid()  # for a decision, which has no gradient
     is_dead = opacity <= min_opacity
-    dead, alive = is_dead.nonzero()[:, 0], (~is_dead).nonzero()[:, 0]
+    dead = is_dead.nonzero()[:, 0]
+    alive = (~is_dead).nonzero()[:, 0]
     if not len(dead) or not len(alive):
         return 0
     source = alive[_draw(opacity[alive], len(dead), generator)]

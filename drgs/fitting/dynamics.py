@@ -68,7 +68,8 @@ class Motion:
     """
 
     def __init__(self, config: FitConfig, times: Sequence[float]) -> None:
-        self.config, self.times = config, tuple(times)
+        self.config = config
+        self.times = tuple(times)
         self.first_step = round(config.static_share * config.max_steps)
         self.field: DeformationField | None = None
         self.step = 0
@@ -125,7 +126,8 @@ class Motion:
 
     def prepare(self, rows: GaussianRows, step: int) -> None:
         """Before a step of the dynamic stage: gates get the epsilon of their optimizer and, once, all open again."""
-        self.step, gates = step, rows.tensors["motion"]
+        self.step = step
+        gates = rows.tensors["motion"]
         group = next(group for group in rows.optimizer.param_groups if group["name"] == "motion")
         group["eps"] = max(_NOISE * self.config.motion_weight / max(len(rows), 1), 1e-15)
         if step == self._again:

@@ -22,7 +22,8 @@ __all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "padded_ssi
 
 _RADIUS = 5
 _SIGMA = 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 
 
 class LossTerm(Protocol):
@@ -70,7 +71,8 @@ class Photometric:
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
-        rgb, target = output.rgb, frame.target()
+        rgb = output.rgb
+        target = frame.target()
         if frame.mask is not None:
             rgb = rgb * frame.mask[..., None]
         loss = (1 - self.ssim_weight) * (rgb - target).abs().mean()

@@ -39,7 +39,9 @@ class Network:
         factors: Mapping[str, float] | None = None,
         fused: bool = False,
     ) -> None:
-        self.name, self.module, self.rate = name, module, rate
+        self.name = name
+        self.module = module
+        self.rate = rate
         groups: dict[float, list] = {}
         for key, x in module.named_parameters():
             groups.setdefault((factors or {}).get(key, 1.0), []).append(x)

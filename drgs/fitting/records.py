@@ -156,7 +156,9 @@ def load_run(run: Run) -> LoadedRun:
         ValueError: If config.json or the classes' embeddings are damaged, or everything else.
     """
     record = fit_record(run)
-    known, decoder, moving = record.semantics, None, None
+    known = record.semantics
+    decoder = None
+    moving = None
     classes = None if known is None else known.read_classes(run.path)
     try:
         tensors, header = load_state(run.state)
@@ -244,7 +246,8 @@ def is_run(path: Path) -> bool:
     One that does not, because it was damaged or edited, counts beside a checkpoint or a log: its reader says what is
     wrong with it.
     """
-    config, others = path / "config.json", ("state.safetensors", "log.jsonl")
+    config = path / "config.json"
+    others = ("state.safetensors", "log.jsonl")
     return config.is_file() and (is_fit_config(config) or any((path / name).is_file() for name in others))
 
 
@@ -300,7 +303,8 @@ def fit_record(run: Run) -> FitRecord:
         FileNotFoundError: If it is no run folder.
         ValueError: If config.json is damaged, of another version, or says something that no fit has written.
     """
-    config, where = run.config(), f"{run.path / 'config.json'}"
+    config = run.config()
+    where = f"{run.path / 'config.json'}"
     advice = "restore the file, or fit again in another folder"
     check_json(where, config, _CONFIG | ({"times": [float]} if "times" in config else {}), advice)
     try:
@@ -328,7 +332,8 @@ def fitted_views(run: Run) -> list[str]:
     record = fit_record(run)
     if not record.is_active:
         return list(record.train)
-    path, advice = run.path / "selection.json", "move it away and resume the fit"
+    path = run.path / "selection.json"
+    advice = "move it away and resume the fit"
     selection = read_json(path, "the record of the chosen views", advice)
     check_json(str(path), selection, {"start": [_VIEW], "picks": [_VIEW]}, advice)
     return [view["name"] for view in (*selection["start"], *selection["picks"])]

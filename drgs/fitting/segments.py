@@ -35,8 +35,11 @@ class Segmentation:
     """
 
     def __init__(self, gaussians: Gaussians, decoder: Decoder, classes: Classes, reference: str, folder: str) -> None:
-        self.reference, self.folder = reference, folder
-        self._gaussians, self._decoder, self._classes = gaussians, decoder, classes
+        self.reference = reference
+        self.folder = folder
+        self._gaussians = gaussians
+        self._decoder = decoder
+        self._classes = classes
         self._colors: FeatureColors | None = None
         self._run: list[tuple[np.ndarray, np.ndarray]] = []
         self._teacher: list[tuple[np.ndarray, np.ndarray]] = []

@@ -80,7 +80,8 @@ class FeatureDistance:
             kept = kept > _INSIDE
             if not bool(kept.any()):
                 return None
-            shown, cells = shown[kept], cells[:, kept]
+            shown = shown[kept]
+            cells = cells[:, kept]
         return self.weight * _Distance.apply(shown, self.decoder.matrix, self.decoder.bias, cells)
 
     def _shown(self, output: Output, frame: Frame, gaussians: Gaussians, width: int, height: int) -> torch.Tensor:
@@ -112,7 +113,8 @@ class _Distance(torch.autograd.Function):
         ctx: Any, features: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor, cells: torch.Tensor
     ) -> torch.Tensor:
         """The loss is a number, so that its gradients are known with it, up to a factor."""
-        total, step = 0.0, max(1, _CHUNK // len(matrix))
+        total = 0.0
+        step = max(1, _CHUNK // len(matrix))
         slopes = torch.empty_like(features), torch.zeros_like(matrix), torch.zeros_like(bias)
         for k in range(0, len(features), step):
             f = features[k : k + step]

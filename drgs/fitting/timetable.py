@@ -123,11 +123,13 @@ class Timetable:
         if len(times) < 2:
             raise ValueError(f"{where} must have training views of two times or more, got one; use --schedule views")
         start, *later = (tuple(times[time]) for time in sorted(times))
-        add, room = active.add or len(later), len(later) if schedule == "times" else sum(map(len, later))
+        add = active.add or len(later)
+        room = len(later) if schedule == "times" else sum(map(len, later))
         if add > room:
             what = "later times" if schedule == "times" else "training views at later times"
             raise ValueError(f"{where} must have --add of at most the {room} {what}, got {add}; lower it")
-        static, least = round(config.static_share * config.max_steps), math.ceil(_PART * config.max_steps)
+        static = round(config.static_share * config.max_steps)
+        least = math.ceil(_PART * config.max_steps)
         every = active.every or max(1, round(_PART * config.max_steps))
         first = static + max(every, least)
         last = first + (add - 1) * every
@@ -166,7 +168,8 @@ def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int
         first: Index of the one to begin with.
     """
     centers = np.stack([camera.center for camera in cameras])
-    chosen, distance = [first], np.linalg.norm(centers - centers[first], axis=1)
+    chosen = [first]
+    distance = np.linalg.norm(centers - centers[first], axis=1)
     while len(chosen) < count:
         distance[chosen] = -1.0  # where all centers coincide, too, no view is chosen twice
         chosen.append(int(np.argmax(distance)))

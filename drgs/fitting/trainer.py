@@ -89,7 +89,10 @@ class Trainer:
             raise ValueError("fit: there must be at least one training view, got none; add photographs")
         if not len(rows):
             raise ValueError("fit: there must be at least one initial point, got none; check the data set")
-        self.config, self.frames, self.rows, self.extent = config, frames, rows, extent
+        self.config = config
+        self.frames = frames
+        self.rows = rows
+        self.extent = extent
         self.parts = parts_of(config, extent) if parts is None else parts
         self.motion = motion
         self._check_parts()
@@ -97,7 +100,8 @@ class Trainer:
         self._bad: str | None = None  # what was not finite first
         self._generator = torch.Generator().manual_seed(config.seed)
         self._queue = torch.zeros(0, dtype=torch.int64)
-        self._start_count, self.reserved = len(rows), 0
+        self._start_count = len(rows)
+        self.reserved = 0
 
     def _check_parts(self) -> None:
         """Raise ValueError if a tensor has no rate, or two networks have one name."""
@@ -122,7 +126,8 @@ class Trainer:
     def restart(self, points: torch.Tensor, colors: torch.Tensor) -> None:
         """Begin again with Gaussians at other points; schedules, networks and photographs stay as they are."""
         features = self.rows.tensors.get("features")
-        width, degree = 0 if features is None else features.shape[1], self.rows.sh_degree
+        width = 0 if features is None else features.shape[1]
+        degree = self.rows.sh_degree
         self.rows = GaussianRows.from_points(points, colors, *self.config.start_of(False), features=width)
         while self.rows.sh_degree < degree:
             self.rows.raise_sh_degree()
@@ -153,7 +158,8 @@ class Trainer:
         with torch.no_grad():  # told, not optimized
             mse = self._mse(frame, out.rgb)
         if (bad := self._not_finite(loss)) is None:
-            self._bad_in_a_row, self._bad = 0, None
+            self._bad_in_a_row = 0
+            self._bad = None
             for optimizer in optimizers:
                 optimizer.step()
             stage = self._stage()
@@ -231,7 +237,8 @@ class Trainer:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
         # What an older drgs did not know, it did as the defaults say.
-        new, old = config.to_json(), FitConfig().to_json() | header["config"]
+        new = config.to_json()
+        old = FitConfig().to_json() | header["config"]
         for key in new:
             if key not in SAVING and new[key] != old[key]:
                 raise ValueError(
@@ -242,12 +249,14 @@ class Trainer:
             raise ValueError(
                 f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
-        rows, extent = GaussianRows.from_state(tensors), header["extent"]
+        rows = GaussianRows.from_state(tensors)
+        extent = header["extent"]
         parts = parts_of(config, extent) if parts is None else parts
         if motion is not None and motion.has_begun(rows):
             parts = motion.restored(rows, parts, header, where)
         trainer = cls(config, frames, rows, extent, parts, motion)
-        was, now = header.get("networks", []), [network.name for network in trainer.parts.networks]
+        was = header.get("networks", [])
+        now = [network.name for network in trainer.parts.networks]
         if was != now:
             raise ValueError(
                 f"{where}: --resume must continue the same fit, networks were {was} and are {now}; "
@@ -255,7 +264,8 @@ class Trainer:
             )
         for network in trainer.parts.networks:
             network.restore(tensors, where)
-        trainer.step_index, trainer.bad_steps = header["step"], header["bad_steps"]
+        trainer.step_index = header["step"]
+        trainer.bad_steps = header["bad_steps"]
         trainer._start_count = header["start_count"]
         trainer._generator.set_state(tensors["rng"])
         trainer._queue = tensors["queue"]
@@ -267,14 +277,17 @@ class Trainer:
 
     def _prepare(self, done: int) -> list[dict]:
         """Schedules and density control before step `done`."""
-        config, rows, events = self.config, self.rows, []
+        config = self.config
+        rows = self.rows
+        events = []
         # The degree is a quotient, rounded up; 1e-9 keeps a whole one from being rounded up to the next.
         while rows.sh_degree < min(config.sh_degree, done / max(1, round(config.sh_every * config.max_steps)) - 1e-9):
             rows.raise_sh_degree()
             events.append({"event": "sh_degree", "degree": rows.sh_degree})
         stage = self._stage()
         every = max(1, round(config.refine_every * stage.length))
-        start, stop = config.refine_start * stage.length, config.refine_stop * stage.length
+        start = config.refine_start * stage.length
+        stop = config.refine_stop * stage.length
         if (done - stage.begin) % every == 0 and max(start, 1) <= done - stage.begin < stop:
             events.append(self._refine(done, start))
         rows.set_rates({name: rate_at(self.parts.rates[name], self._part()) for name in rows.tensors})
@@ -284,7 +297,9 @@ class Trainer:
 
     def _refine(self, done: int, start: float) -> dict:
         """Density control at step `done`; `start`: when the first is due in a stage. What it did, for the log."""
-        config, rows, stage = self.config, self.rows, self._stage()
+        config = self.config
+        rows = self.rows
+        stage = self._stage()
         moved = relocate(rows, config.min_opacity, config.jitter, self._generator)
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
         full = max(config.grow_until * stage.length - start, 1)
@@ -303,7 +318,8 @@ class Trainer:
         assert self.motion is not None
         self.parts = self.motion.begin(self.rows, self.parts, self.extent)
         self._check_parts()
-        self._queue, self._start_count = self._queue[:0], len(self.rows)
+        self._queue = self._queue[:0]
+        self._start_count = len(self.rows)
         return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}]
 
     def _fitted_scene(self) -> Scene:
@@ -317,7 +333,8 @@ class Trainer:
         if not len(self._queue):
             shown = range(len(self.frames)) if self.motion is None else self.motion.shown(self.frames)
             self._queue = torch.tensor(shown)[torch.randperm(len(shown), generator=self._generator)]
-        view, self._queue = int(self._queue[0]), self._queue[1:].clone()
+        view = int(self._queue[0])
+        self._queue = self._queue[1:].clone()
         return view
 
     def _shown(self, gaussians: Gaussians, frame: Frame) -> Output:
@@ -336,7 +353,8 @@ class Trainer:
 
     def _loss(self, out: Output, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, dict[str, float]]:
         """The sum of the terms that a view has, and each of them by name."""
-        total, told = None, {}
+        total = None
+        told = {}
         for term in self.parts.terms:
             value = term(out, frame, gaussians)
             if value is not None:

@@ -29,7 +29,10 @@ _ROTATION_TOLERANCE = 1e-4  # of R R^T: what four digits a number leave; more is
 _ROW_TOLERANCE = 1e-6  # of the row 0 0 0 1, which only rounding may have touched
 # Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.
 IMAGE_MAX = 2**31  # pixels
-_FOCAL_MIN, _FOCAL_MAX, _DISTANCE_MAX, _DISTORTION_MAX = 1e-4, 1e6, 1e15, 1e6
+_FOCAL_MIN = 1e-4
+_FOCAL_MAX = 1e6
+_DISTANCE_MAX = 1e15
+_DISTORTION_MAX = 1e6
 
 
 def is_tensor(value: Any) -> bool:
@@ -81,7 +84,8 @@ def checked_intrinsics(where: str, K: Any) -> np.ndarray:
 def check_proportions(where: str, K: np.ndarray, size: tuple[int, int]) -> None:
     """Focal lengths and principal point have something to do with (width, height)."""
     for axis, side in enumerate(size):
-        focal, middle = K[axis, axis], K[axis, 2]
+        focal = K[axis, axis]
+        middle = K[axis, 2]
         if not _FOCAL_MIN * side <= focal <= _FOCAL_MAX * side:
             raise ValueError(
                 f"{where}: focal lengths must be {_FOCAL_MIN:g} to {_FOCAL_MAX:g} times the sides of the image, got "

@@ -54,7 +54,8 @@ def _conversion(path: Path, suffix: str) -> str:
     target = path.with_name(f"{name}.ply")
     if target == path:
         target = path.with_name(f"{name}_3dgs.ply")
-    source, made = shlex.quote(str(path.parent if path.name == "meta.json" else path)), shlex.quote(str(target))
+    source = shlex.quote(str(path.parent if path.name == "meta.json" else path))
+    made = shlex.quote(str(target))
     if suffix != ".lcc":
         return f"convert it with `drgs convert {source} {made}`, or read it with drgs.load_gaussians"
     return (

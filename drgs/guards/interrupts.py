@@ -56,10 +56,12 @@ class _Handlers:
 
     def on_signal(self, signum: int, _frame: object) -> None:
         """Python's handler, in the main thread."""
-        self.is_answered, now = True, time.monotonic()
+        self.is_answered = True
+        now = time.monotonic()
         is_first = self.first is None
         if self.first is None:
-            self.first, self.signum = now, signum
+            self.first = now
+            self.signum = signum
         is_again = now - self.first >= _SAME
         if not (is_again or is_first and not self.waits):
             return
@@ -215,7 +217,8 @@ def _installed(leave: Callable[[int], None] | None) -> Iterator[_Handlers | None
     if threading.current_thread() is not threading.main_thread():
         yield None
         return
-    outer, _active = _active, _Handlers(leave)
+    outer = _active
+    _active = _Handlers(leave)
     before = {s: signal.getsignal(s) for s in _SIGNALS}
     for signum, handler in before.items():
         if handler not in (signal.SIG_IGN, None):

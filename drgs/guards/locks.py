@@ -37,7 +37,8 @@ def acquire(folder: Path, command: str) -> str | None:
         InUse: If another process writes there, or one of another machine may.
         OSError: If the folder cannot be written.
     """
-    path, stale = folder / NAME, None
+    path = folder / NAME
+    stale = None
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     text = json.dumps({**_this_process(), "command": command, "since": now}) + "\n"
     with _one_at_a_time(folder):

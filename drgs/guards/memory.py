@@ -16,14 +16,19 @@ __all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
 # a pixel in the order of centers, in that of rays as much and their rows; bvh: 156 to 172; gradients: 54 to 61 more.
 # Lists of Gaussians, rows (128 MB at a time) and kernels come on top, hence "at least".
-_TILES, _BVH, _GRADIENT, _FEATURE = 60, 155, 50, 8
+_TILES = 60
+_BVH = 155
+_GRADIENT = 50
+_FEATURE = 8
 PICTURES = {"png": 12, "exr": 28, "webm": 90}
 """Bytes a pixel that writing a file of a format adds, measured in the same way."""
 TANGENT = 70
 """Bytes a pixel that each column of forward mode adds (measured with six: 73)."""
 PAIR = 24
 """Bytes an entry of the tile lists takes while they are made: keys, their sorted copy, and the sort's own."""
-_MEMINFO, _GROUP_OF, _GROUPS = Path("/proc/meminfo"), Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+_MEMINFO = Path("/proc/meminfo")
+_GROUP_OF = Path("/proc/self/cgroup")
+_GROUPS = Path("/sys/fs/cgroup")
 _OTHER = 256 << 20  # kernels, tensors of the Gaussians and whatever else a command holds
 _SMALL = 256 << 20  # of what needs less, nobody asks: looking costs more than it is worth
 

@@ -46,8 +46,10 @@ class Claim:
     """
 
     def __init__(self, path: Path, command: str):
-        self.path, self.command = path, command
-        self._thread, self._depth = threading.get_ident(), 1
+        self.path = path
+        self.command = command
+        self._thread = threading.get_ident()
+        self._depth = 1
         self._inputs: list[Path] = []
         self._new: list[Path] = []  # folders that were made for it, from the outside in
         self._made: dict[str, dict[str, str]] = {}  # name -> hash -> command

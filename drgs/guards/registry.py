@@ -35,7 +35,8 @@ class Registry(MutableMapping[str, T], Generic[T]):
     """
 
     def __init__(self, kind: str, group: str, rows: Mapping[str, T | str]) -> None:
-        self.kind, self.group = kind, group
+        self.kind = kind
+        self.group = group
         self._rows: dict[str, Any] = dict(rows)
 
     def __getitem__(self, name: str) -> T:

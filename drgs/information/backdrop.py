@@ -96,7 +96,8 @@ def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) ->
 
     with torch.no_grad():
         # Without its lens, which tiles do not know: what is wanted is how far away things are, about.
-        plain, small = colors_only(scene, camera.time), at_most(camera.undistorted(), _PIXELS)
+        plain = colors_only(scene, camera.time)
+        small = at_most(camera.undistorted(), _PIXELS)
         # `fast` measures depth along the ray, `ewa` along the axis of the camera.
         out = render(plain, small, RenderSettings.preset("fast"), outputs=("median_depth",))
     assert out.median_depth is not None
@@ -145,7 +146,8 @@ def painted_opacity(
     """(1536, 3) float64 H_c of a view of a known opacity (H, W), in each channel, times the channel's weight; with a
     mask (H, W) of its square.
     """
-    total, open_ = torch.zeros(CELLS, dtype=torch.float64), _open(opacity)
+    total = torch.zeros(CELLS, dtype=torch.float64)
+    open_ = _open(opacity)
     if mask is not None:
         open_ = open_ * mask.detach().double().cpu().square()
     total.index_add_(0, backdrop_cells(camera, sphere).flatten(), open_.flatten())

@@ -55,7 +55,8 @@ class Cache:
         self._answers: OrderedDict[Hashable, Information] = OrderedDict()  # the one that was used last comes last
         self._scene: _State | None = None
         self._lock = threading.RLock()  # several Python threads may select at a time
-        self.max_bytes, self.bytes = max_bytes, 0
+        self.max_bytes = max_bytes
+        self.bytes = 0
         self.hits = self.misses = self.evictions = 0
 
     def __len__(self) -> int:

@@ -56,7 +56,9 @@ def dense(
         )
     added = torch.as_tensor(prior, dtype=torch.float64).expand(J.shape[1])
     keep = (J != 0).any(0) | (added > 0)
-    Jc, J, added = Jc[:, keep], J[:, keep], added[keep]
+    Jc = Jc[:, keep]
+    J = J[:, keep]
+    added = added[keep]
     # R from the rows themselves: H = J^T J would square the condition number.
     rows = torch.cat([J, added.sqrt().diag()])
     length = rows.norm(dim=0)
@@ -68,10 +70,13 @@ def dense(
         )
     whitened = torch.linalg.solve_triangular(R, Jc / length, upper=True, left=False)
     spectrum = torch.linalg.svdvals(whitened).square()
-    H, Hc = J.square().sum(0) + added, Jc.square().sum(0)
-    ratio, blocks = Hc / H, None
+    H = J.square().sum(0) + added
+    Hc = Jc.square().sum(0)
+    ratio = Hc / H
+    blocks = None
     if labels is not None:
-        labels, blocks = torch.as_tensor(labels)[keep], 0.0
+        labels = torch.as_tensor(labels)[keep]
+        blocks = 0.0
         for label in labels.unique():
             one = labels == label
             blocks += dense(Jc[:, one], J[:, one], added[one]).mutual_information

@@ -97,7 +97,8 @@ def by_columns(
     scale = torch.tensor(weights, dtype=torch.float64)
     factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
     for name, group in wanted.items():
-        shape, squares = group.tangent(gaussians), []
+        shape = group.tangent(gaussians)
+        squares = []
         rows = np.argwhere(np.ones(shape))
         for start in range(0, len(rows), _BATCH):
             index = {name: rows[start : start + _BATCH]}

@@ -135,7 +135,8 @@ class Questions:
             return found
         one = next(one for one in self.asked if one.function == "backdrop")
         options: dict[str, Any] = dict(one.options)
-        sphere, mask = options["sphere"], None if self.empty_outside else mask
+        sphere = options["sphere"]
+        mask = None if self.empty_outside else mask
         told = painted_opacity(opacity, camera, (1.0, 1.0, 1.0), mask, sphere)
         found[f"{one.block}.backdrop" if one.block else "backdrop"] = told.to(torch.float32)
         return found
@@ -174,7 +175,8 @@ class Combination:
             if self.traced:
                 return _Trace(scoring.weights)
             return scorer(H, scoring.criterion, scoring.prior_of(), scoring.weights, pool)
-        known, lambdas = {name.partition(".")[2] for name in H}, scoring.prior_of()
+        known = {name.partition(".")[2] for name in H}
+        lambdas = scoring.prior_of()
         for what, names in (("Prior: groups", lambdas.groups), ("information_gain: weights", scoring.weights)):
             for name in names:
                 if name not in known:
@@ -196,7 +198,8 @@ class Combination:
             merged = lambda field: {  # noqa: E731
                 f"{block}.{name}": x for block, gain in gains.items() for name, x in getattr(gain, field).items()
             }
-            total, repaired = sum(gain.total for gain in gains.values()), max(gain.repaired for gain in gains.values())
+            total = sum(gain.total for gain in gains.values())
+            repaired = max(gain.repaired for gain in gains.values())
             return Gain(total, merged("parts"), merged("left_out"), merged("unseen"), repaired)
 
         return score
@@ -308,7 +311,8 @@ def _of_gaussians(
         without = ("sh",)
     if not blocks or (groups is not None and set(groups) <= set(without)):
         return None
-    name, rows = blocks[0] if apart else "", _rows(blocks, metric)
+    name = blocks[0] if apart else ""
+    rows = _rows(blocks, metric)
     if scoring.criterion == "block_logdet":
         return Asked("blocks", (), tuple(sorted(rows.items())), name)
     options: dict[str, Hashable] = {"method": scoring.method, "groups": groups, **rows}

@@ -44,7 +44,8 @@ def _some(
     A.diagonal(dim1=1, dim2=2).fill_(1.0)
     factor, failed = torch.linalg.cholesky_ex(A)
     bad = failed.nonzero()[:, 0]
-    repaired, ridge = len(bad), ROUNDING
+    repaired = len(bad)
+    ridge = ROUNDING
     while len(bad):
         if ridge > 1e-2:  # a percent of the diagonal is not rounding any more
             raise ValueError(
@@ -54,6 +55,7 @@ def _some(
         again = A[bad]
         again.diagonal(dim1=1, dim2=2).add_(ridge)
         factor[bad], failed = torch.linalg.cholesky_ex(again)
-        bad, ridge = bad[failed > 0], 10 * ridge
+        bad = bad[failed > 0]
+        ridge = 10 * ridge
     logs = 2 * factor.diagonal(dim1=1, dim2=2).log() + torch.where(keep, diagonal, 1.0).log()
     return logs.sum(1), repaired

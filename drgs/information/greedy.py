@@ -87,7 +87,9 @@ class ViewInformation:
             source: What information is computed by.
             known: The same of views that are known, where less is needed of them.
         """
-        self.pool, self.source, self.known = pool, source, known or source
+        self.pool = pool
+        self.source = source
+        self.known = known or source
         self.computed = self.done = self.bytes = 0
         self._expected = len(pool.train) + len(pool.candidates)
         self.told: dict[str, bool] = {}
@@ -134,7 +136,8 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         information: Of single views.
         combination: How a score is made of it; default by that scoring, all groups together.
     """
-    combination, prior = combination or Combination(pool.scoring), pool.scoring.prior_of()
+    combination = combination or Combination(pool.scoring)
+    prior = pool.scoring.prior_of()
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
     H, everything, scores, kept = _first_round(pool, information, combination)
@@ -186,7 +189,9 @@ def _first_round(
         part = next(told)
         H = H or _nothing(part)
         _add(H, part)
-    score, everything, keeps = None, None, pool.k > 1
+    score = None
+    everything = None
+    keeps = pool.k > 1
     for i in range(len(candidates)):
         part = next(told)
         if i == 0:
@@ -224,7 +229,8 @@ def _nothing(part: Information) -> dict[str, torch.Tensor]:
 
 def _notes(gains: list[Gain], apart: tuple[str, ...]) -> list[str]:
     """What is worth saying about the first round, of blocks that are scored alone or of all groups together."""
-    notes, scores = [], [gain.total for gain in gains]
+    notes = []
+    scores = [gain.total for gain in gains]
     if max(scores) == 0 and apart:  # of z-scores, one is positive otherwise
         if len(gains) > 1:
             notes.append(f"all {len(scores)} candidates have the same score in each block; the order decided")

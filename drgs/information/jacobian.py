@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
 
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
-_OPACITY, _COLOR, _SHAPE = 0, 1, 10  # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
+# entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
+_OPACITY = 0
+_COLOR = 1
+_SHAPE = 10
 
 
 def extras(
@@ -47,7 +50,8 @@ def extras(
         moved: Where the response asks for them, per geometric parameter but the opacity the tangent of the record.
         color: (channel, axis) nested lists of dc/dmu, or None where the color does not depend on the mean.
     """
-    F, logit = lib.Float, lib.Float64(logit)
+    F = lib.Float
+    logit = lib.Float64(logit)
     e = dr.exp(-abs(logit))
     opacity = dr.select(logit >= 0, 1, e) / (1 + e)
     columns = [F(response.strength_slope(logit, opacity, e))]
@@ -98,9 +102,14 @@ class Rows:
         masks: list[Float] | None = None,
         table: Table | None = None,
     ) -> None:
-        self.m, self.channels, self.sink, self.finals, self.masks = model, channels, sink, finals, masks
+        self.m = model
+        self.channels = channels
+        self.sink = sink
+        self.finals = finals
+        self.masks = masks
         self.table = table
-        self.buffer, self.color = buffer, color
+        self.buffer = buffer
+        self.color = color
         self.size = packed_size(_SHAPE + model.response.extra)
         self.colors = buffer is not None or (sink is not None and sink.needs_color)
 
@@ -135,10 +144,14 @@ class Rows:
 
     def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Replay a hit that some ray of the packet has: B_c as in derivatives.py, exact as the sums are float64."""
-        m, lib, rows, out = self.m, self.m.lib, [], []
+        m = self.m
+        lib = self.m.lib
+        rows = []
+        out = []
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         loaded = self.channels.load(lib, index, rays[0], going, only=None if self.colors else "record")
-        record, hits = loaded["record"], lib.Bool(False)
+        record = loaded["record"]
+        hits = lib.Bool(False)
         extra = None if self.buffer is None else load_packed(lib, self.buffer, self.size, index, going)
         for k, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
             a, depth, ok = m.hit(record, ray, active & (st["alive"] != 0))
@@ -203,7 +216,11 @@ class Diagonal:
     ) -> None:
         self.width = GEOMETRY + 1 + 3 * bands
         self.buffer = dr.zeros(lib.Float, count * self.width)
-        self.weights, self.entries, self.mode, self.bands, self.summed = weights, entries, mode, bands, summed
+        self.weights = weights
+        self.entries = entries
+        self.mode = mode
+        self.bands = bands
+        self.summed = summed
         self.needs_color = bands > 0
 
     def init(self) -> dict:
@@ -255,7 +272,8 @@ class Blocks:
 
     def __init__(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode) -> None:
         self.buffer = dr.zeros(lib.Float, count * self.WIDTH)
-        self.weights, self.mode = weights, mode
+        self.weights = weights
+        self.mode = mode
 
     def init(self) -> dict:
         """Nothing is kept per ray."""
@@ -300,7 +318,10 @@ class Variance:
     def __init__(
         self, buffer: Float, weights: Sequence[float], light: Float | None = None, plain: bool = False
     ) -> None:
-        self.buffer, self.weights, self.light, self.plain = buffer, weights, light, plain
+        self.buffer = buffer
+        self.weights = weights
+        self.light = light
+        self.plain = plain
 
     def init(self) -> dict:
         """The sum along a ray."""
@@ -318,7 +339,8 @@ class Variance:
             total = sum(v[j] * weighted_squares(row, j, self.weights) for j in range(GEOMETRY))
             shares = [v[GEOMETRY + c] for c in range(3)]
             for k, weight in enumerate(light):
-                band, c = row.basis[k // 3], k % 3
+                band = row.basis[k // 3]
+                c = k % 3
                 shares[c] = shares[c] + dr.select(row.color[c] > 0, band * band * weight, 0)
             colors = sum(x * weight for x, weight in zip(shares, self.weights, strict=False))
             if self.plain:

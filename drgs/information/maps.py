@@ -35,7 +35,8 @@ def fisherrf_map(
         known: `drgs.fisher.diagonal(..., method="fisherrf")` of the known views.
         prior: lambda.
     """
-    g, weights = gaussians.detach().replace(features=None), {}
+    g = gaussians.detach().replace(features=None)
+    weights = {}
     inputs = g.parameters()
     for name, group in groups_of(g).items():
         if name in known and group.fisherrf is not None:
@@ -43,7 +44,8 @@ def fisherrf_map(
     # A color that is clamped at 0 is no part of the gray, and nothing is known by it.
     away = torch.from_numpy(g.origin - camera.center).to(g.means.device)
     lit = (sh_colors(g.sh.double(), g.means.double() + away) > 0).to(g.sh)
-    sh, count = torch.zeros_like(g.sh), lit.sum(1)
+    sh = torch.zeros_like(g.sh)
+    count = lit.sum(1)
     sh[..., 0] = (g.sh * lit[:, None]).sum(2)
     sh[:, 0, 0] += torch.where(count > 0, 0.5 * count - 0.5, -1.0) / Y_00  # a color is 0.5 + Y sh: of n, 0.5 n
     if "sh" in weights:

@@ -243,7 +243,8 @@ class _Reduced:
     """A scene whose features are replaced by a few channels of them."""
 
     def __init__(self, scene: DeformableScene, directions: torch.Tensor) -> None:
-        self.scene, self.directions = scene, directions
+        self.scene = scene
+        self.directions = directions
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """Those of the scene."""

@@ -319,7 +319,8 @@ class Pool:
         """
         count = len(self.candidates)
         try:
-            place, number = operator.index(index), float(score)
+            place = operator.index(index)
+            number = float(score)
         except (TypeError, ValueError, RuntimeError):
             place, number = -1, math.nan
         if not 0 <= place < count or not math.isfinite(number):

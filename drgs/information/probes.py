@@ -77,7 +77,9 @@ class Pullback:
             call: Of the view; its scene, if it has one, is where the Gaussians come from.
             names: Of the call's inputs, those that slopes are wanted of.
         """
-        self.call, self.names, lib = call, list(names), call.lib
+        self.call = call
+        self.names = list(names)
+        lib = call.lib
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         dr.enable_grad([self.inputs[name] for name in self.names])
         self.compositor, arguments = call.prepare(self.inputs)

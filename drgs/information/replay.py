@@ -76,10 +76,13 @@ class Replay:
             assert gaussians.features is not None  # `SemanticMetric.check` has refused it
             channels = semantics.channels(gaussians.features)
             slices = list(channels.split(_BESIDE, 1)) if channels.shape[1] else slices
-        self.semantics, self.slices = semantics, slices
+        self.semantics = semantics
+        self.slices = slices
         seen = gaussians.detach().replace(features=slices[0])
         self.call = call = Call(seen, camera, settings, frozenset())
-        self.lib, self.settings, self.count = call.lib, settings, len(gaussians)
+        self.lib = call.lib
+        self.settings = settings
+        self.count = len(gaussians)
         lib = self.lib
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         self.compositor, arguments = call.prepare(self.inputs)
@@ -90,7 +93,8 @@ class Replay:
         p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
         self.along_ray = settings.sh_direction == "ray"
-        self.color, self.extras = False, None
+        self.color = False
+        self.extras = None
         self.light: torch.Tensor | Any = None  # of SH along each ray, once `sums` or `sh_spread` was called
         if not geometry:
             return
@@ -149,7 +153,10 @@ class Replay:
         """Tangents of the records along means, rotations and log-scales, for a response that asks for them."""
         if not self.compositor.model.response.by_tangents:
             return None
-        lib, call, inputs, moved = self.lib, self.call, self.inputs, []
+        lib = self.lib
+        call = self.call
+        inputs = self.inputs
+        moved = []
         axes = [("means", _unit(k)) for k in range(3)] + [("quats", _unit(k)) for k in range(3)]
         sizes = call.inputs["log_scales"]
         sphere = (sizes == sizes[:, :1]).all(1)
@@ -174,7 +181,8 @@ class Replay:
         The first has the colors and a slice of the semantic channels. Each other slice has the colors beside it, too,
         for that costs little; there they weigh nothing.
         """
-        compositor, gamma = self.compositor, self.semantics.weight if self.semantics else 0.0
+        compositor = self.compositor
+        gamma = self.semantics.weight if self.semantics else 0.0
         for number, features in enumerate(self.slices):
             count = 0 if features is None else features.shape[1]
             channels, done = compositor.passes[0], compositor.finals[0]
@@ -182,7 +190,8 @@ class Replay:
                 assert features is not None  # only the first slice may be none at all
                 channels, done = compositor.again(to_drjit(self.lib, features.reshape(-1)).array, count)
             numbers = channels.outputs if self.extras is not None else 0
-            kernel, tabled = functools.partial(self._rows, channels), None if numbers > _TABLED else numbers
+            kernel = functools.partial(self._rows, channels)
+            tabled = None if numbers > _TABLED else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
             for at in done:
                 yield Walk(number == 0, own, channels, *by_lists(self.lib, *at, tabled, kernel))
@@ -227,7 +236,8 @@ class Replay:
     def diagonal(self, groups: dict, weights: Sequence[float], fisherrf: bool) -> Information:
         """`fisher.diagonal` of one view."""
         entries = sorted({k for group in groups.values() for k in group.entries})
-        sums, result = self.sums(entries, weights, fisherrf), {}
+        sums = self.sums(entries, weights, fisherrf)
+        result = {}
         scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64)
         for name, group in groups.items():
             result[name] = group.collect(sums[:, group.entries], self, scale)

@@ -41,7 +41,8 @@ def farthest_in_time(pool: Pool) -> Selection:
     known, new = _points(pool)
     distances = np.linalg.norm(new[:, None] - known[None], axis=2).round(_DIGITS)
     scores = distances.min(1).tolist() if len(known) else [0.0] * len(new)
-    picks, left = [], list(range(len(new)))
+    picks = []
+    left = list(range(len(new)))
     for _ in range(pool.k):
         nearest = {i: sorted(distances[i]) for i in left}
         order = sorted(left, key=lambda i: [-x for x in nearest[i]])  # stable: ties by index
@@ -72,7 +73,8 @@ def uniform_in_time(pool: Pool) -> Selection:
     likewise, in the order of names. Cameras of one pose are one camera. The score is minus the number of views that
     its camera has.
     """
-    train, picks = list(pool.train), []
+    train = list(pool.train)
+    picks = []
     left = list(range(len(pool.candidates)))
     views = sorted([*pool.train, *pool.candidates], key=lambda camera: by_number(camera.name))
     places = list(dict.fromkeys(_pose(camera) for camera in views))

@@ -115,7 +115,8 @@ def twist_basis() -> torch.Tensor:
     basis = torch.zeros(6, 4, 4, dtype=torch.float64)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        basis[k, j, i], basis[k, i, j] = 1, -1
+        basis[k, j, i] = 1
+        basis[k, i, j] = -1
         basis[3 + k, k, 3] = 1
     return basis
 
@@ -229,9 +230,12 @@ class Errors:
 
 def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle) -> Errors:
     """Render, differentiate both ways and compare with the oracle."""
-    out, ref, good = render(g, cam, settings, outputs="all"), oracle.out, oracle.good
+    out = render(g, cam, settings, outputs="all")
+    ref = oracle.out
+    good = oracle.good
     size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])
-    image, finite = {}, True
+    image = {}
+    finite = True
     for name in (*FIELDS, "median_depth"):
         a, b = getattr(out, name), getattr(ref, name)
         if b is not None:

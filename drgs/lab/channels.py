@@ -47,7 +47,9 @@ def wide_gradients(
     ):
         return {}, "what it does to colors is a convention of three channels"
     fixed = {name: x for name, x in case.raw.items() if name != POSE}
-    raw, black, u = with_colors(fixed, channels, seed), (0.0,) * channels, cotangents([camera], seed, channels)
+    raw = with_colors(fixed, channels, seed)
+    black = (0.0,) * channels
+    u = cotangents([camera], seed, channels)
     case.say(f"{channels} channels")
     try:
         picture, alpha = rasterizer.image(raw, camera, black)

@@ -182,15 +182,18 @@ def _refined(
     flip = field == "alpha_max"  # what matters there is the distance from 1
     if distance(model) <= settled or value == float(flip):
         return model
-    center, ratio = math.log(1 - value if flip else value), (math.sqrt(5) - 1) / 2
+    center = math.log(1 - value if flip else value)
+    ratio = (math.sqrt(5) - 1) / 2
     # What is searched for stays below 1.
-    low, high = center - 1.0, min(center + 1.0, -1e-3)
+    low = center - 1.0
+    high = min(center + 1.0, -1e-3)
 
     def at(x: float) -> ReferenceModel:
         return model.replace(**{field: 1 - math.exp(x) if flip else math.exp(x)})
 
     for _ in range(12):
-        a, b = high - ratio * (high - low), low + ratio * (high - low)
+        a = high - ratio * (high - low)
+        b = low + ratio * (high - low)
         if distance(at(a)) < distance(at(b)):
             high = b
         else:

@@ -40,7 +40,9 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     if not drawn:
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     for side in _SIDES:
-        parts, places, seen = [], [], []
+        parts = []
+        places = []
+        seen = []
         for camera, image in drawn:
             width, height = min(camera.width, side), min(camera.height, side)
             x, y = _liveliest(image, width, height)

@@ -143,10 +143,13 @@ def crossval(
         g, cameras, cropped = crops(g, cameras, starts[0].settings)
         places = [*cropped]
     dtype = getattr(rasterizer, "dtype", torch.float32)
-    raw, signs = with_pose(raw_of(g)), cotangents(cameras, seed)
+    raw = with_pose(raw_of(g))
+    signs = cotangents(cameras, seed)
     say("images")
     if isinstance(rasterizer, Dump):
-        pictures, alphas, signs = list(rasterizer.images), list(rasterizer.alphas), rasterizer.cotangents
+        pictures = list(rasterizer.images)
+        alphas = list(rasterizer.alphas)
+        signs = rasterizer.cotangents
     else:
         pairs = [rasterizer.image(raw, camera, background) for camera in cameras]
         pictures, alphas = ([pair[k] for pair in pairs] for k in range(2))
@@ -221,7 +224,8 @@ def crossval(
     }
     report["scope"] = _scope(report)
     say("pictures")
-    exact, images = ReferenceModel(RenderSettings.preset("exact", background=background)), []
+    exact = ReferenceModel(RenderSettings.preset("exact", background=background))
+    images = []
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
         true, _ = _drawn(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})

@@ -69,7 +69,8 @@ def central(
     kept = torch.ones(cotangent.shape[:2], dtype=torch.bool)
     noise = noise or _EPS[rasterizer.dtype]
     for group, indices in entries.items():
-        slopes[group], steps[group] = [], []
+        slopes[group] = []
+        steps[group] = []
         for index in indices:
             found, used = _slopes(rasterizer, raw, camera, background, group, index)
             largest = max(float(x.abs().max()) for x in found)
@@ -132,7 +133,9 @@ def _unit(raw: dict, camera: Camera, group: str, index: int) -> float:
     """The change of a parameter that changes its Gaussian's part of the image by about its own size."""
     if group not in ("means", "quats", POSE):
         return 1.0
-    w2c, scales = float64(camera.w2c).detach(), raw["log_scales"].exp()  # a step is a constant
+    # a step is a constant
+    w2c = float64(camera.w2c).detach()
+    scales = raw["log_scales"].exp()
     depths = raw["means"] @ w2c[2, :3] + w2c[2, 3]
     # Nothing in the image is thinner than this.
     thin = scales.amin(1).maximum(0.3 * depths.abs() / float(camera.K[0][0]))

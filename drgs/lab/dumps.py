@@ -65,7 +65,8 @@ def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict
     arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
     arrays["viewmat"] = np.stack([float64(c.w2c).detach().float().numpy() for c in cameras])
     arrays["K"] = np.stack([np.asarray(c.K, np.float32) for c in cameras])
-    arrays["width"], arrays["height"] = np.int64(cameras[0].width), np.int64(cameras[0].height)
+    arrays["width"] = np.int64(cameras[0].width)
+    arrays["height"] = np.int64(cameras[0].height)
     arrays["background"] = np.asarray(background, np.float32)
     return arrays
 
@@ -106,7 +107,8 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
     """
     found = _arrays(path)
     scene = scene_arrays(g, cameras, background)
-    count, size = len(cameras), (cameras[0].height, cameras[0].width)
+    count = len(cameras)
+    size = (cameras[0].height, cameras[0].width)
     shapes = {"image": (*size, 3), "alpha": size, "cotangent": (*size, 3)}
     names = [*shapes, *(f"grad_{name}" for name in PARAMETERS), *scene]
     pose = [_POSE] if _POSE in found else []
@@ -134,7 +136,8 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
         found[name] = got
     for name in PARAMETERS:
         if found[f"grad_{name}"].shape != scene[name].shape:
-            wanted, got = scene[name].shape, found[f"grad_{name}"].shape
+            wanted = scene[name].shape
+            got = found[f"grad_{name}"].shape
             raise ValueError(f"{path}: grad_{name} must have shape {wanted}, got {got}")
     if pose and found[_POSE].reshape(-1).shape != scene["viewmat"].reshape(-1).shape:
         raise ValueError(f"{path}: {_POSE} must have shape {scene['viewmat'].shape}, got {found[_POSE].shape}")

@@ -95,7 +95,8 @@ def _at_camera(offset: Sequence[float], scale: float = 0.3) -> Builder:
 
 def _on_axes(rng: np.random.Generator) -> Built:
     """Means exactly on the camera's axes and diagonal, Gaussians aligned with them: ties of every choice of a frame."""
-    g, cam = random_gaussians(rng, 12, 4), random_camera(rng, SIZE, turn=0.0)
+    g = random_gaussians(rng, 12, 4)
+    cam = random_camera(rng, SIZE, turn=0.0)
     places = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]
     with torch.no_grad():
         cam.w2c[:3, 3] = torch.tensor([0.125, -0.125, 4.0])  # as a float32 mean can be
@@ -145,12 +146,14 @@ def _huge(g: Gaussians, cam: Camera) -> None:
 def _needles(g: Gaussians, cam: Camera) -> None:
     """Each on a ray of its own."""
     _on_rays(g, cam, range(len(g)))
-    g.log_scales[:, 0], g.log_scales[:, 1:] = 0.0, math.log(1e-6)
+    g.log_scales[:, 0] = 0.0
+    g.log_scales[:, 1:] = math.log(1e-6)
 
 
 def _sheets(g: Gaussians, cam: Camera) -> None:
     """As wide as the scene, and without thickness."""
-    g.log_scales[:, :2], g.log_scales[:, 2] = math.log(0.5), math.log(0.5e-6)
+    g.log_scales[:, :2] = math.log(0.5)
+    g.log_scales[:, 2] = math.log(0.5e-6)
 
 
 def _opacities(g: Gaussians, cam: Camera) -> None:
@@ -177,7 +180,8 @@ def _coincident(g: Gaussians, cam: Camera) -> None:
 
 def _equal_depths(rng: np.random.Generator) -> Built:
     """A plane of equal camera z, mirrored pairs at equal distance."""
-    g, cam = random_gaussians(rng, 12, 4), random_camera(rng, SIZE, turn=0.0)
+    g = random_gaussians(rng, 12, 4)
+    cam = random_camera(rng, SIZE, turn=0.0)
     with torch.no_grad():
         g.means[:, 2] = 0.5
         g.means[:, 0] = 0.1 + 0 * g.means[:, 0]
@@ -226,7 +230,8 @@ def _covering(g: Gaussians, cam: Camera) -> None:
 
 def _layers(rng: np.random.Generator, n: int = 1000) -> Built:
     """Opaque layers: T underflows within a few of them."""
-    g, cam = random_gaussians(rng, n, 1), random_camera(rng, SIZE)
+    g = random_gaussians(rng, n, 1)
+    cam = random_camera(rng, SIZE)
     with torch.no_grad():
         g.log_scales[:] = torch.tensor([0.4, 0.5, 0.7]).log()
         g.logit_opacities[:] = 6.0
@@ -286,10 +291,13 @@ def _translucent_layers(rng: np.random.Generator) -> Built:
 
 def _beyond_float32(g: Gaussians, cam: Camera) -> None:
     """Activations that overflow or vanish in float32."""
-    g.log_scales[0], g.log_scales[1] = 60.0, -60.0
+    g.log_scales[0] = 60.0
+    g.log_scales[1] = -60.0
     g.log_scales[2] = torch.tensor([-40.0, 0.0, 40.0])
-    g.logit_opacities[3], g.logit_opacities[4] = 3e4, -3e4
-    g.means[5], g.means[6] = 1e15, -1e15
+    g.logit_opacities[3] = 3e4
+    g.logit_opacities[4] = -3e4
+    g.means[5] = 1e15
+    g.means[6] = -1e15
 
 
 def _hidden(g: Gaussians, cam: Camera) -> None:

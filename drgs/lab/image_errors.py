@@ -180,7 +180,8 @@ def _orders(case: _Case) -> Iterator[tuple]:
 def _sums(case: _Case) -> Iterator[tuple]:
     """Factors and summands, of all channels or of each."""
     x, y = case.right[case.counts], case.wrong[case.counts]
-    factor, factors = _ratio(x, y), np.array([_ratio(x[:, k], y[:, k]) for k in range(3)])
+    factor = _ratio(x, y)
+    factors = np.array([_ratio(x[:, k], y[:, k]) for k in range(3)])
     summands = (y - x).mean(0)
     summand = float(summands.mean())
     yield "factor", f"times {factor:.4g}", factor * case.right
@@ -197,7 +198,8 @@ def _backgrounds(case: _Case) -> Iterator[tuple]:
     factor = 1 + _ratio(front[case.counts], difference[case.counts])
     yield "foreground", f"what its Gaussians add times {factor:.4g}", case.right + (factor - 1) * front
     added = np.array([_ratio(seen[..., 0][case.counts], difference[..., k][case.counts]) for k in range(3)])
-    now, was = case.background + added, _numbers(case.background)
+    now = case.background + added
+    was = _numbers(case.background)
     missing = np.abs(now).max() < 0.01 < np.abs(case.background).max()
     what = f"its background {was} missing" if missing else f"its background {_numbers(now)} instead of {was}"
     yield "background", what, case.right + seen * added
@@ -237,7 +239,8 @@ def _moves(case: _Case) -> Iterator[tuple]:
                 down, across = np.gradient(made, axis=(0, 1))
                 slopes = [-across, -down, -(across * x[..., None] + down * y[..., None])][:count]
                 table = np.stack([slope[use].ravel() for slope in slopes])
-                square, right = table @ table.T, table @ (case.wrong - made)[use].ravel()
+                square = table @ table.T
+                right = table @ (case.wrong - made)[use].ravel()
                 step = np.linalg.lstsq(square, right, rcond=None)[0].clip(-2, 2)  # of a flat image no move is best
                 move[:count] += step
                 if np.abs(step * (1, 1, max(width, height))[:count]).max() < _MOVED:
@@ -255,7 +258,9 @@ def _moves(case: _Case) -> Iterator[tuple]:
 def _moved(image: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """An (H, W, 3) image moved by (dx, dy) pixels and magnified by 1 + s about its middle, and where that is known."""
     height, width = image.shape[:2]
-    dx, dy, zoom = move[0], move[1], 1 + float(np.clip(move[2], -0.5, 0.5))
+    dx = move[0]
+    dy = move[1]
+    zoom = 1 + float(np.clip(move[2], -0.5, 0.5))
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     matrix = np.column_stack([zoom * np.eye(2), middle - zoom * middle + (dx, dy)])
 

@@ -110,9 +110,12 @@ def ladder(
         if name == "forward":
             rounding = made.part(start, "float64") - states[0]
             states = [states[0], *(state + rounding for state in states), made.part(end, "float64")]
-            names, switched = ["float32", *names, "rest"], [{}, *switched, {}]
+            names = ["float32", *names, "rest"]
+            switched = [{}, *switched, {}]
         else:
-            states, names, switched = [*states, made.part(end, "float64")], [*names, "float32"], [*switched, {}]
+            states = [*states, made.part(end, "float64")]
+            names = [*names, "float32"]
+            switched = [*switched, {}]
         report["crops"][name], report["crops"]["total"] = _rungs(names, switched, states)
     if not made.windows:
         del report["crops"]
@@ -143,7 +146,9 @@ def sequences(start: RenderSettings, end: RenderSettings) -> tuple[list, list]:
     names = [rung for rung, fields in changes.items() if fields]
     made = []
     for order in (names, names[::-1]):
-        now, steps, done = start, [], set()
+        now = start
+        steps = []
+        done = set()
         for rung in _with_needs(order):
             if rung not in done and rung in names:
                 now = now.replace(**changes[rung])
@@ -173,7 +178,8 @@ def _rungs(
     names: list[str], switched: list[dict], states: list[State], exact: State | None = None
 ) -> tuple[list[dict], dict]:
     """One row a step, and one of the whole way, as JSON."""
-    exact, total = exact or states[-1], states[-1] - states[0]
+    exact = exact or states[-1]
+    total = states[-1] - states[0]
     ways = zip(names, switched, states[:-1], states[1:], strict=True)
     rows = [Step.of(b - a, total, exact, name, change).to_json() for name, change, a, b in ways]
     return rows, Step.of(total, total, exact).to_json()
@@ -186,7 +192,8 @@ def _asides(made: Pictures, start: RenderSettings, end: RenderSettings) -> list[
     evaluated in: the image stays), SH along rays instead of towards means, and the response, both from `exact`.
     """
     first, exact = made.full(start), made.full(end)
-    total, steps = exact - first, {}
+    total = exact - first
+    steps = {}
     if made.gradients and start.sh_direction == "gaussian" and made.g.sh.shape[1] > 1:
         steps["view direction detached"] = made.full(start, True) - first
     if made.g.sh.shape[1] > 1:

@@ -71,7 +71,10 @@ class Pictures:
         if crop < 0:
             raise ValueError(f"ladder: crop must be >= 0 pixels, got {crop}; correct it")
         # Each picture makes leaves of its own.
-        self.g, self.cameras, self.crop, self.gradients = g.detach(), list(cameras), crop, gradients
+        self.g = g.detach()
+        self.cameras = list(cameras)
+        self.crop = crop
+        self.gradients = gradients
         self.advance = advance or (lambda: None)
         self.background = (0.0, 0.0, 0.0)
         rng = np.random.default_rng(seed)
@@ -135,10 +138,12 @@ class Pictures:
 
     def _part(self, s: RenderSettings, kind: str) -> State:
         """Both crops, in float32 by drawing the whole picture, in float64 by the oracle's window."""
-        camera, states = self.cameras[0], []
+        camera = self.cameras[0]
+        states = []
         for x, y, width, height in self.windows:
             rows, columns = slice(y, y + height), slice(x, x + width)
-            g, window = self._leaves(), (x, y, width, height)
+            g = self._leaves()
+            window = (x, y, width, height)
             with torch.set_grad_enabled(self.gradients):
                 if kind == "float32":
                     image = render(g, camera, s, outputs=()).rgb.cpu()[rows, columns]

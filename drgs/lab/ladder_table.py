@@ -30,7 +30,9 @@ class Size:
     def of(cls, step: torch.Tensor, total: torch.Tensor, exact: torch.Tensor) -> Size:
         """Of three tensors of one shape."""
         step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))
-        whole, truth, size = float(total.norm()), float(exact.norm()), float(step.norm())
+        whole = float(total.norm())
+        truth = float(exact.norm())
+        size = float(step.norm())
         return cls(
             norm=size,
             share=float(step @ total) / whole**2 if whole > 0 else None,
@@ -108,7 +110,8 @@ def table(report: dict) -> str:
 def _both(part: dict, groups: list[str], what: str) -> list[str]:
     """Rows of one ladder: RMS and share of the image, shares of the gradients, `first order / reverse`."""
     forward, reverse = ([Step.from_json(row) for row in part[order]] for order in ("forward", "reverse"))
-    back, total = {step.rung: step for step in reverse}, Step.from_json(part["total"])
+    back = {step.rung: step for step in reverse}
+    total = Step.from_json(part["total"])
     lines = [f"| rung, {what} | RMS | max | share |" + "".join(f" {name} |" for name in groups)]
     lines.append("|---" * (4 + len(groups)) + "|")
     for step in forward:

@@ -138,7 +138,8 @@ def function(call: Callable, name: str) -> Rasterizer:
 
     def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
         """Its image, or one line that says how it failed."""
-        means, camera = raw["means"], posed(raw, camera)
+        means = raw["means"]
+        camera = posed(raw, camera)
         like = {"dtype": means.dtype, "device": means.device}
         arguments = {
             "means": means,

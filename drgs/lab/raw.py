@@ -58,8 +58,11 @@ def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
     """
     if POSE not in raw:
         return camera
-    w2c, twist = float64(camera.w2c).detach(), float64(raw[POSE])  # the motion is the parameter, not the matrix
-    turn, shift = twist[:3], twist[3:] * depth_of(raw, camera)
+    # the motion is the parameter, not the matrix
+    w2c = float64(camera.w2c).detach()
+    twist = float64(raw[POSE])
+    turn = twist[:3]
+    shift = twist[3:] * depth_of(raw, camera)
     zero = torch.zeros_like(turn[0])
     rows = [
         zero, -turn[2], turn[1], shift[0],
@@ -72,7 +75,9 @@ def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
 
 def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
     """Median depth of the means in front of a camera, 1 where there is none: a unit, so without a derivative."""
-    w2c, means = float64(camera.w2c).detach(), float64(raw["means"]).detach()  # a unit is a constant
+    # a unit is a constant
+    w2c = float64(camera.w2c).detach()
+    means = float64(raw["means"]).detach()
     depths = means @ w2c[2, :3] + w2c[2, 3]
     ahead = depths[depths > 0]
     return float(ahead.median()) if len(ahead) else 1.0

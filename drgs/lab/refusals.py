@@ -53,7 +53,8 @@ def _not_finite() -> Attempts:
     _, cam = _scene()
     for field in ("means", "quats", "log_scales", "logit_opacities", "sh", "features"):
         for value in (math.nan, math.inf, -math.inf):
-            g, told = _with(field, value), f"{field} must be finite"
+            g = _with(field, value)
+            told = f"{field} must be finite"
             for traversal in ("tiles", "bvh"):
                 settings = RenderSettings.preset("exact", traversal=traversal)
                 yield lambda g=g, settings=settings: render(g, cam, settings), told
@@ -73,7 +74,9 @@ def _broken_camera() -> Attempts:
     """A camera is refused when it is made, and once more when its pose has been moved since."""
     g, cam = _scene()
     for value in (math.nan, math.inf):
-        K, w2c = cam.K.copy(), cam.w2c.detach().clone()  # changed in place, which no leaf can be
+        # changed in place, which no leaf can be
+        K = cam.K.copy()
+        w2c = cam.w2c.detach().clone()
         K[0, 0] = w2c[0, 3] = value
         yield lambda K=K: dataclasses.replace(cam, K=K), "K must"
         yield lambda w2c=w2c: dataclasses.replace(cam, w2c=w2c), "pose must be finite"

@@ -133,7 +133,8 @@ class GroupRow:
 
     def settle(self, verdict: str, why: str) -> None:
         """Give it its verdict."""
-        self.verdict, self.why = verdict, why
+        self.verdict = verdict
+        self.why = why
 
     def json(self) -> dict:
         """Without `differences` where there are none."""

@@ -112,12 +112,16 @@ def truth_of(case: ExtremeCase) -> Truth:
     from drgs import reference
     from drgs.lab.accuracy import FIELDS, Oracle, jacobian, squares
 
-    rng, settings = np.random.default_rng(3), case.settings
+    rng = np.random.default_rng(3)
+    settings = case.settings
     g, cam = case.build(rng)
     names = [name for name in FIELDS if case.depth or name != "depth"]
     # 1e-6: near ties of float32 keys, ten times its rounding.
     oracle = Oracle(g, cam, settings, rng, 1e-6, names)
-    good, out, view, remark = oracle.good, oracle.out, cam, ""
+    good = oracle.good
+    out = oracle.out
+    view = cam
+    remark = ""
     whole = settings.culling == "extent" and settings.fov_clamp == "none"
     most = math.isqrt(_DENSE // max(len(g), 1)) if whole else good.numel()
     if not good.all() and not whole:
@@ -135,7 +139,10 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
     """One row: every error of a case on `tiles` or `bvh`, and what they amount to."""
     from drgs.lab.accuracy import compare
 
-    g, cam, oracle, settings = truth.g, truth.cam, truth.oracle, case.settings.replace(traversal=traversal)
+    g = truth.g
+    cam = truth.cam
+    oracle = truth.oracle
+    settings = case.settings.replace(traversal=traversal)
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -151,7 +158,9 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
         "duality": errors.duality,
         "fisher": information,
     }
-    finite, bounds, limits = errors.finite and sound, BOUNDS, ""
+    finite = errors.finite and sound
+    bounds = BOUNDS
+    limits = ""
     if traversal == "bvh" and case.bvh == "rounds":
         bounds = _rounded(g, cam)
         limits = f"rounding of `bvh`: image within {bounds['image']:.0e}"
@@ -159,9 +168,11 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
     broken = [f"{n} {x:.1e} > {bounds[n]:.0e}" for n, x in values.items() if x is not None and not x <= bounds[n]]
     expected = traversal == "bvh" and case.bvh == "warns"
     if expected and told and finite:
-        verdict, broken = "warns", []
+        verdict = "warns"
+        broken = []
     elif expected != bool(told):
-        verdict, broken = "FAILS", [*broken, "no warning" if expected else "a warning without need"]
+        verdict = "FAILS"
+        broken = [*broken, "no warning" if expected else "a warning without need"]
     else:
         verdict = "FAILS" if broken or not finite else "holds"
     ties = 100 * float((~oracle.good).double().mean())
@@ -200,7 +211,8 @@ def _information(case: ExtremeCase, settings: RenderSettings, truth: Truth) -> t
     from drgs.lab.accuracy import entry_error
 
     g, cam, view = truth.g, truth.cam, truth.view
-    found, blocks = fisher.diagonal(g, cam, settings), fisher.blocks(g, cam, settings)
+    found = fisher.diagonal(g, cam, settings)
+    blocks = fisher.blocks(g, cam, settings)
     finite = all(bool(torch.isfinite(x).all()) for x in (*found.values(), blocks))
     if view is None:
         return None, finite, truth.remark
@@ -221,10 +233,12 @@ def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, t
 
     K = cam.K.copy()
     K[0, 2] -= 0.6 * cam.width
-    other, prior = dataclasses.replace(cam, K=K), Prior(value=0.0)
+    other = dataclasses.replace(cam, K=K)
+    prior = Prior(value=0.0)
     Hc = fisher.diagonal(g, other, settings)
     true = squares(jacobian(g, reference.render(g, other, settings), features=True))
-    worst, seen = 0.0, {name: x > 0 for name, x in truth.items()}
+    worst = 0.0
+    seen = {name: x > 0 for name, x in truth.items()}
     for criterion in _CRITERIA:
         gain = information_gain(Hc, H, criterion, prior)
         want = 0.0
@@ -242,14 +256,16 @@ def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, t
     )
     if gain.left_out != left or not np.isfinite(blocks.total):
         return float("nan"), f"left out {gain.left_out}, the oracle {left}; block_logdet {blocks.total}"
-    count, total = sum(left.values()), sum(x.numel() for x in truth.values())
+    count = sum(left.values())
+    total = sum(x.numel() for x in truth.values())
     return worst, f"gain of a second view (logdet, eig, trace_cov) {worst:.0e}, {count} of {total} entries left out"
 
 
 def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
     """The camera of the largest rectangle of good pixels, shortened to `most` pixels."""
     height, width = good.shape
-    best, heights = (0, 0, 0, 0, 0), np.zeros(width, int)
+    best = (0, 0, 0, 0, 0)
+    heights = np.zeros(width, int)
     for bottom in range(height):
         heights = np.where(good[bottom].numpy(), heights + 1, 0)
         for left in range(width):
@@ -262,16 +278,20 @@ def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
     _, x, y, w, h = (int(v) for v in best)
     w, h = (w, max(1, min(h, most // w))) if w <= most else (most, 1)
     K = cam.K.copy()
-    K[0, 2], K[1, 2] = K[0, 2] - x, K[1, 2] - y
+    K[0, 2] = K[0, 2] - x
+    K[1, 2] = K[1, 2] - y
     return dataclasses.replace(cam, K=K, width=w, height=h)
 
 
 def refused(case: Refusal) -> StressRow:
     """The row of input that must raise ValueError, or be warned about, with one line that says why."""
-    start, count, message = time.perf_counter(), 0, ""
+    start = time.perf_counter()
+    count = 0
+    message = ""
     for call, text in case.attempts():
         count += 1
-        told, result = [], None
+        told = []
+        result = None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:

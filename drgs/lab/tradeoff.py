@@ -75,11 +75,13 @@ def measure(
     stage = _Stage(gaussians, cameras, seed)
     rows = rows_of(variants, fields or {})
     turns = [_Turn(row, stage) for row in rows if row.skipped is None and row.by == "view"]
-    truth, others = turns[0], turns[1:]
+    truth = turns[0]
+    others = turns[1:]
     # The truth once more in every round: how much equal work scatters.
     again = _Turn(dataclasses.replace(truth.row), stage)
     others.append(again)
-    order, done = random.Random(seed), 0
+    order = random.Random(seed)
+    done = 0
     began = time.perf_counter(), time.process_time()
     # The first pass compiles. Every view has a turn, so that errors are of all of them.
     for number in range(max(repeats, len(cameras) - 1) + 1):
@@ -134,7 +136,8 @@ class _Stage:
     """
 
     def __init__(self, gaussians: Gaussians, cameras: list[Camera], seed: int):
-        self.gaussians, self.cameras = gaussians, cameras
+        self.gaussians = gaussians
+        self.cameras = cameras
         self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
         self.moving = gaussians.replace(**self.leaves)
         generator = torch.Generator().manual_seed(seed)
@@ -144,7 +147,8 @@ class _Stage:
             (torch.randint(0, 2, size, generator=generator) * 2 - 1).float().to(device) for size in sizes
         ]
         self.truth: dict[int, _Answer] = {}
-        self.shown, self.sampled = False, 0
+        self.shown = False
+        self.sampled = 0
 
     def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
         """(H, W, 3), whatever the share of its resolution that is rendered."""
@@ -189,10 +193,14 @@ class _Turn:
     """One row's measurements, view by view and round by round."""
 
     def __init__(self, row: TradeoffRow, stage: _Stage):
-        self.row, self.stage = row, stage
+        self.row = row
+        self.stage = stage
         self.settings = row.settings
         self.seconds = {name: {} for name in CLOCKS}
-        self.pixels, self.slopes, self.parts, self.medians = [], {}, {}, {}
+        self.pixels = []
+        self.slopes = {}
+        self.parts = {}
+        self.medians = {}
         self.first = 0.0
 
     def take(self, number: int, timed: bool) -> None:
@@ -212,8 +220,11 @@ class _Turn:
         Raises:
             ValueError, NotImplementedError, OSError, RuntimeError: If the setting cannot be, or gives no numbers.
         """
-        stage, view, share = self.stage, number % len(self.stage.cameras), self.row.share
-        camera, took = stage.cameras[view], {}
+        stage = self.stage
+        view = number % len(self.stage.cameras)
+        share = self.row.share
+        camera = stage.cameras[view]
+        took = {}
         with torch.no_grad():  # what an image alone takes
             _, took["forward"] = clocked(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
 
@@ -248,7 +259,8 @@ class _Turn:
             y = truth.slopes[name]
             self.slopes[name] = a + _squares(x - y), b + _squares(y)
         for name, x in (seen.information or {}).items() if truth.information else ():
-            y, (a, b) = truth.information[name], self.parts.get(name, (0.0, 0.0))
+            y = truth.information[name]
+            (a, b) = self.parts.get(name, (0.0, 0.0))
             self.parts[name] = a + float((x - y).abs().sum()), b + float(y.sum())
             known = y > _UNSEEN * y.max()
             if bool(known.any()):
@@ -268,14 +280,16 @@ class _Turn:
             both = x.keys() & truth.seconds[name].keys()
             warm[name] = statistics.median(x.values()) if x else None
             times[name] = interval([x[k] / truth.seconds[name][k] for k in both])
-        self.row.seconds, self.row.times = warm, times
+        self.row.seconds = warm
+        self.row.times = times
         self.row.ratio = {name: x and x.ratio for name, x in times.items()}
         self.row.first_call = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
 
 
 def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) -> WorstErrors:
     """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
-    camera, count = stage.cameras[stage.sampled], len(stage.gaussians)
+    camera = stage.cameras[stage.sampled]
+    count = len(stage.gaussians)
     pixels = camera.width * camera.height
     places = torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
     own = WorstErrors()
@@ -296,11 +310,13 @@ def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) ->
 
 def _by_rays(row: TradeoffRow, stage: _Stage, truth: _Turn, chosen: torch.Tensor) -> WorstErrors:
     """One row on some pixels of a view: errors against the truth's image, time scaled to all of them."""
-    camera, oracle = stage.cameras[stage.sampled], row.by == "oracle"
+    camera = stage.cameras[stage.sampled]
+    oracle = row.by == "oracle"
     whole = stage.cotangents[stage.sampled]
     pixels = camera.width * camera.height
     forward, both = _tracer(stage, row.settings, chosen, oracle)
-    fixed, start = [0.0, 0.0], 0.0
+    fixed = [0.0, 0.0]
+    start = 0.0
     if not oracle:
         # The acceleration structure does not grow with the number of rays. The first call compiles.
         few = _tracer(stage, row.settings, chosen[:1], oracle)

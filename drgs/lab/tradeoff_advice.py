@@ -73,7 +73,10 @@ def interval(ratios: Sequence[float]) -> Interval | None:
     """
     if not ratios:
         return None
-    x, n, k, tail = sorted(ratios), len(ratios), 0, 0.5 ** len(ratios)
+    x = sorted(ratios)
+    n = len(ratios)
+    k = 0
+    tail = 0.5 ** len(ratios)
     while 2 * (tail + math.comb(n, k + 1) * 0.5**n) <= _SURE:
         k += 1
         tail += math.comb(n, k) * 0.5**n

@@ -77,7 +77,9 @@ def measure_full(
         Clock -> what was timed with it.
     """
     rows = {row.name: row for row in measured.rows}
-    exact, order, report = measured.truth, random.Random(seed), {}
+    exact = measured.truth
+    order = random.Random(seed)
+    report = {}
     gaussians = placed(gaussians)
     chosen = {clock: leaders(measured, clock, budgets) for clock in CLOCKS}
     chosen = {clock: names for clock, names in chosen.items() if names}
@@ -114,7 +116,8 @@ def measure_full(
 
 def _widened(times: Interval, scatter: Interval) -> Interval:
     """Ratios of too few rounds, with an interval at least as wide as equal work scatters."""
-    low, high = min(times.low, times.ratio * scatter.low), max(times.high, times.ratio * scatter.high)
+    low = min(times.low, times.ratio * scatter.low)
+    high = max(times.high, times.ratio * scatter.high)
     return dataclasses.replace(times, low=low, high=high)
 
 
@@ -122,7 +125,9 @@ class _Work:
     """One clock: what is done to a view between its two readings."""
 
     def __init__(self, clock: str, gaussians: Gaussians, seed: int):
-        self.clock, self.gaussians, self.seed = clock, gaussians, seed
+        self.clock = clock
+        self.gaussians = gaussians
+        self.seed = seed
         self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
         self.moving = gaussians.replace(**self.leaves)
 
@@ -158,7 +163,8 @@ def _sized(
     No cameras if a round fits at no more than the pixels that all rows were measured with already. Four times as many
     pixels are tried each time, so that nothing far too large is ever begun.
     """
-    whole, spent = max(camera.width * camera.height for camera in cameras), 0.0
+    whole = max(camera.width * camera.height for camera in cameras)
+    spent = 0.0
     least = pixels = min(pixels, whole)
     while True:
         camera = at_most(cameras[0], int(pixels))

@@ -77,14 +77,16 @@ def _labels(figure: Figure, axis: Axes, points: list[Point], dots: list[Point]) 
     from matplotlib.transforms import Bbox
 
     figure.tight_layout(rect=(0, 0, 1, 0.985))  # places do not move any more
-    renderer, inside = figure.canvas.get_renderer(), axis.get_window_extent()
+    renderer = figure.canvas.get_renderer()
+    inside = axis.get_window_extent()
     places = [axis.transData.transform(p[:2]) for p in dots]
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
     taken.append(axis.get_legend().get_window_extent(renderer))
     for x, y, row in points:
         for reach in (6, 16, 30, 46):
             for angle in (0, 180, 90, 270, 45, 315, 135, 225):
-                dx, dy = reach * math.cos(math.radians(angle)), reach * math.sin(math.radians(angle))
+                dx = reach * math.cos(math.radians(angle))
+                dy = reach * math.sin(math.radians(angle))
                 text = axis.annotate(
                     row.name,
                     (x, y),

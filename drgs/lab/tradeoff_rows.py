@@ -339,7 +339,8 @@ class Measured:
 
 def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[TradeoffRow]:
     """Rows without numbers; those that cannot or need not be measured say why."""
-    rows, seen = [], {}
+    rows = []
+    seen = {}
     for variant in variants:
         row = TradeoffRow(name=variant.name, kind=variant.kind, share=variant.share, by=variant.by)
         try:

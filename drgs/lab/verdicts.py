@@ -123,7 +123,8 @@ def compared(
     near_ties: Callable[[int], torch.Tensor],
 ) -> Compared:
     """Two correct renderers differ where pixels hang on near ties: these are left out before a difference counts."""
-    ties, counted = torch.zeros(signs.shape[:3], dtype=torch.bool), False
+    ties = torch.zeros(signs.shape[:3], dtype=torch.bool)
+    counted = False
     while True:
         left = ties & (not counted)
         views = [_image_row(*row) for row in zip(case.cameras, pictures, alphas, drawn, ~left, strict=True)]
@@ -133,7 +134,8 @@ def compared(
             off = torch.stack([(a - s).abs().amax(-1) > OFF for a, (s, _) in zip(pictures, drawn, strict=True)])
             u = signs * ~(left | (off & agrees))[..., None]
         case.say("gradients")
-        theirs, ours = case.theirs(u), case.ours(model, u)
+        theirs = case.theirs(u)
+        ours = case.ours(model, u)
         offered = [name for name, x in theirs.items() if name != POSE or x is not None]
         groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in offered}
         found = Compared(views, agrees, u, theirs, groups, ties, counted)
@@ -155,7 +157,8 @@ def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
         case.say("central differences")
         _decide(case, model if agrees else None, compared, names)
     elif names:
-        verdict, why = "undecided", "the image is of another model, a dump cannot be asked for central differences"
+        verdict = "undecided"
+        why = "the image is of another model, a dump cannot be asked for central differences"
         open_to = dict.fromkeys(names, 0.0)
         if agrees:
             verdict, why = "gradient bug", "the image is the model's, the gradient is not"
@@ -239,14 +242,17 @@ def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float
     """How far two gradients are apart; `verdict` is None where that is still to be explained."""
     verdict, why = None, ""
     if theirs is None:
-        theirs, why = torch.zeros_like(ours), "the image does not depend on it"
+        theirs = torch.zeros_like(ours)
+        why = "the image does not depend on it"
     finite = torch.isfinite(theirs)
     if not finite.all():
         index = [int(i) for i in torch.nonzero(~finite)[0]]
-        verdict, why = "gradient bug", f"not finite, first at {index}"
+        verdict = "gradient bug"
+        why = f"not finite, first at {index}"
         theirs = torch.where(finite, theirs, 0.0)
     a, b = theirs.reshape(-1), ours.reshape(-1)
-    norm, largest = float(b.norm()), float((a - b).abs().max())
+    norm = float(b.norm())
+    largest = float((a - b).abs().max())
     relative = float((a - b).norm()) / max(norm, 1e-12)  # of a gradient that is 0: of next to nothing
     each = (theirs - ours).reshape(len(ours), -1).norm(dim=1)
     worst = torch.topk(each, min(5, len(each))).indices
@@ -290,7 +296,10 @@ def _known(case: Case, model: ReferenceModel, compared: Compared) -> None:
 
 def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names: list[str]) -> None:
     """Ask the rasterizer's own central differences; `model` is given if the image is its."""
-    groups, rasterizer, raw, background = compared.groups, case.rasterizer, case.raw, case.background
+    groups = compared.groups
+    rasterizer = case.rasterizer
+    raw = case.raw
+    background = case.background
     camera, u = case.cameras[case.first], compared.u[case.first]
     found = rasterizer.gradient(raw, camera, background, u)
     found = {name: torch.zeros_like(raw[name]) if x is None else x for name, x in found.items()}
@@ -315,7 +324,8 @@ def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names:
 
 def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
     """Where the two differ most, and where the gradient is largest: half of each."""
-    a, b = torch.nan_to_num(theirs).reshape(-1), ours.reshape(-1)
+    a = torch.nan_to_num(theirs).reshape(-1)
+    b = ours.reshape(-1)
     order = [torch.argsort(x.abs(), descending=True).tolist() for x in (a - b, b)]
     return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]
 
@@ -324,7 +334,8 @@ def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differenc
     """A gradient, and the model's if it has the same image, against central differences at their entries."""
     values, bars = own.values[name], own.uncertainty[name]
     there = gradient.reshape(-1)[own.entries[name]]
-    error, size = float((there - values).norm()), float(values.norm())
+    error = float((there - values).norm())
+    size = float(values.norm())
     noise = float(bars.norm())
     ratios = there[values.abs() > 3 * bars] / values[values.abs() > 3 * bars]
     ratio = float(ratios.median()) if len(ratios) else float("nan")

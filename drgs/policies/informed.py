@@ -45,7 +45,8 @@ def fisher(pool: Pool) -> Selection:
         sphere = backdrop_sphere(pool.scene, [*pool.train, *pool.candidates], pool.answers)
     asked, combination = asked_of(scoring, blocks, metric, sphere)
     selection = _greedy(pool, asked, combination)
-    selection.blocks, selection.semantics = list(blocks), metric.to_json() if metric else None
+    selection.blocks = list(blocks)
+    selection.semantics = metric.to_json() if metric else None
     if "deformation" in blocks:
         selection.network = {"score": scoring.network, "probes": scoring.probes}
         if scoring.network == "ratio" and scoring.probes < _FEW_PROBES:
@@ -61,7 +62,8 @@ def fisher(pool: Pool) -> Selection:
 
 def fisherrf(pool: Pool) -> Selection:
     """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations and no features."""
-    prior, weights = pool.scoring.prior_of("fisherrf"), _without_rotations(pool.scoring.weights)
+    prior = pool.scoring.prior_of("fisherrf")
+    weights = _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
     asked = Asked("diagonal", ("features",), (("method", "fisherrf"),))
     plain = dataclasses.replace(pool, masks=None)  # of which FisherRF knows nothing
@@ -82,7 +84,8 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
         asked: What is asked of a view.
         combination: How that becomes a score; default by the pool's scoring, all groups together.
     """
-    settings, combination = pool.scoring.settings, combination or Combination(pool.scoring)
+    settings = pool.scoring.settings
+    combination = combination or Combination(pool.scoring)
 
     def by(asked: Sequence[Asked]) -> InformationSource:
         questions = Questions(settings, tuple(asked), pool.empty_outside)

@@ -27,7 +27,9 @@ def farthest(pool: Pool) -> Selection:
         distance = np.minimum(distance, np.linalg.norm(centers - camera.center, axis=1))
     if not pool.train:
         distance[:] = 0.0
-    scores, picks, left = distance.tolist(), [], np.ones(len(centers), bool)
+    scores = distance.tolist()
+    picks = []
+    left = np.ones(len(centers), bool)
     for _ in range(pool.k):
         order = np.argsort(np.where(left, -distance, np.inf), kind="stable")
         best, margin = order[0], None

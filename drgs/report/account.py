@@ -82,7 +82,8 @@ def account_of(run: Run) -> Account:
     selection = _optional(run.path / "selection.json", _SELECTION) if record.is_active else None
     for pick in [] if selection is None else selection["picks"]:
         _check_numbers(run.path / "selection.json", pick["parts"])
-    env, (events, wall) = _optional(run.path / "env.json", {}) or {}, _events(run)
+    env = _optional(run.path / "env.json", {}) or {}
+    (events, wall) = _events(run)
     return Account(run, record, run.config(), env, events, metrics, selection, wall)
 
 
@@ -117,7 +118,8 @@ def _events(run: Run) -> tuple[list[dict[str, Any]], float]:
             raise ValueError(f"{where}: time must be ISO 8601, got {event['time'][:40]!r}; {_ADVICE}") from None
         if event["event"] in ("resume", "start") or began is None or last is None:
             wall += 0.0 if began is None or last is None else last - began
-            kept, began = [row for row in kept if row["step"] <= event["step"]], now
+            kept = [row for row in kept if row["step"] <= event["step"]]
+            began = now
         kept.append(event)
         last = now
     return kept, wall if began is None or last is None else wall + last - began

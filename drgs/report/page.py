@@ -127,7 +127,8 @@ def _subtitle(account: Account) -> str:
 
 def _tiles(account: Account) -> list[tuple[str, str]]:
     """The few numbers that a reader looks for first."""
-    metrics, tiles = account.metrics, []
+    metrics = account.metrics
+    tiles = []
     if metrics is not None:
         units = {"psnr": " dB", "psnr_moving": " dB"}
         names = {"psnr": "PSNR", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS", "psnr_moving": "PSNR of what moves"}
@@ -216,7 +217,8 @@ def _segmentation(metrics: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _picks(account: Account) -> dict[str, Any]:
     """What was picked, and what the held-out views had on the way."""
-    selection, rows = account.selection, []
+    selection = account.selection
+    rows = []
     if selection is None:
         return {"picks": [], "measured": []}
     for pick in selection["picks"]:
@@ -228,7 +230,8 @@ def _picks(account: Account) -> dict[str, Any]:
     criteria = sorted({str(pick["criterion"]) for pick in selection["picks"] if pick.get("criterion")})
     how = ", ".join([*policies, *criteria])
     leak = " Initial points are of the whole data set, views that were not picked included." * selection["pool_leak"]
-    measured, names = [], ("psnr", "ssim", "flip")
+    measured = []
+    names = ("psnr", "ssim", "flip")
     for row in selection.get("measured") or ():
         if isinstance(row, dict) and isinstance(row.get("mean"), dict):
             values = [row["mean"].get(name) for name in names]
@@ -245,7 +248,8 @@ def _picks(account: Account) -> dict[str, Any]:
 
 def _timings(account: Account) -> list[tuple[str, str, str]]:
     """Where the wall time went."""
-    steps, wall = _seconds(account), account.wall
+    steps = _seconds(account)
+    wall = account.wall
     picks = account.selection["picks"] if account.selection else []
     choosing = sum(pick["seconds"] for pick in picks)
     per_step = 1000 * steps / max(account.step, 1)
@@ -268,7 +272,8 @@ def _memory(account: Account) -> str:
 
 def _configuration(account: Account) -> list[tuple[str, str, bool]]:
     """Name, value and whether it is not the default, of every field."""
-    config, rows = account.record.config.to_json(), []
+    config = account.record.config.to_json()
+    rows = []
     usual = FitConfig().to_json()
     for name, value in config.pop("settings").items():
         rows.append((f"settings.{name}", _text(value), value != usual["settings"][name]))

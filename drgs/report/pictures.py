@@ -88,7 +88,8 @@ def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str
     if account.metrics is None:
         return {}
     every = [row["name"] for row in account.metrics["views"]]
-    files, found = dict(zip(every, pictures.file_names(every), strict=True)), {}
+    files = dict(zip(every, pictures.file_names(every), strict=True))
+    found = {}
     for name in names:
         image = _read(account.run.renders / account.metrics["split"] / f"{files[name]}.{kind}")
         if image is not None:
@@ -116,7 +117,8 @@ def maps(
     """
     if not known or not shown:
         return {}
-    counted, result = spread(known, _KNOWN), dict[str, tuple[Picture, Picture]]()
+    counted = spread(known, _KNOWN)
+    result = dict[str, tuple[Picture, Picture]]()
     sphere = fisher.backdrop_sphere(scene, [*known, *shown.values()])
     with Bar("maps of information", len(counted) + len(shown)) as bar:
         total: dict[str, torch.Tensor] = {}

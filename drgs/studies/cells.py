@@ -128,12 +128,14 @@ class Study:
 
     def configs(self, cell: Cell) -> tuple[FitConfig, ActiveConfig | None]:
         """What the fit of a cell is told."""
-        (every, offset), protocol = cell.split, PROTOCOLS[cell.protocol]
+        (every, offset) = cell.split
+        protocol = PROTOCOLS[cell.protocol]
         changed: dict[str, Any] = {"seed": cell.seed, "test_every": every, "test_offset": offset}
         changed["init_points"] = protocol.points
         if cell.camera:
             changed["test_cameras"] = (cell.camera,)
-        fields, config = self.policies[cell.policy], dataclasses.replace(self.fit, **changed)
+        fields = self.policies[cell.policy]
+        config = dataclasses.replace(self.fit, **changed)
         if fields is None:
             return config, None
         return config, dataclasses.replace(self.active, start=cell.start, **{**protocol.active, **fields})
@@ -156,7 +158,8 @@ class Study:
         Raises:
             ValueError: If the data set states another split than the cell's: it would win.
         """
-        (every, offset), (config, _) = cell.split, self.configs(cell)
+        (every, offset) = cell.split
+        (config, _) = self.configs(cell)
         dataset = load_dataset(self._made(cell), config, lazy=True, points=PROTOCOLS[cell.protocol].leaks)
         if cell.camera:
             return dataset  # which knows the camera, or has been refused
@@ -254,7 +257,8 @@ def run_cells(
     Raises:
         OSError: If there is no room left.
     """
-    taken, failed = list[Cell](), dict[Cell, str]()
+    taken = list[Cell]()
+    failed = dict[Cell, str]()
     for number, cell in enumerate(cells, 1):
         if is_done(study.name, cell, read_study(rows), study.measured_later):
             continue
@@ -319,10 +323,14 @@ def _row(study: Study, cell: Cell, run: Run) -> dict:
     env = read_json(run.path / "env.json", "where a run ran", _ADVICE)
     measured: list[dict] = []
     if study.policies[cell.policy] is None:
-        start, picks, leak = run.config()["train"], [], PROTOCOLS[cell.protocol].leaks
+        start = run.config()["train"]
+        picks = []
+        leak = PROTOCOLS[cell.protocol].leaks
     else:
         chosen = read_json(run.path / SELECTION, "the record of the chosen views", _ADVICE)
-        start, picks, leak = [view["name"] for view in chosen["start"]], chosen["picks"], chosen["pool_leak"]
+        start = [view["name"] for view in chosen["start"]]
+        picks = chosen["picks"]
+        leak = chosen["pool_leak"]
         measured = chosen.get("measured", [])
     done = next((event for event in run.events()[::-1] if event.get("event") == "done"), {})
     return {

@@ -47,7 +47,8 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
     figure, axes = plt.subplots(lines, columns, figsize=(_SIZE * columns, _SIZE * lines), dpi=100, squeeze=False)
     for axis in axes.flat[len(scenes) :]:
         axis.set_axis_off()
-    colors, judged = plt.get_cmap("tab20"), {policy for policy, _ in study.comparisons}
+    colors = plt.get_cmap("tab20")
+    judged = {policy for policy, _ in study.comparisons}
     for axis, scene in zip(axes.flat, scenes, strict=False):
         mine = [row for row in rows if row["scene"] == scene]
         for number, label in enumerate(study.policies):

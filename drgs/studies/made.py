@@ -61,7 +61,8 @@ def _made(
         return given[scene]
     from drgs.scenes import kitchen, room
 
-    (width, height), (w, h) = sizes.image, sizes.teacher
+    (width, height) = sizes.image
+    (w, h) = sizes.teacher
     size = {"width": width, "height": height, "teacher_width": w, "teacher_height": h, "seed": _number(scene)}
     with Bar(f"path tracing {scene}") as bar:
         if study == "static":

@@ -82,7 +82,9 @@ def plan_of(
     study = study_of(experiment.study, scale, made, scenes, lpips=lpips)
     study = dataclasses.replace(study, policies={label: study.policies[label] for label in wanted})
     dataclasses.replace(study.fit, test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
-    units, notes, lacking = [], list[str](), set[tuple[str, str]]()
+    units = []
+    notes = list[str]()
+    lacking = set[tuple[str, str]]()
     for scene, path in scenes.items():
         dataset = data.load(
             path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.times

@@ -42,7 +42,9 @@ _QUANTILES = 0.025, 0.975
 # with 3 to 5 units that differ as much as their units do, from 8 on half as much.
 _HELD = {2: 0.50, 3: 0.75, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.88, 10: 0.89, 12: 0.90, 15: 0.92}
 _HELD_SCENES = {2: 0.71, 3: 0.82, 4: 0.86, 5: 0.90, 7: 0.91, 8: 0.95}
-_LEVEL, _POWER = 0.975, 0.8  # 5 % of false alarms on both sides together, and 4 of 5 studies that find the difference
+# 5 % of false alarms on both sides together, and 4 of 5 studies that find the difference
+_LEVEL = 0.975
+_POWER = 0.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +112,8 @@ def values_of(rows: Iterable[Mapping[str, Any]], metric: str, policy: str) -> di
 
 def differences(rows: Sequence[Mapping[str, Any]], metric: str, policy: str, reference: str) -> dict[Unit, float]:
     """Unit -> policy minus reference, where there are both."""
-    ours, theirs = values_of(rows, metric, policy), values_of(rows, metric, reference)
+    ours = values_of(rows, metric, policy)
+    theirs = values_of(rows, metric, reference)
     return {unit: value - theirs[unit] for unit, value in ours.items() if unit in theirs}
 
 
@@ -124,7 +127,8 @@ def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Effect:
     scenes: dict[str, list[float]] = {}
     for unit, value in values.items():
         scenes.setdefault(unit[0], []).append(value)
-    rng, count = np.random.default_rng(0), len(scenes)
+    rng = np.random.default_rng(0)
+    count = len(scenes)
     # A scene that is drawn twice has its units drawn twice, independently.
     means = np.stack(
         [np.asarray(x)[rng.integers(len(x), size=(draws, count, len(x)))].mean(2) for x in scenes.values()]
@@ -151,7 +155,8 @@ def coverage(scenes: int, units: int) -> float:
         scenes, units: How many there are, at least two units in all.
     """
     if scenes == 1 or units < 2 * scenes:
-        count, table = units if scenes == 1 else scenes, _HELD
+        count = units if scenes == 1 else scenes
+        table = _HELD
     else:
         count, table = scenes, _HELD_SCENES
     return table[max(key for key in table if key <= count)]
@@ -165,7 +170,8 @@ def student_quantile(share: float, degrees: int) -> float:
     Reference:
         [1] Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964.
     """
-    low, high = 0.0, math.pi / 2
+    low = 0.0
+    high = math.pi / 2
     for _ in range(60):
         angle = (low + high) / 2
         low, high = (angle, high) if _within(angle, degrees) < 2 * share - 1 else (low, angle)
@@ -174,7 +180,8 @@ def student_quantile(share: float, degrees: int) -> float:
 
 def _within(angle: float, degrees: int) -> float:
     """The share of Student's distribution between -t and t, for t = tan(angle) sqrt(degrees)."""
-    cosine, odd = math.cos(angle), degrees % 2
+    cosine = math.cos(angle)
+    odd = degrees % 2
     term = cosine if odd else 1.0
     total = 0.0 if degrees == 1 else term
     for power in range(2 + odd, degrees - 1, 2):

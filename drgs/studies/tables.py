@@ -255,7 +255,8 @@ def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
         "Measured with so many views, on the way just before the next one is picked, with the last number at the end; "
         "every scene counts alike."
     )
-    heads, labels = ["policy", *(f"{count} views" for count in counts)], _labels(study, rows)
+    heads = ["policy", *(f"{count} views" for count in counts)]
+    labels = _labels(study, rows)
     measured = [at_views(rows, count) for count in counts]
     units = {x: {len({unit_of(row) for row in at if row["policy"] == x}) for at in measured} for x in labels}
     unlike = next((said for at in measured if (said := unlike_units(at))), "")
@@ -323,7 +324,8 @@ def _verdict(metric: Metric, found: Effect) -> str:
 
 def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -> str:
     """Gains and losses in words; a pair without either is named as well."""
-    lines, verbs = [], {"gain": "gains in", "loss": "loses in"}
+    lines = []
+    verbs = {"gain": "gains in", "loss": "loses in"}
     for policy, reference in pairs:
         found = _estimates(study, rows, policy, reference)
         words: dict[str, list[str]] = {word: [] for word in verbs}

@@ -70,7 +70,8 @@ class _Reverse(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: Call, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
-        ctx.call, ctx.needed = call, ctx.needs_input_grad[1:]
+        ctx.call = call
+        ctx.needed = ctx.needs_input_grad[1:]
         ctx.graph = _traced(call, values, ctx.needed)
         return tuple(x.torch() for x in ctx.graph[1])
 

@@ -58,12 +58,18 @@ class BvhTraversal:
     world = True
 
     def __init__(self, lib: Lib, settings: RenderSettings, projected: Projected, rays: int) -> None:
-        self.lib, self.settings, self.projected, self.rays = lib, settings, projected, rays
+        self.lib = lib
+        self.settings = settings
+        self.projected = projected
+        self.rays = rays
         self.certificate: dict = {}
 
     def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
         """Build the proxies, and find the order of the rays."""
-        self.model, self.records, self.carried, self.basis = model, records, carried, basis
+        self.model = model
+        self.records = records
+        self.carried = carried
+        self.basis = basis
         lib, s = self.lib, self.settings
         every = self._ray(dr.arange(lib.UInt32, self.rays))
         self.proxies = self._proxies(every)
@@ -78,7 +84,8 @@ class BvhTraversal:
     def parts(self, share: int) -> list[Part]:
         """All rays as one part, one a lane."""
         lib, s = self.lib, self.settings
-        ray, inside = self._ray(self.order), lib.Bool(bool(self.rays))
+        ray = self._ray(self.order)
+        inside = lib.Bool(bool(self.rays))
         stream = _ProxyStream(lib, self.proxies, ray, s.order)
         part = Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, True, self.center_key)
         if s.order == "entry":
@@ -133,7 +140,8 @@ class Proxies:
     ) -> None:
         self.scene = scene
         self.listed = [dr.opaque(lib.UInt32, int(x)) for x in first[-2:]]
-        self.members, self.first = lib.UInt32(members.astype(np.uint32)), lib.UInt32(first.astype(np.uint32))
+        self.members = lib.UInt32(members.astype(np.uint32))
+        self.first = lib.UInt32(first.astype(np.uint32))
         self.low, self.high = ([dr.opaque(lib.Float, float(x)) for x in corner] for corner in box)
         size = np.linalg.norm(box[1] - box[0])
         self.size, self.back, self.scale = (dr.opaque(lib.Float, float(x)) for x in (size, back, scale))
@@ -165,14 +173,18 @@ def proxy_scene(
     longest = radii.max(0)
     # Those that only differ in size share a proxy. Rounded: the radii differ by the extents, which are multiplied in.
     grouped, first = _groups(np.concatenate([means, quats, np.round(radii / longest, 9)]))
-    members, primitive = index[grouped], grouped[first[:-1]]
+    members = index[grouped]
+    primitive = grouped[first[:-1]]
     growth = np.maximum.reduceat(longest[grouped], first[:-1]) / longest[primitive]
-    means, quats, radii = means[:, primitive], quats[:, primitive], radii[:, primitive] * growth
+    means = means[:, primitive]
+    quats = quats[:, primitive]
+    radii = radii[:, primitive] * growth
     low, high = origins.min(1), origins.max(1)
     spread = 0.5 * float(np.linalg.norm(high - low))
     to = means - 0.5 * (low + high)[:, None]
     distance = np.sqrt((to * to).sum(0)) + spread
-    back, proxies = 0.0, _grown(radii, means, distance)
+    back = 0.0
+    proxies = _grown(radii, means, distance)
     around = _around(to, quats, proxies, spread, distance, tails)
     # Of a single origin all are candidates of every ray, and listed they are cheaper than traced.
     most = _LISTED if spread > 0 else len(around)
@@ -183,11 +195,15 @@ def proxy_scene(
         around = around[len(moved) :]
         back = 2.5 * float(proxies[:, moved].max())
     if len(around):
-        kept, counts = np.delete(np.arange(len(primitive)), around), np.diff(first)
+        kept = np.delete(np.arange(len(primitive)), around)
+        counts = np.diff(first)
         listed = np.isin(np.repeat(np.arange(len(primitive)), counts), around)
         members = np.concatenate([members[~listed], members[listed]])
         first = np.concatenate([[0], np.cumsum(counts[kept])])
-        means, quats, radii, distance = means[:, kept], quats[:, kept], radii[:, kept], distance[kept]
+        means = means[:, kept]
+        quats = quats[:, kept]
+        radii = radii[:, kept]
+        distance = distance[kept]
     first = np.append(first, len(members))
     if means.shape[1] == 0:
         return Proxies(lib, None, members, first, np.zeros((2, 3)), 0, 1)
@@ -213,7 +229,8 @@ def _groups(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x = columns[0, order]
     equal = np.flatnonzero(x[1:] == x[:-1])
     tied = np.zeros(len(order), bool)
-    tied[equal], tied[equal + 1] = True, True
+    tied[equal] = True
+    tied[equal + 1] = True
     # Comparing whole columns is slow: only those whose first numbers are equal.
     some, alone = order[tied], order[~tied]
     if len(some) == 0:
@@ -259,7 +276,10 @@ class _ProxyStream:
     """Listed Gaussians, then the proxies along rays in the order of their entry points; a `Stream`."""
 
     def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, order: str) -> None:
-        self.lib, self.proxies, self.ray, self.order = lib, proxies, ray, order
+        self.lib = lib
+        self.proxies = proxies
+        self.ray = ray
+        self.order = order
         self.mi = runtime.mitsuba()
         self.d = ray.carried[-3:]
         if proxies is not None:
@@ -311,7 +331,9 @@ class _ProxyStream:
         count, at, step, last, member, end, some = s
         inside = member < end
         trace = active & ~inside & (some != 0)
-        found, primitive, entry = lib.Bool(False), lib.UInt32(0), at
+        found = lib.Bool(False)
+        primitive = lib.UInt32(0)
+        entry = at
         if p.scene is not None:
             o = [dr.fma(d, at, x) for x, d in zip(self.o, self.d, strict=True)]
             ray = mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*[d * p.scale for d in self.d]))
@@ -321,10 +343,8 @@ class _ProxyStream:
             entry = at + dr.select(found, pi.t, 0) * p.scale
         again = found & (primitive == last)
         fresh = found & ~again
-        first, behind = (
-            dr.gather(lib.UInt32, p.first, primitive, fresh),
-            dr.gather(lib.UInt32, p.first, primitive + 1, fresh),
-        )
+        first = dr.gather(lib.UInt32, p.first, primitive, fresh)
+        behind = dr.gather(lib.UInt32, p.first, primitive + 1, fresh)
         member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
         step = dr.select(again, 2 * step, dr.select(fresh, self.step, step))
         # Far along the ray the step is less than one unit in the last place: 1.2e-7.

@@ -93,7 +93,10 @@ class Call:
         couple: bool = True,
         timed: bool = False,
     ):
-        self.lib, self.settings, self.camera, self.want = runtime.dr_types(), settings, camera, want
+        self.lib = runtime.dr_types()
+        self.settings = settings
+        self.camera = camera
+        self.want = want
         must_be("render", "couple_features", couple, bool, "True or False")
         self.couple = couple
         if settings.traversal == "tiles" and camera.is_distorted:
@@ -104,7 +107,8 @@ class Call:
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
         self._check_memory(gaussians, rays)
         gaussians.validate("render")
-        self.device, middle = gaussians.means.device, None
+        self.device = gaussians.means.device
+        middle = None
         if settings.traversal == "bvh" and gaussians.means.dtype == torch.float64 and len(gaussians):
             # World records are float32, so a world far from 0 is moved there; where to has no derivative.
             middle = gaussians.means.detach().mean(0)
@@ -113,7 +117,8 @@ class Call:
         given = gaussians.parameters()
         self.field = None
         if scene is not None:
-            fields, given = given, {name: self._move(x) for name, x in scene.parameters().items()}
+            fields = given
+            given = {name: self._move(x) for name, x in scene.parameters().items()}
             _check_names(given)
             fixed = {name: x for name, x in given.items() if not x.is_floating_point()}
             given = {name: x for name, x in given.items() if name not in fixed}
@@ -123,7 +128,8 @@ class Call:
 
             self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
-        self.count, self.coefficients = len(gaussians), gaussians.sh.shape[1]
+        self.count = len(gaussians)
+        self.coefficients = gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
         origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
         if rays is not None:
@@ -145,7 +151,8 @@ class Call:
         # The world of the means is re-centered: x_world = x + origin.
         self.inputs["w2c"] = self._move(shifted(pose, origin))
         self.pixels = int(np.prod(self.shape))
-        self.extra, self.certificate = {}, {}
+        self.extra = {}
+        self.certificate = {}
 
     def _check_memory(self, gaussians, rays):
         """Refuse what cannot fit before anything is allocated for it."""
@@ -176,7 +183,8 @@ class Call:
         """Dr.Jit tensors to a dict of flat images, with AD."""
         compositor, arguments = self.prepare(inputs)
         images = dr.custom(Composite, compositor, *arguments, dr.grad_enabled(inputs))
-        self.extra, self.certificate = compositor.extra, compositor.certificate
+        self.extra = compositor.extra
+        self.certificate = compositor.certificate
         return images
 
     def prepare(self, inputs: dict) -> tuple[Compositor, Arguments]:
@@ -191,7 +199,8 @@ class Call:
             projected = projection.project_world(lib, p, p["w2c"], s, coefficients)
             traversal = BvhTraversal(lib, s, projected, self.pixels)
         else:
-            K, size = self.camera.K, (self.camera.width, self.camera.height)
+            K = self.camera.K
+            size = (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
             projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, coefficients)
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
@@ -212,7 +221,9 @@ class Call:
 
     def _carried(self, p: dict, along_ray: bool, world: bool) -> tuple[int, list]:
         """What rays carry: the SH basis where colors are evaluated along them, then o and d of world rays."""
-        lib, basis, carried = self.lib, 0, []
+        lib = self.lib
+        basis = 0
+        carried = []
         if along_ray or world:
             i = dr.arange(lib.UInt32, self.pixels)
             direction = [lib.Float(dr.gather(lib.Float64, p["ray_directions"], 3 * i + k)) for k in range(3)]

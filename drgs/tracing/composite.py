@@ -60,8 +60,14 @@ class Compositor:
         basis: int = 0,
         couple: bool = True,
     ) -> None:
-        self.lib, self.settings, self.traversal, self.want = lib, settings, traversal, want
-        self.width, self.basis, self.rays, self.couple = width, basis, traversal.rays, couple
+        self.lib = lib
+        self.settings = settings
+        self.traversal = traversal
+        self.want = want
+        self.width = width
+        self.basis = basis
+        self.rays = traversal.rays
+        self.couple = couple
         self.model = HitModel(lib, settings, traversal.world)
         self.certificate: dict = {}
         self.extra: dict = {}
@@ -89,7 +95,8 @@ class Compositor:
             columns: So many tangents may follow.
         """
         view = self.traversal
-        self.entries, self.carried = len(record), carried
+        self.entries = len(record)
+        self.carried = carried
         self.buffers = {"record": pack_records(self.lib, record)}
         if sh is not None:
             self.buffers["sh"] = sh
@@ -119,7 +126,8 @@ class Compositor:
             features: Flat (N count), all of them composited.
         """
         channels = Channels({**self.buffers, "features": features}, count, 0, count, True)
-        done, kernel = [], Primal(self.model, channels, frozenset({"replay"}))
+        done = []
+        kernel = Primal(self.model, channels, frozenset({"replay"}))
         for part in self.parts:
             done.append((part, part.run(kernel)))
             dr.eval(done[-1][1])  # one at a time: each has rows to sort
@@ -127,7 +135,9 @@ class Compositor:
 
     def _composited(self, want: frozenset, count: int) -> dict:
         """Flat images, `count` visibilities among them, from all passes."""
-        lib, out, self.finals = self.lib, self._images(), []
+        lib = self.lib
+        out = self._images()
+        self.finals = []
         for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
             if name in want:
                 out[name] = dr.zeros(kind, self.rays)
@@ -173,7 +183,8 @@ class Compositor:
     ) -> tuple[list[dict], Float | None]:
         """Final states of a part, and its weights if they are held; adds a part of rays that are to be redone."""
         if not channels.color:
-            want, visibility = want & {"replay"}, None
+            want = want & {"replay"}
+            visibility = None
         # In exact order the first traversal decides which rays are redone.
         check = part.ordered and channels.color
         if check and visibility is not None:
@@ -253,7 +264,9 @@ class Compositor:
         self, g: dict, channels: Channels, walked: tuple, grads: dict, carried: list[Float], slopes: torch.Tensor | None
     ) -> None:
         """Of a part with its final states: add to `grads`, `carried` and the `slopes` of features."""
-        (part, finals), depth, shared = walked, "depth" in self.want and channels.color, None
+        (part, finals) = walked
+        depth = "depth" in self.want and channels.color
+        shared = None
         cotangents = self._cotangents(g, channels, part)
         if part.weights is not None and slopes is not None:
             shared = self._products(part, part.weights, in_rows(g["features"], self.width), slopes, cotangents)
@@ -262,7 +275,8 @@ class Compositor:
             return
 
         def kernel(part: Part, finals: list[dict], table: Table | None = None) -> Adjoint:
-            own, scalar = cotangents if table is None else self._cotangents(g, channels, part), None
+            own = cotangents if table is None else self._cotangents(g, channels, part)
+            scalar = None
             if shared is not None:
                 scalar = lambda k, place, ok: dr.gather(self.lib.Float, shared, part.slot(k, place), ok)  # noqa: E731
             return Adjoint(self.model, channels, grads, finals, own, depth, part.reduction, scalar, table)
@@ -356,7 +370,8 @@ class Compositor:
                     [[dr.gather(lib.Float, v, at, inside) for v in per_tangent] for per_tangent in carried]
                     for at, inside in zip(part.flat, part.inside, strict=True)
                 ]
-                buffer, moved = None, []
+                buffer = None
+                moved = []
                 if part.weights is not None:
                     buffer = part.weights.zeros()
                     moved = [part.weights.zeros() for _ in rest] if self.couple else []

@@ -87,13 +87,21 @@ class Adjoint:
         scalar: Callable[[int, list, Mask], Float] | None = None,
         table: Table | None = None,
     ) -> None:
-        self.m, self.channels, self.grads, self.mode, self.scalar = model, channels, grads, mode, scalar
+        self.m = model
+        self.channels = channels
+        self.grads = grads
+        self.mode = mode
+        self.scalar = scalar
         self.table = table
-        self.finals, self.cotangents, self.slots = finals, cotangents, set(model.slots(depth))
+        self.finals = finals
+        self.cotangents = cotangents
+        self.slots = set(model.slots(depth))
 
     def rest(self, k: int) -> list[Float]:
         """The whole sum of shared ray k, of which each hit takes its own."""
-        D, final, g = self.m.lib.Float64, self.finals[k], self.cotangents[k]
+        D = self.m.lib.Float64
+        final = self.finals[k]
+        g = self.cotangents[k]
         rest = D(final["depth"]) * D(g["depth"]) if "depth" in final else D(0)
         rest = dr.fma(D(g["alpha"]), D(final["alpha"]), rest)
         for x, c in zip(final["sum"], g["sum"], strict=True):
@@ -113,7 +121,8 @@ class Adjoint:
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of shared ray k; `carried` collects the gradient of what the ray itself carries."""
-        lib, state = self.m.lib, {"carried": [self.m.lib.Float(0) for _ in range(self.cotangents[k]["carried"])]}
+        lib = self.m.lib
+        state = {"carried": [self.m.lib.Float(0) for _ in range(self.cotangents[k]["carried"])]}
         if self.table is None:
             alive = alive & (self.finals[k]["place"] != nowhere)
             state |= {"T": lib.Float(1), "rest": self.rest(k)}
@@ -127,7 +136,9 @@ class Adjoint:
 
     def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit of each ray: its local derivative by AD, weighted with dL/da and with w times the cotangents."""
-        m, lib, out = self.m, self.m.lib, []
+        m = self.m
+        lib = self.m.lib
+        out = []
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         with dr.resume_grad():
             # A graph of this hit only, from leaves of its own: the walk has suspended AD.
@@ -135,7 +146,9 @@ class Adjoint:
                 name: [dr.detach(x) for x in xs] for name, xs in self.channels.load(lib, index, rays[0], going).items()
             }
             dr.enable_grad(fixed)
-            total, hits, carried = lib.Float(0), lib.Bool(False), []
+            total = lib.Float(0)
+            hits = lib.Bool(False)
+            carried = []
             for number, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
                 g = self.cotangents[number]
                 ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])  # leaves, too
@@ -191,12 +204,19 @@ class Tangent:
         carried: list[list],
         emits: list[Emit | None] | None = None,
     ) -> None:
-        self.primal, self.m, self.channels, self.emits = primal, primal.m, primal.channels, emits
-        self.records, self.slots, self.tangents, self.carried = records, slots, tangents, carried
+        self.primal = primal
+        self.m = primal.m
+        self.channels = primal.channels
+        self.emits = emits
+        self.records = records
+        self.slots = slots
+        self.tangents = tangents
+        self.carried = carried
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray: the primal's, and `d` with a tangent of it for each column."""
-        lib, state = self.m.lib, self.primal.init(k, alive, nowhere)
+        lib = self.m.lib
+        state = self.primal.init(k, alive, nowhere)
         names = ["T", *(["depth"] if "depth" in state else [])]  # sum w is 1 - T
         state["d"] = [
             {**{n: lib.Float(0) for n in names}, "sum": [lib.Float(0) for _ in range(self.channels.outputs)]}
@@ -222,7 +242,8 @@ class Tangent:
                 ok &= new["count"] != st["count"]
             elif m.s.stop != "after":
                 ok &= new["alive"] != 0
-            T, w = st["T"], dr.select(ok, st["T"] * a0, 0)
+            T = st["T"]
+            w = dr.select(ok, st["T"] * a0, 0)
             values0 = self.channels.values(m, loaded, ray)
             # One gradient of the hit serves all columns.
             slopes = [self._slopes(loaded["record"], ray, live, k) for k in range(2 if "depth" in new else 1)]
@@ -246,7 +267,8 @@ class Tangent:
 
     def _load(self, index: UInt32, ray: Ray, active: Mask) -> list[dict]:
         """Tangents of what a hit reads, by column."""
-        lib, count = self.m.lib, len(self.tangents)
+        lib = self.m.lib
+        count = len(self.tangents)
         flat = load_packed(lib, self.records, packed_size(len(self.slots) * count), index, active)
         speeds = [self.channels.load(lib, index, ray, active, tangent) for tangent in self.tangents]
         for k, speed in enumerate(speeds):

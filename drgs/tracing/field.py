@@ -45,7 +45,11 @@ class Field:
         shift: torch.Tensor | None = None,
         fixed: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
-        self.scene, self.time, self.names, self.shift, self.fixed = scene, time, tuple(names), shift, dict(fixed or {})
+        self.scene = scene
+        self.time = time
+        self.names = tuple(names)
+        self.shift = shift
+        self.fixed = dict(fixed or {})
         self.seen: _Tensors = {}  # the fields, once they are computed: a call's parameters are constant
 
     def __call__(self, parameters: dict) -> dict:
@@ -99,7 +103,10 @@ class _Kept(torch.autograd.Function):
     def forward(ctx: Any, function: Callable, seen: _Tensors, names: tuple, *values: torch.Tensor) -> tuple:
         if not seen:
             seen.update(function(dict(zip(names, values, strict=True))))
-        ctx.function, ctx.names, ctx.values, ctx.graph = function, names, values, None
+        ctx.function = function
+        ctx.names = names
+        ctx.values = values
+        ctx.graph = None
         return tuple(x.detach() for x in seen.values())  # an output that is an input would be taken for it
 
     @staticmethod

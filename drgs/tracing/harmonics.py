@@ -31,7 +31,9 @@ def sh_basis(direction: list[Float], coefficients: int) -> list[Float]:
     if coefficients > 1:
         basis += [-_LINEAR * y, _LINEAR * z, -_LINEAR * x]
     if coefficients > 4:
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         c: tuple[float, ...] = _QUADRATIC
         basis += [c[0] * x * y, c[1] * y * z, c[2] * (2 * zz - xx - yy), c[3] * x * z, c[4] * (xx - yy)]
     if coefficients > 9:

@@ -52,9 +52,11 @@ class Table:
 
     def __init__(self, lib: Lib, part: Part, count: int) -> None:
         assert part.slots is not None  # of a part along the lists of tiles
-        self.lib, self.part = lib, part
+        self.lib = lib
+        self.part = part
         self.count = 1 << count.bit_length()  # numbers of a slot: so many are written at once
-        self.numbers, self.array = 1 + count, dr.zeros(lib.Float, self.count * part.slots.size)
+        self.numbers = 1 + count
+        self.array = dr.zeros(lib.Float, self.count * part.slots.size)
 
     def load(self, k: int, place: list, active: Mask) -> list[Float]:
         """T at a place of shared ray k, 0 where there is no hit, and what lies behind it."""
@@ -114,7 +116,10 @@ class Behind:
     """
 
     def __init__(self, kernel: Replayed, part: Part, table: Table) -> None:
-        self.kernel, self.part, self.table, self.m = kernel, part, table, kernel.m
+        self.kernel = kernel
+        self.part = part
+        self.table = table
+        self.m = kernel.m
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray: what is left of each sum behind the last hit."""
@@ -128,7 +133,9 @@ class Behind:
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit."""
         kernel, table = self.kernel, self.table
-        (ray,), (st,), (place,) = rays, states, places
+        (ray,) = rays
+        (st,) = states
+        (place,) = places
         going = active & (st["alive"] != 0)
         loaded: Any = kernel.channels.load(self.m.lib, index, ray, going)
         a, depth, ok = self.m.hit(loaded["record"], ray, going)
@@ -147,7 +154,10 @@ def passed(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok:
         st: State with `T`, `alive` and `rest`, a Float64 for each term.
         terms: Of each sum along the ray, what the hit's weight is multiplied by.
     """
-    T, left, new, wide = st["T"], 1 - a, dict(st), dr.float64_array_t(a)
+    T = st["T"]
+    left = 1 - a
+    new = dict(st)
+    wide = dr.float64_array_t(a)
     w = dr.select(ok, T * a, 0)
     rest = [r - wide(w) * wide(term) for r, term in zip(st["rest"], terms, strict=True)]
     # Behind an a that rounds to 1 nothing was composited: there is no rest to share out.

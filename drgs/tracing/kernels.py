@@ -55,7 +55,10 @@ class HitModel:
     """
 
     def __init__(self, lib: Lib, settings: RenderSettings, world: bool = False) -> None:
-        self.lib, self.s, self.world, self.response = lib, settings, world, RESPONSES[settings.response]
+        self.lib = lib
+        self.s = settings
+        self.world = world
+        self.response = RESPONSES[settings.response]
         # Opaque: another value is no other kernel.
         self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
         self.alpha_max = dr.opaque(lib.Float, settings.alpha_max)
@@ -121,7 +124,8 @@ class Channels:
         self, lib: Lib, index: UInt32, ray: Ray, active: Mask, buffers: dict | None = None, only: str | None = None
     ) -> dict:
         """What a hit of Gaussian `index` reads, name -> list of floats; from other buffers, or `only` of one name."""
-        buffers, loaded = buffers or self.buffers, {}
+        buffers = buffers or self.buffers
+        loaded = {}
         for name, (stride, offset, count) in self.layout(ray).items():
             if name not in buffers or (only and name != only):
                 continue
@@ -152,7 +156,10 @@ class Primal:
     """
 
     def __init__(self, model: HitModel, channels: Channels, want: frozenset, emit: Emit | None = None) -> None:
-        self.m, self.channels, self.want, self.emit = model, channels, want, emit
+        self.m = model
+        self.channels = channels
+        self.want = want
+        self.emit = emit
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray; the same for each shared one."""
@@ -177,12 +184,14 @@ class Primal:
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Composite Gaussian `index` onto each of `rays`; places[k] is where the hit stands in the order."""
-        m, out = self.m, []
+        m = self.m
+        out = []
         any_active = active & (sum((s["alive"] for s in states), m.lib.UInt32(0)) != 0)
         loaded = self.channels.load(m.lib, index, rays[0], any_active)
         for k, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
             a, depth, ok = m.hit(loaded["record"], ray, active & (st["alive"] != 0))
-            T, rest = st["T"], st["T"] * (1 - a)
+            T = st["T"]
+            rest = st["T"] * (1 - a)
             if m.s.stop == "after":
                 done = ok & (rest < m.stop_at)
             else:
@@ -190,7 +199,8 @@ class Primal:
                 ok &= ~done
             w = dr.select(ok, T * a, 0)
             new = dict(st)  # a loop state keeps its order of keys
-            new["T"], new["alive"] = dr.select(ok, rest, T), dr.select(done, 0, st["alive"])
+            new["T"] = dr.select(ok, rest, T)
+            new["alive"] = dr.select(done, 0, st["alive"])
             values = self.channels.values(m, loaded, ray)
             new["sum"] = [_add(w, v, s) for v, s in zip(values, st["sum"], strict=True)]
             # Not 1 - T, which rounds a thin veil away.

@@ -46,7 +46,8 @@ def twisted(pose: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
     c2w <- exp(xi) c2w is w2c <- w2c exp(-xi).
     """
     generator = torch.zeros(4, 4, dtype=torch.float64)
-    generator[:3, :3], generator[:3, 3] = _cross_matrix(twist[:3]), twist[3:]
+    generator[:3, :3] = _cross_matrix(twist[:3])
+    generator[:3, 3] = twist[3:]
     return -pose @ generator
 
 
@@ -57,7 +58,8 @@ def turned(omega: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 def quaternion_product(w: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     """(0, w) * q for (N, 3) and (N, 4) wxyz."""
-    s, v = q[:, :1], q[:, 1:]
+    s = q[:, :1]
+    v = q[:, 1:]
     return torch.cat([-(w * v).sum(1, keepdim=True), s * w + torch.cross(w, v, dim=1)], 1)
 
 

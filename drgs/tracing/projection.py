@@ -44,7 +44,9 @@ class Projected:
         ellipsoids: list[Float] | None = None,
         frame: tuple | None = None,
     ) -> None:
-        self.record, self.key, self.alive = record, key, alive
+        self.record = record
+        self.key = key
+        self.alive = alive
         # Any: None where a view has no such thing, and then nobody reads it.
         self.bounds: list[Float] | Any = bounds
         self.ellipsoids: list[Float] | Any = ellipsoids
@@ -72,7 +74,9 @@ class Activated:
 
     def __init__(self, lib: Lib, p: dict, w2c: Float, settings: RenderSettings, count: int) -> None:
         Float64, UInt32 = lib.Float64, lib.UInt32
-        self.lib, self.settings, self.response = lib, settings, RESPONSES[settings.response]
+        self.lib = lib
+        self.settings = settings
+        self.response = RESPONSES[settings.response]
         i = dr.arange(UInt32, count)
         # Each Gaussian gathers its own entries once, so the adjoint needs no atomics.
         permute = dr.ReduceMode.Permute
@@ -177,7 +181,8 @@ def project_screen(
     # The anchor: pixel center nearest to the projected mean, on the screen; the center of it for z <= 0. It is where
     # the record is expanded around, which changes no value: hence no derivative. A mean nearer to the camera plane than
     # 1e-9 of its distance counts as on it.
-    zd, cd = dr.detach(g.center[2]), dr.detach(g.center)
+    zd = dr.detach(g.center[2])
+    cd = dr.detach(g.center)
     front = zd > 1e-9 * (abs(cd[0]) + abs(cd[1]))
     iz = dr.select(front, 1 / dr.select(front, zd, 1), 0)
     px = dr.select(front, fx * (cd[0] * iz) + skew * (cd[1] * iz) + cx, cx)
@@ -209,7 +214,8 @@ def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coeff
     record += [Float(inverse[r] * g.rotation[c][r]) for r in range(3) for c in range(3)]
     # The extent is a cut-off, keys order hits: both are constants of the derivative.
     record += [Float(g.strength), Float(dr.detach(g.extent * g.extent)), *g.rgb(coefficients)]
-    distance, z = dr.detach(g.distance()), dr.detach(g.center[2])
+    distance = dr.detach(g.distance())
+    z = dr.detach(g.center[2])
     alive = dr.detach(g.extent) > 0  # a mask has none
     if settings.near > 0:
         alive &= z > settings.near

@@ -18,7 +18,11 @@ __all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "load_record", "
 RECORD = 24
 AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)
 # A world record: mean (3), W by rows (9), opacity, extent^2, rgb (3); padded to the same stride.
-W_MEAN, W_ROWS, W_ALPHA, W_EXT2, W_RGB = 0, 3, 12, 13, 14
+W_MEAN = 0
+W_ROWS = 3
+W_ALPHA = 12
+W_EXT2 = 13
+W_RGB = 14
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
@@ -59,7 +63,9 @@ def packed_size(count: int) -> int:
 
 def pack(lib: Lib, columns: list[Float], count: int) -> Float:
     """Interleave per-Gaussian floats: `packed_size(len(columns))` of each of `count` Gaussians together."""
-    size, i, zero = packed_size(len(columns)), dr.arange(lib.UInt32, count), dr.zeros(lib.Float, count)
+    size = packed_size(len(columns))
+    i = dr.arange(lib.UInt32, count)
+    zero = dr.zeros(lib.Float, count)
     buffer = dr.zeros(lib.Float, count * size)
     columns = [x + zero for x in columns] + [zero] * (size - len(columns))
     for k in range(0, size, 16):

@@ -67,7 +67,11 @@ class SortedHits:
         cut: Float | None,
         room: Room,
     ) -> None:
-        self.lib, self.in_lists, self.index, self.lengths, self.room = lib, in_lists, index, lengths, room
+        self.lib = lib
+        self.in_lists = in_lists
+        self.index = index
+        self.lengths = lengths
+        self.room = room
         self.cut = cut
         self.held: SortedRows | None = None
 
@@ -87,13 +91,17 @@ class SortedHits:
 
     def _sorted(self) -> tuple[Float, UInt32, UInt32]:
         """Words of the hits, and of each pixel where its row starts and how many it has."""
-        lib, part, tiles = self.lib, self.in_lists(), len(self.lengths)
+        lib = self.lib
+        part = self.in_lists()
+        tiles = len(self.lengths)
         lists: ListStream | Any = part.stream
         assert part.slots is not None  # of a part along lists
         share = len(part.columns)
-        first, own = lists.start - part.slots.first, lists.end - lists.start
+        first = lists.start - part.slots.first
+        own = lists.end - lists.start
         starts = [first * PIXELS + column * own for column in part.columns]
-        words, lane = dr.full(lib.Float64, BEYOND, part.slots.size), dr.arange(lib.UInt32, tiles * PIXELS // share)
+        words = dr.full(lib.Float64, BEYOND, part.slots.size)
+        lane = dr.arange(lib.UInt32, tiles * PIXELS // share)
         cut = lib.Float(0) if self.cut is None else dr.gather(lib.Float, self.cut, lane // (PIXELS // share))
         dr.eval(words, starts, cut)
         found = part.run(_Finder(part, words, starts, cut))
@@ -109,7 +117,8 @@ class SortedHits:
 
     def _entries(self, words: Float, start: UInt32, count: UInt32, first: UInt32, total: int) -> UInt32:
         """(total,) what the words name, in rows without gaps."""
-        lib, entries = self.lib, dr.zeros(self.lib.UInt32, max(total, 1))
+        lib = self.lib
+        entries = dr.zeros(self.lib.UInt32, max(total, 1))
 
         def body(i: UInt32) -> tuple[UInt32]:
             dr.scatter(entries, name_of(lib, dr.gather(lib.Float64, words, start + i)), first + i)
@@ -151,7 +160,11 @@ class _Finder:
     """
 
     def __init__(self, part: Part, words: Float, starts: list[UInt32], cut: Float) -> None:
-        self.m, self.records, self.words, self.starts, self.cut = part.model, part.records, words, starts, cut
+        self.m = part.model
+        self.records = part.records
+        self.words = words
+        self.starts = starts
+        self.cut = cut
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of a ray: how many hits it has."""
@@ -160,7 +173,8 @@ class _Finder:
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """Look at one Gaussian."""
-        lib, out = self.m.lib, []
+        lib = self.m.lib
+        out = []
         record = load_record(lib, self.records, index, active)
         record[self.m.extent2] -= self.cut
         for start, ray, st, place in zip(self.starts, rays, states, places, strict=True):
@@ -199,7 +213,8 @@ def _sort_at_once(words: torch.Tensor, lengths: torch.Tensor) -> None:
 
 def _sort_by_tile(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor, threads: int) -> None:
     """NumPy sorts short rows in vector registers."""
-    flat, most = words.numpy(), counts.amax(1).tolist()
+    flat = words.numpy()
+    most = counts.amax(1).tolist()
     ends = [0, *(PIXELS * lengths).cumsum(0).tolist()]
 
     def sort(first: int) -> None:

@@ -39,7 +39,8 @@ def _columns(call: Call, tangents: dict) -> tuple[list[dict], bool]:
     if "quats" in shapes:
         shapes["rotations"] = (shapes["quats"][0], 3)
     shapes["camera"] = (6,)
-    lengths, given = set(), {}
+    lengths = set()
+    given = {}
     for name, x in tangents.items():
         if name not in shapes:
             raise ValueError(f"render_jvp: tangents must be named among {', '.join(shapes)}, got {name!r}")
@@ -119,7 +120,8 @@ def _shaped(call: Call, primal: dict, image: dict) -> dict:
     if "depth" in made:
         # d(D / max(alpha, eps)) by the quotient rule; the denominator is constant where it is clamped.
         alpha = primal["alpha"].torch().to(torch.float64)
-        free, alpha = alpha > EPS_ALPHA, alpha.clamp_min(EPS_ALPHA)
+        free = alpha > EPS_ALPHA
+        alpha = alpha.clamp_min(EPS_ALPHA)
         depth = primal["depth"].torch().to(torch.float64) / alpha
         change = (made["depth"] - depth * made["alpha"] * free) / alpha
         out["depth"] = change.to(torch.float32).reshape(call.shape)

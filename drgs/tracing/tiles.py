@@ -62,18 +62,25 @@ class TileTraversal:
         height: int,
         trimmed: bool,
     ) -> None:
-        self.lib, self.settings, self.projected = lib, settings, projected
+        self.lib = lib
+        self.settings = settings
+        self.projected = projected
         # Its bound is of tails of at most alpha exp(-rho^2 / 2), and a ray that ends behind so many hits counts them.
         bounded = settings.extent is None and settings.max_hits is None and RESPONSES[settings.response].at_most_alpha
         self.trimmed = trimmed and settings.order == "ray" and bounded
-        self.width, self.height, self.rays = width, height, width * height
+        self.width = width
+        self.height = height
+        self.rays = width * height
         self.certificate: dict = {}
         self.pinhole = [lib.Float(v) for v in pinhole]
         dr.make_opaque(*self.pinhole)
 
     def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
         """Build the lists."""
-        self.model, self.records, self.carried, self.basis = model, records, carried, basis
+        self.model = model
+        self.records = records
+        self.carried = carried
+        self.basis = basis
         size = self.width, self.height
         self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed)
         self.certificate["pairs"] = self.lists.pairs
@@ -85,12 +92,14 @@ class TileTraversal:
         """All pixels as one part; in `ray` order as `weighed`, for tables of two numbers."""
         if self.settings.order == "ray":
             return [part for part, _ in self._bands(share, TABLES // 2)]
-        count, per_tile = self.lists.columns * self.lists.rows, TILE * TILE // share
+        count = self.lists.columns * self.lists.rows
+        per_tile = TILE * TILE // share
         return [self._part(share, dr.arange(self.lib.UInt32, count * per_tile) // per_tile)]
 
     def weighed(self, share: int, size: int) -> list[Part]:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
-        index, made = signed(self.lists.index), []
+        index = signed(self.lists.index)
+        made = []
         size = min(size, TABLES // 2) if self.settings.order == "ray" else size
         for part, (begin, end, first, lengths) in self._bands(share, size):
             pixels = self._pixels(torch.arange(begin, end, device=lengths.device))
@@ -102,7 +111,10 @@ class TileTraversal:
         """Parts of consecutive tiles whose entries, a float in each pixel, take `size` bytes, or a tile's more; and of
         each its first tile, that behind it, its first entry and the (tiles,) lengths of its lists.
         """
-        lib, pixels, begin, first = self.lib, PIXELS, 0, 0
+        lib = self.lib
+        pixels = PIXELS
+        begin = 0
+        first = 0
         per_tile = pixels // share
         lengths = signed(self.lists.end - self.lists.start).long()
         ends = lengths.cumsum(0)
@@ -129,10 +141,12 @@ class TileTraversal:
 
     def _in_lists(self, begin: int, end: int, slots: Slots, share: int) -> Part:
         """The pixels of tiles in the order of the tiles' lists."""
-        lib, per_tile = self.lib, PIXELS // share
+        lib = self.lib
+        per_tile = PIXELS // share
         lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
         part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin))
-        part.slots, part.columns = slots, [lane % per_tile + 16 * k for k in range(share)]
+        part.slots = slots
+        part.columns = [lane % per_tile + 16 * k for k in range(share)]
         return part
 
     def _pixels(self, tiles: torch.Tensor) -> torch.Tensor:
@@ -147,7 +161,8 @@ class TileTraversal:
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
         inner = dr.arange(lib.UInt32, dr.width(tile)) % per_tile
-        block, k = inner // 16, inner % 16
+        block = inner // 16
+        k = inner % 16
         # 16 consecutive lanes, a packet, are 4x4 pixels.
         x = (tile % lists.columns) * TILE + (block % 2) * 4 + k % 4
         y = (tile // lists.columns) * TILE + (block // 2) * 4 + k // 4
@@ -224,13 +239,15 @@ def build(
     # Bounds that are NaN (parameters beyond float64) list the Gaussian nowhere.
     seen = projected.alive & (ix1 >= 0) & (ix0 < width) & (iy1 >= 0) & (iy0 < height) & (x0 <= x1) & (y0 <= y1)
     tx0, ty0 = dr.maximum(ix0, 0) // TILE, dr.maximum(iy0, 0) // TILE
-    tx1, ty1 = dr.minimum(ix1, width - 1) // TILE, dr.minimum(iy1, height - 1) // TILE
+    tx1 = dr.minimum(ix1, width - 1) // TILE
+    ty1 = dr.minimum(iy1, height - 1) // TILE
     seen &= (ix0 <= ix1) & (iy0 <= iy1)
     amount = dr.select(seen, lib.UInt32((tx1 - tx0 + 1) * (ty1 - ty0 + 1)), 0)
     count = dr.width(projected.key)
     gaussian = dr.arange(lib.UInt32, count)
     dr.eval(amount, tx0, tx1, ty0, ty1, projected.key)
-    order, exact = gaussian, settings.order == "ray"
+    order = gaussian
+    exact = settings.order == "ray"
     if not exact:
         # Emitting in depth order leaves 32 bits for the rank, so ties fall by index and nothing is quantized.
         order = depth_order(lib, projected.key, gaussian)
@@ -243,7 +260,8 @@ def build(
     pairs = int(total64)
     what = f"{pairs} entries of tile lists ({count} Gaussians, {width}x{height} pixels)"
     memory.require("render", memory.PAIR * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
-    start, end = dr.zeros(lib.UInt32, columns * rows), dr.zeros(lib.UInt32, columns * rows)
+    start = dr.zeros(lib.UInt32, columns * rows)
+    end = dr.zeros(lib.UInt32, columns * rows)
     nothing = Lists(dr.zeros(lib.UInt32, 1), start, end, columns, rows, 0)
     if pairs == 0:
         return nothing
@@ -263,7 +281,8 @@ def build(
             return nothing
         keys = dr.gather(lib.UInt64, keys, kept)
     keys = ascending(lib, keys)
-    tile, index = lib.UInt32(keys >> 32), dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
+    tile = lib.UInt32(keys >> 32)
+    index = dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
     dr.eval(tile, index)
     _ranges(lib, tile, start, end)
     lists = Lists(index, start, end, columns, rows, pairs)
@@ -286,10 +305,12 @@ def _shorter(lib: Lib, lists: Lists, tile: UInt32, settings: RenderSettings, rec
     tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile))
     dx, dy = tiles.center(lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns))
     kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & tiles.may_hit(dx, dy))
-    start, end = dr.zeros(lib.UInt32, dr.width(listed)), dr.zeros(lib.UInt32, dr.width(listed))
+    start = dr.zeros(lib.UInt32, dr.width(listed))
+    end = dr.zeros(lib.UInt32, dr.width(listed))
     if dr.width(kept) == 0:
         return Lists(lists.index, start, end, lists.columns, lists.rows, 0, cut)
-    index, tile = dr.gather(lib.UInt32, lists.index, kept), dr.gather(lib.UInt32, tile, kept)
+    index = dr.gather(lib.UInt32, lists.index, kept)
+    tile = dr.gather(lib.UInt32, tile, kept)
     dr.eval(index, tile, cut)
     _ranges(lib, tile, start, end)
     return Lists(index, start, end, lists.columns, lists.rows, dr.width(kept), cut)
@@ -325,7 +346,9 @@ class _Tiles:
     """
 
     def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], cut: Float | int = 0) -> None:
-        self.lib, self.r, self.response = lib, loaded, RESPONSES[settings.response]
+        self.lib = lib
+        self.r = loaded
+        self.response = RESPONSES[settings.response]
         self.limit = loaded[layout.EXT2] - cut
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))

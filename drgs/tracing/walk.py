@@ -48,7 +48,10 @@ class ListStream:
     """
 
     def __init__(self, lib: Lib, index: UInt32, start: UInt32, end: UInt32) -> None:
-        self.lib, self.index, self.start, self.end = lib, index, start, end
+        self.lib = lib
+        self.index = index
+        self.start = start
+        self.end = end
 
     def opened(self) -> ListStream:
         """Itself."""
@@ -111,9 +114,15 @@ class Part:
         ordered: bool,
         center_key: Float | None = None,
     ) -> None:
-        self.lib, self.model, self.records = lib, model, records
-        self.rays, self.flat, self.inside = rays, flat, inside
-        self.stream, self.ordered, self.center_key = stream, ordered, center_key
+        self.lib = lib
+        self.model = model
+        self.records = records
+        self.rays = rays
+        self.flat = flat
+        self.inside = inside
+        self.stream = stream
+        self.ordered = ordered
+        self.center_key = center_key
         self.failed = None
         self.weights: Weights | None = None
         self.columns: list[UInt32] = []
@@ -142,11 +151,13 @@ class Part:
         pick = lambda x: None if x is None else dr.gather(type(x), x, lanes)  # noqa: E731
         rays = [Ray(pick(r.x), pick(r.y), pick(r.length), [pick(v) for v in r.carried], r.basis) for r in self.rays]
         divided: DividedStream | Any = self.stream
-        flat, stream = [pick(f) for f in self.flat], divided.of(lanes)
+        flat = [pick(f) for f in self.flat]
+        stream = divided.of(lanes)
         dr.eval(rays, flat)
         inside = [self.lib.Bool(True)]
         part = Part(self.lib, self.model, self.records, rays, flat, inside, stream, True, self.center_key)
-        part.first, part.buffer = False, _DEEP
+        part.first = False
+        part.buffer = _DEEP
         return [part] if count >= _MANY and self.buffer < _DEEP else part._listed(count)
 
     def _listed(self, count: int) -> list[Part]:
@@ -171,7 +182,8 @@ class Part:
 
     def _sorted_hits(self, start: UInt32, total: int, bits: int) -> UInt32:
         """The hits of each ray, from its `start` on, by (key, Gaussian); indices of Gaussians have so many bits."""
-        lib, count = self.lib, dr.width(start)
+        lib = self.lib
+        count = dr.width(start)
         words = dr.zeros(lib.UInt64, max(total, 1))
         own = lib.UInt64(dr.arange(lib.UInt32, count)) << (32 + bits)
 
@@ -187,7 +199,9 @@ class Part:
 
     def _each_hit(self, lanes: int, visit: Callable) -> UInt32:
         """Number of hits of every lane; `visit(number so far, Gaussian, key, is hit)` sees each candidate."""
-        lib, ray, stream = self.lib, self.rays[0], self.stream.opened()
+        lib = self.lib
+        ray = self.rays[0]
+        stream = self.stream.opened()
 
         def body(s: Any, k: UInt32) -> tuple:
             candidate, valid, _, _, s = stream.next(s, lib.Bool(True))
@@ -206,7 +220,8 @@ class Part:
 
     def _in_order(self, kernel: Kernel) -> list[dict]:
         """Composite the candidates as they come."""
-        lib, stream = self.lib, self.stream.opened()
+        lib = self.lib
+        stream = self.stream.opened()
         states = [kernel.init(k, inside, lib.UInt32(NOWHERE)) for k, inside in enumerate(self.inside)]
         start = stream.begin()
 
@@ -234,7 +249,9 @@ class Part:
 
     def _sorted(self, kernel: Kernel, check: bool) -> list[dict]:
         """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
-        lib, stream, size = self.lib, self.stream.opened(), self.buffer
+        lib = self.lib
+        stream = self.stream.opened()
+        size = self.buffer
         U, word = lib.UInt32, lib.Float64
         state = kernel.init(0, self.inside[0], word(EMPTY))
         start = stream.begin()
@@ -261,7 +278,8 @@ class Part:
             buffer, last, state = dr.if_stmt(
                 (enter, buffer, last, state), enter != EMPTY, exchange, lambda _, *unchanged: unchanged
             )
-            alive, there = state["alive"] != 0, stream.more(s)
+            alive = state["alive"] != 0
+            there = stream.more(s)
             going = alive & (there | (buffer[0] < BEYOND))
             if check:
                 going |= there & (word_of(lib, bound, U(0)) <= last)

@@ -74,7 +74,10 @@ class Weights:
     """
 
     def __init__(self, lib: Lib, index: torch.Tensor, lengths: torch.Tensor, pixels: torch.Tensor) -> None:
-        self.lib, self.lengths, self.pixels, self.inside = lib, lengths, pixels.clamp_min(0), pixels >= 0
+        self.lib = lib
+        self.lengths = lengths
+        self.pixels = pixels.clamp_min(0)
+        self.inside = pixels >= 0
         self.index = torch.cat([index, index.new_zeros(1)])  # of the row that is 0, too
         self.rows = len(index)
         self.kept: Float | None = None
@@ -87,7 +90,8 @@ class Weights:
 
     def image(self, buffer: Float, features: torch.Tensor, out: torch.Tensor) -> None:
         """Add W^T f to the pixels of `out` (pixels, D); `features` is (N, D)."""
-        flat, width = _matrix(buffer), features.shape[1]
+        flat = _matrix(buffer)
+        width = features.shape[1]
         for group in self._grouped(width):
             tiles = len(group.rows)
             total = features.new_zeros(tiles, PIXELS, width)
@@ -110,7 +114,8 @@ class Weights:
 
     def gradient(self, buffer: Float, cotangent: torch.Tensor, out: torch.Tensor) -> None:
         """Add W dL/dF to the rows of `out` (N, D); `cotangent` dL/dF is (pixels, D)."""
-        flat, width = _matrix(buffer), cotangent.shape[1]
+        flat = _matrix(buffer)
+        width = cotangent.shape[1]
         for group in self._grouped(width):
             g = _gathered(cotangent, group)
             for rows, index in group.slices(width):
@@ -164,20 +169,25 @@ class Weights:
         starts, ends = self._bounds()
         counts, tiles = torch.sort(ends - starts, descending=True, stable=True)
         touched = torch.cat([self._touched, self._touched.new_full((1,), self.rows)])
-        ascending, filled, k = counts.flip(0), int((counts > 0).sum()), 0
-        self._groups, self._width = [], width
+        ascending = counts.flip(0)
+        filled = int((counts > 0).sum())
+        k = 0
+        self._groups = []
+        self._width = width
         while k < filled:
             most = int(counts[k])
             fewest = max(most - max(most // _SLACK, _SLACK), 1)
             similar = len(tiles) - int(torch.searchsorted(ascending, fewest)) - k
             count = max(min(similar, _WORK // (4 * width * max(most, PIXELS))), 1)  # rows of features, or of pixels
-            own, j = tiles[k : k + count], torch.arange(most, device=tiles.device)
+            own = tiles[k : k + count]
+            j = torch.arange(most, device=tiles.device)
             at = torch.where(j < counts[k : k + count, None], starts[own, None] + j, -1)  # -1: the row that is 0
             inside = self.inside[own].view(-1)
             if count == 1:
                 # A single product is split between threads, and rounds by their number; one of two is not. The other
                 # one is of nothing.
-                own, at = own.expand(2), torch.cat([at, torch.full_like(at, -1)])
+                own = own.expand(2)
+                at = torch.cat([at, torch.full_like(at, -1)])
                 inside = torch.cat([inside, torch.zeros_like(inside)])
             rows = touched[at]
             index = self.index[rows].long()  # what int32 would take to add is twice the time

@@ -78,7 +78,8 @@ class Gate:
         """
         if (odd := _odd(path, headers)) is not None:
             return http.HTTPStatus.BAD_REQUEST, odd
-        host, origins = headers["Host"].lower(), headers.get_all("Origin")
+        host = headers["Host"].lower()
+        origins = headers.get_all("Origin")
         named = _HOST.fullmatch(host)
         if named is None:
             return http.HTTPStatus.BAD_REQUEST, "the request must name one host"

@@ -151,7 +151,8 @@ def _tint_of(painter: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], n
         assert g.features is not None  # else there is no such painter
         rows = []
         for features in g.features.detach().split(_ROW):
-            rgb, alpha = torch.zeros(1, len(features), 3), torch.ones(1, len(features))
+            rgb = torch.zeros(1, len(features), 3)
+            alpha = torch.ones(1, len(features))
             rows.append(painter(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])
         return np.concatenate(rows) if rows else np.zeros((0, 3), np.uint8)
 

@@ -115,7 +115,8 @@ def stations_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranking |
         fitted: Names of those that were fitted to.
         ranking: Scores of some of them.
     """
-    known, scores = set(fitted), {} if ranking is None else ranking.scores
+    known = set(fitted)
+    scores = {} if ranking is None else ranking.scores
     picks = {} if ranking is None else {name: k for k, name in enumerate(ranking.picked, 1)}
     found: dict[tuple, list[tuple[Kind, Sight]]] = {}
 
@@ -124,7 +125,8 @@ def stations_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranking |
         found.setdefault((camera.K.tobytes(), np.asarray(camera.w2c).tobytes()), []).append((kind, sight))
 
     for view in views:
-        score, name = scores.get(view.name), view.name
+        score = scores.get(view.name)
+        name = view.name
         kind: Kind = "training" if name in known else "candidate" if score else "held out"
         camera = dataclasses.replace(view.camera.undistorted(), name=name)
         add(kind, Sight(camera, _reader(view) if view.has_image else None, score, picks.get(name)))
@@ -148,11 +150,14 @@ def read_ranking(path: Path) -> Ranking:
         FileNotFoundError: If there is no such file.
         ValueError: If it is damaged, or of something else.
     """
-    found, where = read_json(path, "a selection", _ADVICE), str(path)
+    found = read_json(path, "a selection", _ADVICE)
+    where = str(path)
     check_json(where, found, {"picks": [{"name": str}]}, _ADVICE)
     if found.get("command") == "select":
         check_json(where, found, {"policy": str, "criterion": (None, str), "candidates": [_SCORED]}, _ADVICE)
-        rows, criterion, policy = found["candidates"], found["criterion"], found["policy"]
+        rows = found["candidates"]
+        criterion = found["criterion"]
+        policy = found["policy"]
     else:
         check_json(
             where, found, {"picks": [{"policy": str, "criterion": (None, str), "candidates": [_SCORED]}]}, _ADVICE

@@ -51,7 +51,9 @@ class Pose:
             return None
         if given.shape != (10,) or not np.isfinite(given).all() or np.abs(given).max() > _FARTHEST:
             return None
-        quaternion, place, (angle, across, down) = given[:4], given[4:7], given[7:]
+        quaternion = given[:4]
+        place = given[4:7]
+        (angle, across, down) = given[7:]
         length = float(np.linalg.norm(quaternion))
         if (
             length < 1 / _FARTHEST

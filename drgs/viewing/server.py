@@ -22,8 +22,12 @@ __all__ = ["Viewer"]
 
 _log = logging.getLogger(__name__)
 
-_NEAR, _FAR = 1e-3, 1e3  # of the distance to what is looked at: where the client's pictures begin and end
-_LEARNING, _LEFT = "uncertainty", "what browsers have left"  # jobs that can wait
+# of the distance to what is looked at: where the client's pictures begin and end
+_NEAR = 1e-3
+_FAR = 1e3
+# jobs that can wait
+_LEARNING = "uncertainty"
+_LEFT = "what browsers have left"
 
 
 class Viewer:
@@ -56,7 +60,9 @@ class Viewer:
             self.port = listening.getsockname()[1]
             self.gate = Gate.of(host, self.port, token)
             self.address = self.gate.address(host, self.port)
-            self.subject, self._preset, self._pixels = subject, preset, pixels
+            self.subject = subject
+            self._preset = preset
+            self._pixels = pixels
             self.sessions: dict[int, Session] = {}
             self._learnt: Subject | None = None  # the last one whose uncertainty is known
             with guarded(self.gate, listening), contextlib.redirect_stdout(io.StringIO()):  # it says where it listens
@@ -92,15 +98,19 @@ class Viewer:
     def _place(self) -> None:
         """Where browsers begin, and what the page looks like."""
         subject, server = self.subject, self._server
-        first, bright = subject.first, sum(subject.background) > 1.5
+        first = subject.first
+        bright = sum(subject.background) > 1.5
         server.gui.configure_theme(dark_mode=not bright, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("drgs view")
         server.scene.set_up_direction(first.up)
         camera = server.initial_camera
-        camera.position, camera.look_at, camera.up = first.pose.position, first.target, first.up
+        camera.position = first.pose.position
+        camera.look_at = first.target
+        camera.up = first.up
         camera.fov = first.pose.fov
         distance = first.distance or 1.0
-        camera.near, camera.far = _NEAR * distance, _FAR * distance
+        camera.near = _NEAR * distance
+        camera.far = _FAR * distance
 
     async def _connected(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(

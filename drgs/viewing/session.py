@@ -72,12 +72,18 @@ class Session:
         wants: Callable[[], None],
         learnt: Callable[[], Subject | None],
     ) -> None:
-        self.client, self.subject, self._worker, self._pixels = client, subject, worker, pixels
-        self._wants, self._learnt = wants, learnt
+        self.client = client
+        self.subject = subject
+        self._worker = worker
+        self._pixels = pixels
+        self._wants = wants
+        self._learnt = learnt
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
         self._wanted = 0
-        self._is_closed, self.drawn = False, 0  # pictures that were drawn to the end
+        # pictures that were drawn to the end
+        self._is_closed = False
+        self.drawn = 0
         self._is_over = False  # our picture lies there, and the Gaussians are hidden
         self.scale: ColorScale | None = None  # of the picture that lies there
         self._gaussians: Any = None
@@ -113,7 +119,9 @@ class Session:
 
     def _build(self, preset: str) -> None:
         """What stands in the panel."""
-        gui, subject, is_narrow = self.client.gui, self.subject, self.size[0] <= _NARROW
+        gui = self.client.gui
+        subject = self.subject
+        is_narrow = self.size[0] <= _NARROW
         self._header = gui.add_html(panel.header(subject))
         names = [layer.name for layer in subject.layers]
         presets = list(dict.fromkeys([preset, *_PRESETS]))
@@ -157,7 +165,8 @@ class Session:
 
     def show(self, subject: Subject) -> None:
         """Look at another subject, from where the camera is."""
-        before, self.subject = self.subject, subject
+        before = self.subject
+        self.subject = subject
         self._header.content = panel.header(subject)
         names = tuple(layer.name for layer in subject.layers)
         if names != tuple(self._layer.options):
@@ -212,7 +221,8 @@ class Session:
         pose, size = seen
         if pose.is_near(self.pose) and size == self.size:
             return
-        self.pose, self.size = pose, size
+        self.pose = pose
+        self.size = size
         self._widen()
         self._show_frusta()
         self._hide()
@@ -239,7 +249,8 @@ class Session:
     def _stop_playing(self) -> None:
         if self._playing is not None:
             self._playing.cancel()
-            self._playing, self._button.label = None, "play"
+            self._playing = None
+            self._button.label = "play"
 
     async def _play(self) -> None:
         """Goes through all times, again and again, as fast as the Gaussians of each can be sent."""
@@ -267,7 +278,8 @@ class Session:
         """A frustum for each place, in the color of its score."""
         for frustum in self._frusta:
             frustum.remove()
-        subject, self._frusta = self.subject, []
+        subject = self.subject
+        self._frusta = []
         colors, _ = score_colors(subject.stations)
         self._cameras.visible = bool(subject.stations)
         self._legend.content = panel.legend(subject.stations, subject.ranking.title if subject.ranking else "")
@@ -314,7 +326,8 @@ class Session:
 
     def visit(self, station: Station) -> None:
         """Fly to a place, and show what is known of it, with its photograph."""
-        sight, camera = station.at(self.time), self.client.camera
+        sight = station.at(self.time)
+        camera = self.client.camera
         pose = pose_of(sight.camera, self.subject.origin)
         with self.client.atomic():
             camera.position = pose.position
@@ -386,7 +399,8 @@ class Session:
         with self._lock:
             self._wanted += 1
             if self._is_over:
-                self._is_over, self.scale = False, None
+                self._is_over = False
+                self.scale = None
                 with self.client.atomic():
                     self._clear()
                     if self._gaussians is not None:
@@ -422,10 +436,14 @@ class Session:
 
     def _picture(self, wanted: int, subject: Subject, whole: Camera, layer: Layer, preset: str) -> Iterator[None]:
         """Job: pictures of what the camera sees, each larger than the one before."""
-        began, settings, rate = time.perf_counter(), subject.settings(preset), 0.0
+        began = time.perf_counter()
+        settings = subject.settings(preset)
+        rate = 0.0
         of = f" of {subject.state}" if subject is not self.subject and subject.state else ""
         for camera in stages(whole, min(self._pixels, layer.pixels or self._pixels)):
-            text, pixels, since = f"{layer.name}{of}, {preset}: ", camera.width * camera.height, time.perf_counter()
+            text = f"{layer.name}{of}, {preset}: "
+            pixels = camera.width * camera.height
+            since = time.perf_counter()
             drawing = yield from self._told(
                 layer.draw(subject.scene, camera, settings),
                 f"{text}drawing {camera.width}x{camera.height}",
@@ -435,7 +453,8 @@ class Session:
             with self._lock:
                 if wanted != self._wanted:
                     return
-                self._is_over, self.scale = True, drawing.scale
+                self._is_over = True
+                self.scale = drawing.scale
                 with self.client.atomic():
                     self.client.scene.set_background_image(drawing.picture, format="png")
                     if self._gaussians is not None:

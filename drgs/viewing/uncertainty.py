@@ -32,7 +32,10 @@ class Uncertainty:
         mapped: Callable[[Camera, Information], np.ndarray],
         prior: Prior,
     ) -> None:
-        self.cameras, self._said, self._mapped, self._prior = tuple(cameras), said, mapped, prior
+        self.cameras = tuple(cameras)
+        self._said = said
+        self._mapped = mapped
+        self._prior = prior
         self.done = 0
         self._sum: Information = {}
         self._weights: Information | None = None

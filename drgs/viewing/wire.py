@@ -80,7 +80,8 @@ class _Answering(ServerConnection):
 
     def send_data(self) -> None:
         """What the protocol has to send, behind our answer where it has given up reading a request."""
-        error, self._given = self.protocol.handshake_exc, getattr(self, "_given", False)
+        error = self.protocol.handshake_exc
+        self._given = getattr(self, "_given", False)
         if error is not None and self.protocol.state.name == "CONNECTING" and self.request is None and not self._given:
             self._given = True
             if "unsupported HTTP method" in str(error.__cause__):
@@ -136,7 +137,9 @@ def _without_traceback(record: logging.LogRecord) -> bool:
     """What a client has sent is worth a line at most, without a traceback, whatever it was; a handshake none."""
     if record.exc_info and record.exc_info[1] is not None:
         record.msg = f"view: {record.getMessage()}: {in_a_line(record.exc_info[1])}"
-        record.args, record.exc_info, record.exc_text = (), None, None
+        record.args = ()
+        record.exc_info = None
+        record.exc_text = None
         return "opening handshake failed" not in record.msg
     return True
 

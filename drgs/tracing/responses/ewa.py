@@ -39,7 +39,9 @@ class Ewa(AlphaStrength):
     def project(self, g: Activated, screen: Screen) -> tuple[list[Float], list[Float], Mask, None]:
         """The triangular factor of Sigma'^-1 and where it is centered, the depth, and what each culling leaves."""
         fx, skew, cx, fy, cy = screen.pinhole
-        Float64, s, c = type(fx), g.settings, g.center
+        Float64 = type(fx)
+        s = g.settings
+        c = g.center
         # Means at or behind the camera plane are culled, by a mask, which has no derivative; a positive depth keeps
         # their (unused) numbers finite.
         alive = dr.detach(c[2]) > 0
@@ -94,7 +96,8 @@ class Ewa(AlphaStrength):
         slopes = []
         for j in range(9):
             r11, r12, r13, r22, r23 = extra[5 * j : 5 * j + 5]
-            d1, d2 = dr.fma(r11, dx, dr.fma(r12, dy, r13)), dr.fma(r22, dy, r23)
+            d1 = dr.fma(r11, dx, dr.fma(r12, dy, r13))
+            d2 = dr.fma(r22, dy, r23)
             slopes.append(-a * dr.fma(c1, d1, c2 * d2))
         return [*slopes, a]
 
@@ -120,10 +123,15 @@ def _clamped(tx: Float, ty: Float, screen: Screen, fov_clamp: str) -> tuple[Floa
     fx, _, cx, fy, cy = screen.pinhole
     half_x, half_y = screen.width / (2 * fx), screen.height / (2 * fy)
     if fov_clamp == "inria":
-        high_x, low_x, high_y, low_y = 1.3 * half_x, 1.3 * half_x, 1.3 * half_y, 1.3 * half_y
+        high_x = 1.3 * half_x
+        low_x = 1.3 * half_x
+        high_y = 1.3 * half_y
+        low_y = 1.3 * half_y
     else:
-        high_x, low_x = (screen.width - cx) / fx + 0.3 * half_x, cx / fx + 0.3 * half_x
-        high_y, low_y = (screen.height - cy) / fy + 0.3 * half_y, cy / fy + 0.3 * half_y
+        high_x = (screen.width - cx) / fx + 0.3 * half_x
+        low_x = cx / fx + 0.3 * half_x
+        high_y = (screen.height - cy) / fy + 0.3 * half_y
+        low_y = cy / fy + 0.3 * half_y
     return dr.clip(tx, -low_x, high_x), dr.clip(ty, -low_y, high_y)
 
 

@@ -70,8 +70,11 @@ class Integral(Peak):
         strength = r[layout.W_ALPHA if world else layout.ALPHA]
         passed = 0.5 + 0.5 * dr.erf(u * _ROOT_HALF)
         left = strength * gauss * dr.exp(-strength * gauss * passed)
-        along, across = left * passed, left * dr.exp(-0.5 * u * u) * _BELL
-        local, ne, le = times(extra, 1, p), times(extra, 0, e), times(extra, 1, e)
+        along = left * passed
+        across = left * dr.exp(-0.5 * u * u) * _BELL
+        local = times(extra, 1, p)
+        ne = times(extra, 0, e)
+        le = times(extra, 1, e)
         pairs = [((i + 1) % 3, (i + 2) % 3) for i in range(3)]
         products = [local[j] * le[k] + local[k] * le[j] - u * le[j] * le[k] for j, k in pairs]
         scales = [2 * x * y - u * y * y for x, y in zip(local, le, strict=True)]

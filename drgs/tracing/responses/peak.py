@@ -209,14 +209,16 @@ def deviation(r: list[Float], dx: Float, dy: Float, half: float) -> Float:
         rounding = 1e-6 * (abs(parts[0]) + abs(parts[1]) + abs(c))  # a few units in the last place of each part
         return dr.maximum(abs(parts[0] + parts[1] + parts[2]) - half * (abs(a) + abs(b)) - rounding, 0)
 
-    m1, m2 = least(r[L.R11], r[L.R12], r[L.R13]), least(r[L.R21], r[L.R22], r[L.R23])
+    m1 = least(r[L.R11], r[L.R12], r[L.R13])
+    m2 = least(r[L.R21], r[L.R22], r[L.R23])
     return dr.fma(m1, m1, m2 * m2)
 
 
 def approach(extra: list[Float], p: list[Float]) -> list[Float]:
     """d(-rho^2 / 2) by mean, rotation and log-scale: (p / s) R^T, R (S p x S^-1 p), p_k^2."""
     n, local = times(extra, 0, p), times(extra, 1, p)
-    squares, products = [x * x for x in local], [local[1] * local[2], local[2] * local[0], local[0] * local[1]]
+    squares = [x * x for x in local]
+    products = [local[1] * local[2], local[2] * local[0], local[0] * local[1]]
     return [*n, *times(extra, 2, products), *squares]
 
 
@@ -251,7 +253,8 @@ def _local(r: list[Float], ray: Ray) -> tuple[Float, list[Float], list[Float], F
     is rounded is as small as the Gaussian's distance from the ray.
     """
     L = layout
-    o, d = ray.carried[-6:-3], ray.carried[-3:]
+    o = ray.carried[-6:-3]
+    d = ray.carried[-3:]
     to = [r[L.W_MEAN + k] - o[k] for k in range(3)]
     t0 = dr.detach(dot(to, d))  # no value depends on it but for rounding, hence no derivative
     w = [dr.fma(t0, d[k], -to[k]) for k in range(3)]
@@ -274,7 +277,8 @@ def _frame(n: list[Float]) -> tuple[list[Float], list[Float]]:
     z = dr.select(usable, z, 1)
     # The axis that n is least along gives u its direction: a choice, again.
     ax, ay, az = (abs(dr.detach(v)) for v in (x, y, z))
-    first, second = (ax <= ay) & (ax <= az), ay <= az
+    first = (ax <= ay) & (ax <= az)
+    second = ay <= az
     e = [dr.select(first, 1.0, 0.0), dr.select(~first & second, 1.0, 0.0), dr.select(~first & ~second, 1.0, 0.0)]
     n = [x, y, z]
     u = _less(e, n, dot(e, n))
@@ -304,7 +308,8 @@ def _silhouette(g: Activated, screen: Screen) -> tuple[list[Float], Mask]:
     tangent to it where n^T (extent^2 Sigma - c c^T) n = 0. Bounds only say where to look, hence no derivative.
     """
     fx, skew, cx, fy, cy = screen.pinhole
-    f, extent = g.from_local, g.listed_extent()
+    f = g.from_local
+    extent = g.listed_extent()
     c = dr.detach(g.center)  # for bounds, as sigma
     e2 = extent * extent
 
