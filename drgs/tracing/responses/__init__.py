@@ -6,16 +6,13 @@ float64 oracle (reference.py), written independently of this.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from drgs.tracing.protocols import Float, Lib, Mask
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated, Projected, Ray, Screen
 from drgs.tracing.responses.ewa import Ewa
 from drgs.tracing.responses.integral import Integral
 from drgs.tracing.responses.peak import Peak
-
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.projection import Activated, Projected, Screen
 
 __all__ = ["RESPONSES", "Response"]
 

@@ -7,18 +7,15 @@ its triangular factor. Of `tiles` and `order="center"` only: the model is one of
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 
 from drgs.tracing import records as layout
-from drgs.tracing.protocols import Float, Lib, Mask
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
 from drgs.tracing.responses.peak import AlphaStrength, deviation
-
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.projection import Activated, Projected, Screen
 
 __all__ = ["Ewa"]
 

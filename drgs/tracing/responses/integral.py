@@ -11,17 +11,14 @@ notation are those of peak.py. With e = d' / |d'|,
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from drgs.tracing import records as layout
-from drgs.tracing.protocols import Float
+from drgs.tracing.arrays import Float
+from drgs.tracing.primitives import Ray
 from drgs.tracing.records import dot
 from drgs.tracing.responses.peak import Peak, approach, times
-
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
 
 __all__ = ["Integral"]
 

@@ -24,17 +24,12 @@ cross product in float32, the rotation of a sphere, which changes nothing, would
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 
 from drgs.tracing import records as layout
-from drgs.tracing.protocols import Float, Lib, Mask
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
-
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.projection import Activated, Projected, Screen
 
 __all__ = ["AlphaStrength", "Peak", "approach", "deviation", "entry", "times"]
 
