@@ -22,7 +22,7 @@ from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.harmonics import sh_color
 from drgs.tracing.primitives import Ray
 from drgs.tracing.records import RECORD, load_record
-from drgs.tracing.responses import RESPONSES
+from drgs.tracing.responses import response_of
 
 __all__ = ["Channels", "Emit", "HitModel", "Primal"]
 
@@ -41,7 +41,7 @@ class HitModel:
         self.lib = lib
         self.s = settings
         self.world = world
-        self.response = RESPONSES[settings.response]
+        self.response = response_of(settings)
         # Opaque: another value is no other kernel.
         self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
         self.alpha_max = dr.opaque(lib.Float, settings.alpha_max)

@@ -14,7 +14,7 @@ from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib
 from drgs.tracing.primitives import Activated, Projected, Screen
 from drgs.tracing.records import ALPHA
-from drgs.tracing.responses import RESPONSES, Response
+from drgs.tracing.responses import Response, response_of
 
 __all__ = ["project_screen", "project_world"]
 
@@ -43,7 +43,7 @@ def project_screen(
         Records, depth keys and bounds of all N Gaussians.
     """
     Float = lib.Float
-    response = RESPONSES[settings.response]
+    response = response_of(settings)
     g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
     fx, skew, cx, fy, cy = pinhole
     # The anchor: pixel center nearest to the projected mean, on the screen; the center of it for z <= 0. It is where
@@ -75,7 +75,7 @@ def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coeff
     Arguments are those of `project_screen`; `bounds` of what is returned is None.
     """
     Float = lib.Float
-    response = RESPONSES[settings.response]
+    response = response_of(settings)
     g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
     inverse = [dr.rcp(s) for s in g.scale]
     record = [Float(x) for x in g.mean]

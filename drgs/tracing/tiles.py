@@ -24,7 +24,7 @@ from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.records import load_record
-from drgs.tracing.responses import RESPONSES
+from drgs.tracing.responses import response_of
 from drgs.tracing.rows import Room, SortedHits
 from drgs.tracing.sort_keys import ascending
 from drgs.tracing.walk import ListStream, Part, Slots
@@ -67,7 +67,7 @@ class TileTraversal:
         self.settings = settings
         self.projected = projected
         # Its bound is of tails of at most alpha exp(-rho^2 / 2), and a ray that ends behind so many hits counts them.
-        bounded = settings.extent is None and settings.max_hits is None and RESPONSES[settings.response].at_most_alpha
+        bounded = settings.extent is None and settings.max_hits is None and response_of(settings).at_most_alpha
         self.trimmed = trimmed and settings.order == "ray" and bounded
         self.width = width
         self.height = height
@@ -394,7 +394,7 @@ class _Tiles:
     def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], cut: Float | int = 0) -> None:
         self.lib = lib
         self.r = loaded
-        self.response = RESPONSES[settings.response]
+        self.response = response_of(settings)
         self.limit = loaded[layout.EXT2] - cut
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
