@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Iterable
 from typing import Any, Literal
 
 from drgs.guards.arguments import check_fields, must_be
@@ -174,7 +175,8 @@ class RenderSettings:
         must_be("RenderSettings.preset", "name", name, str, 'e.g. RenderSettings.preset("fast", extent=4.0)')
         if name not in table:
             raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
-        return cls().replace(**{**table[name], **overrides})
+        _refuse_unknown(overrides)
+        return cls(**{**table[name], **overrides})
 
     def nearest_preset(self) -> tuple[str, dict[str, Any]]:
         """Name of the preset from which, whatever the background, the fewest fields differ, `fast` among equals, and
@@ -189,11 +191,15 @@ class RenderSettings:
 
     def replace(self, **fields: Any) -> RenderSettings:
         """A copy with the given fields replaced; unknown names raise ValueError."""
-        known = {f.name for f in dataclasses.fields(self)}
-        unknown = sorted(set(fields) - known)
-        if unknown:
-            raise ValueError(f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}")
+        _refuse_unknown(fields)
         return dataclasses.replace(self, **fields)
+
+
+def _refuse_unknown(fields: Iterable[str]) -> None:
+    known = {field.name for field in dataclasses.fields(RenderSettings)}
+    unknown = sorted(set(fields) - known)
+    if unknown:
+        raise ValueError(f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}")
 
 
 def legal(s: RenderSettings) -> str | None:
