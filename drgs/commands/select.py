@@ -35,11 +35,11 @@ _SHORT = {
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
     check_counts(args)
-    args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     prior = Prior.given(args.prior, args.relative_prior)
     given = SceneInput.of(args)
-    settings = given.settings(args.preset)
+    settings = given.over_background(settings)
     semantics = given.semantics()
     scoring = Scoring(
         args.criterion,

@@ -132,13 +132,15 @@ def _stations(args: View, given: SceneInput, ranking: Ranking | None, notes: lis
     """Where photographs were taken or could be."""
     if args.train is None and given.run is None:
         return stations_of([], (), ranking)
-    source = Source("--train", str(given.run.path), "run") if args.train is None else Source.of("--train", args.train)
+    source = Source.known(args.train, given)
     if source.kind == "list":
         views = [DataView(camera, camera.name) for camera in source.listed()]
         return stations_of(views, [view.name for view in views], ranking)
     try:
         views = source.dataset(args, given).views
-        fitted = fitted_views(Run(Path(source.text))) if source.kind == "run" else [view.name for view in views]
+        fitted = [view.name for view in views]
+        if source.kind == "run":
+            fitted = fitted_views(Run(Path(source.text)), source.record)
     except (OSError, ValueError):
         if args.train is not None:
             raise
