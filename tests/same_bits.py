@@ -197,7 +197,8 @@ def of_json(path: Path) -> dict:
 
     def kept(value: Any) -> Any:
         if isinstance(value, dict):
-            return {k: kept(x) for k, x in sorted(value.items()) if not any(word in k for word in _CLOCK)}
+            told = {k: x for k, x in sorted(value.items()) if k != "env" and not any(word in k for word in _CLOCK)}
+            return {k: kept(x) for k, x in told.items()}
         if isinstance(value, list):
             return [kept(x) for x in value]
         if isinstance(value, float) and abs(value) < 1e30:
