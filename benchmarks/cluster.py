@@ -28,7 +28,7 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs.cameras import Camera, intrinsics_from_fov, look_at  # noqa: E402
 from drgs.cluster.connect import opened  # noqa: E402
-from drgs.cluster.payloads import Parcel  # noqa: E402
+from drgs.cluster.payloads import Payload  # noqa: E402
 from drgs.files import write_json  # noqa: E402
 from drgs.select import Selection, select  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
@@ -140,7 +140,7 @@ def measured(arguments: argparse.Namespace) -> dict:
         "candidates": len(candidates),
         "known": len(known),
         "size": SIZE,
-        "scene_bytes": len(Parcel.of(g).data),
+        "scene_bytes": len(Payload.of(g).data),
         "rows": rows,
     }
 
