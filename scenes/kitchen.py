@@ -56,7 +56,7 @@ _JELLIES = (((150, 16, 40), (214, 60, 78)), ((36, 110, 40), (120, 176, 70)), ((1
 _WOODS = (((92, 56, 32), (172, 116, 70)), ((132, 92, 56), (208, 164, 112)), ((54, 38, 30), (112, 80, 58)))
 _CLAYS = ((178, 84, 56), (150, 110, 86), (112, 122, 128))
 _WORDS = ("FLOUR", "SUGAR", "SALT", "RICE")
-_STATIONS = ((-0.285, -0.005), (0.0, -0.02), (0.285, 0.0))  # (x, y) in front
+_SPOTS = ((-0.285, -0.005), (0.0, -0.02), (0.285, 0.0))  # (x, y) in front
 _BACK = ((-0.38, 0.235), (-0.145, 0.25), (0.125, 0.25), (0.365, 0.235))  # (x, y) along the wall
 
 _FOV_X = 46.0  # degrees across the image width
@@ -76,7 +76,7 @@ def parts(seed):
     rng = np.random.default_rng([seed, 31])
     accents = rng.permutation(np.array(_ACCENTS))
     light = rng.permutation(np.array(_LIGHT))
-    order = list(itertools.permutations(_STATIONS))[(5 * seed + 2) % 6]  # six seeds, six arrangements
+    order = list(itertools.permutations(_SPOTS))[(5 * seed + 2) % 6]  # six seeds, six arrangements
     for_mug, for_jelly, for_tongs = (np.array(at) + rng.uniform(-0.012, 0.012, 2) for at in order)
     back = [np.array(at) + rng.uniform(-0.02, 0.02, 2) * (1, 0.5) for at in rng.permutation(np.array(_BACK))]
     word = rng.permutation(np.array(_WORDS))

@@ -29,12 +29,12 @@ Builder = Callable[[np.random.Generator], Built]
 
 @dataclasses.dataclass(frozen=True)
 class ExtremeCase:
-    """One scene.
+    """One scene at an extreme.
 
     Attributes:
-        name: As printed.
-        build: rng -> (Gaussians, Camera).
-        preset: Where the settings come from.
+        name: Name of the case, as it is printed.
+        build: Function of a random generator: Gaussians and camera.
+        preset: Preset that the settings start from.
         fields: Settings that differ from the preset.
         bvh: Whether `bvh` keeps the bounds as well; `rounds` where it keeps those of its rounding (docs/numerics.md),
             `warns` where it keeps none and says so, `skip` where it is not run.
@@ -54,12 +54,12 @@ class ExtremeCase:
 
     @property
     def settings(self) -> RenderSettings:
-        """On `tiles`."""
+        """Render settings of the case, for the traversal `tiles`."""
         return RenderSettings.preset(self.preset, **self.fields)
 
     @property
     def traversals(self) -> tuple[str, ...]:
-        """Those that it is run on."""
+        """Traversals that the case is run on."""
         return ("tiles",) if self.bvh == "skip" or self.settings.planar else ("tiles", "bvh")
 
 

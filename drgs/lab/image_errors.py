@@ -59,7 +59,7 @@ class Pattern:
 
     Attributes:
         name: A key of `PATTERNS`.
-        what: In words, to follow "the image of the model".
+        what: The pattern in words that follow "the image of the model".
         explained: Share of the squared error; NaN for `none`.
     """
 
@@ -93,12 +93,13 @@ class _Case:
 def error_row(
     wrong: np.ndarray, model: np.ndarray, counts: np.ndarray, pattern: Pattern, beside: str
 ) -> ErrorRow | None:
-    """Where an image is off the model's, with a pattern; None where no pixel is.
+    """The place where an image is off the model's, with a pattern; None where no pixel is off.
 
     Args:
-        wrong, model: (H, W, 3).
+        wrong: (H, W, 3) image that is looked at.
+        model: (H, W, 3) image of the model.
         counts: (H, W) bool, the pixels that count.
-        pattern: Of `pattern_of`.
+        pattern: Pattern of the error, as `pattern_of` finds it.
         beside: What the pattern changes, in words.
     """
     error = np.abs(wrong - model).max(-1) * counts
@@ -139,9 +140,10 @@ def pattern_of(
     """The simplest pattern that makes a wrong image of the right one.
 
     Args:
-        wrong, right: (H, W, 3).
-        alpha: (H, W), of the right one.
-        background: RGB of both.
+        wrong: (H, W, 3) image that is looked at.
+        right: (H, W, 3) image that it should be.
+        alpha: (H, W) opacity of the right image.
+        background: RGB background of both.
         counts: (H, W) bool, the pixels that count.
     """
     case = _Case(*(np.asarray(x, np.float64) for x in (wrong, right, alpha, background)), np.asarray(counts, bool))
@@ -290,7 +292,7 @@ def _blank(case: _Case) -> Iterator[tuple]:
 
 
 def _place(case: _Case) -> Pattern | None:
-    """Where an error lies that is like nothing known."""
+    """The kind of place where an error lies that is like nothing known; None where it lies everywhere."""
     error = ((case.wrong - case.right) ** 2).sum(-1) * case.counts
     total = error.sum()
     sides = {"left": (1, 1), "right": (1, -1), "top": (0, 1), "bottom": (0, -1)}

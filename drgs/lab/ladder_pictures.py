@@ -50,7 +50,7 @@ class Pictures:
         g: N Gaussians.
         cameras: Pinhole cameras, at least one.
         crop: Width and height in pixels of the crops of the first camera; 0 for none.
-        seed: Of the cotangent.
+        seed: Seed of the cotangent.
         gradients: Whether J^T u is wanted.
         advance: Called after each image.
     """
@@ -70,7 +70,7 @@ class Pictures:
             )
         if crop < 0:
             raise ValueError(f"ladder: crop must be >= 0 pixels, got {crop}; correct it")
-        # Each picture makes leaves of its own.
+        # Each picture makes leaves of its own; a graph behind these would be walked by each of them.
         self.g = g.detach()
         self.cameras = list(cameras)
         self.crop = crop

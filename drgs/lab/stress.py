@@ -44,13 +44,14 @@ class StressRow:
     """One case on one traversal.
 
     Attributes:
-        case, traversal: Their names; refusals have the traversal `all`.
-        image, gradient, forward, duality, fisher: Errors, see `BOUNDS`; None where there is none.
-        group: That of the worst gradient.
-        finite: Every output, derivative and entry of the information is; None where nothing was computed.
+        case: Name of the case.
+        traversal: Name of the traversal; `all` of a refusal.
+        image, gradient, forward, duality, fisher: Errors that `BOUNDS` limits; None where there is none.
+        group: Parameter group of the worst gradient.
+        finite: Whether every output, derivative and entry of the information is; None where nothing was computed.
         verdict: `holds`, `warns` (refused or warned about, as documented) or `FAILS`.
         remark: What a reader should know, messages included.
-        seconds: Of the renderer, compilation of its kernels included.
+        seconds: Time of the renderer, compilation of its kernels included.
     """
 
     case: str
@@ -92,9 +93,10 @@ class Truth:
     """A case, and what the oracle says about it.
 
     Attributes:
-        g, cam: The scene, leaves.
-        oracle: Images and derivatives.
-        view: The camera whose image is compared in Fisher information; None where none is.
+        g: Gaussians of the scene, all leaves.
+        cam: Camera of the scene, whose pose is a leaf.
+        oracle: Images and derivatives of the oracle.
+        view: Camera whose image is compared in Fisher information; None where none is.
         information: Group -> diagonal of the dense Jacobian's J^T J, of `view`.
         remark: What `view` leaves out, and why.
     """
@@ -198,7 +200,7 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
 
 def _rounded(g: Gaussians, cam: Camera) -> dict[str, float]:
     """`BOUNDS` of hits in float32 world space; derivatives have four times the error, their squares twice that."""
-    # Numbers for a bound, no part of a graph.
+    # A bound is a number: `float` of a tensor with a graph would warn.
     far = (g.means.detach().double() - torch.tensor(cam.center - g.origin)).norm(dim=1)
     unit = _ROUNDING * float((far / g.scales.detach().double().amin(1)).max())
     more = {"image": unit, "gradient": 4 * unit, "forward": 4 * unit, "fisher": 8 * unit}

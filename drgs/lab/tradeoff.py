@@ -59,12 +59,12 @@ def measure(
     """Times and errors of settings.
 
     Args:
-        gaussians: At least one.
-        cameras: Pinhole, at least one.
-        variants: Rows; the first one is the truth.
+        gaussians: Gaussians of the scene, at least one.
+        cameras: Pinhole cameras, at least one.
+        variants: Variants to be measured, a row each; the first one is the truth.
         fields: Settings that hold in every row that does not say otherwise.
         repeats: Rounds of timing at most; they end after 100 seconds if three are done.
-        seed: Of the cotangents, of the samples of pixels and of the order within a round.
+        seed: Seed of the cotangents, of the samples of pixels and of the order within a round.
         advance: Called after each turn.
     Returns:
         A row for each of `variants`. Where there is no number there is None, and the reason in `skipped` or `notes`.
@@ -107,8 +107,9 @@ def measure(
 
 
 def placed(gaussians: Gaussians) -> Gaussians:
-    """Where they are rendered, without a graph."""
+    """Gaussians on the device that they are rendered on, without a graph."""
     device = "cuda" if runtime.backend().name == "cuda" else "cpu"
+    # Forward times are of images without derivatives; the leaves of the others are made of these (`_Stage`).
     return gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
 
 
@@ -117,7 +118,7 @@ class _Answer:
     """What a setting makes of a view.
 
     Attributes:
-        image: (H, W, 3), on the CPU.
+        image: (H, W, 3) colors, on the CPU.
         slopes: J^T u by group.
         information: The Fisher diagonal by group; None where the setting has none.
     """
@@ -153,7 +154,7 @@ class _Stage:
     def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
         """(H, W, 3), whatever the share of its resolution that is rendered."""
         out = render(g, _reduced(camera, share), settings, outputs=())
-        self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)
+        self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)  # a yes or no has no derivative
         if share == 1:
             return out.rgb
         size = (camera.height, camera.width)
@@ -400,6 +401,6 @@ def clocked(work: Callable[[], _Result]) -> tuple[_Result, float]:
 
 
 def _clock_name() -> str:
-    """With one thread, time of the processor: what else runs on the machine does not stretch it."""
+    """The clock: of one thread the processor's time, which nothing else on the machine stretches; else the wall's."""
     backend = runtime.backend()
     return "processor" if backend.name == "llvm" and backend.threads == 1 else "wall"

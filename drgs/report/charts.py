@@ -68,7 +68,7 @@ def score_bars(picks: Sequence[Mapping[str, Any]]) -> str | None:
     """One row a pick: the share of each parameter group in its score, and the candidates' scores relative to the best.
 
     Args:
-        picks: Of selection.json, those with a score.
+        picks: Picks of selection.json; those without a score are left out.
     Returns:
         None where no pick has a score.
     """
@@ -112,7 +112,7 @@ def _part_bars(axis: Axes, picks: Sequence[Mapping[str, Any]], names: Sequence[s
 
 
 def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Camera, str]]) -> str | None:
-    """Where cameras stand and where they look, seen from above.
+    """A map of where cameras stand and where they look, seen from above.
 
     Args:
         groups: Name -> cameras: `start` or `fitted`, `not picked`, `held out`; drawn in this order.

@@ -36,8 +36,8 @@ def stages(camera: Camera, most: int) -> list[Camera]:
     """The cameras of one view in the order in which they are drawn: a small picture, then one of `most` pixels.
 
     Args:
-        camera: As large as the browser's window.
-        most: Pixels; no picture is larger than the window either.
+        camera: The view, as large as the browser's window.
+        most: Largest number of pixels; no picture is larger than the window either.
     """
     last = at_most(camera, most)
     first = at_most(camera, _FIRST)
@@ -65,12 +65,14 @@ def drawn(
     """What `read` takes of the rendering of a view, (H, W, ...).
 
     Args:
-        scene, camera, settings: As for `drgs.render`.
-        read: Of a band's rendering, with its depth.
+        scene: What is drawn.
+        camera: The view, as large as the picture.
+        settings: Render settings.
+        read: Function that takes a band's rendering, with its depth, and returns rows of the picture.
         features: Whether it reads the features, which else cost nothing.
     """
     parts = []
-    with torch.no_grad():  # a picture
+    with torch.no_grad():  # a picture is looked at only; a graph would keep every band's intermediates
         seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
     below = 0
     for part in bands(camera):
