@@ -62,7 +62,6 @@ class Bench:
         target: The reader.
         scratch: Empty folder, best in memory.
         made: Folders that hold valid files already, in place of those that the target's functions write.
-
     Attributes:
         files: (folder, path, bytes) of the valid files that are damaged.
     """

@@ -31,9 +31,9 @@ class Mover:
     """A part that moves.
 
     Attributes:
-        name: Its class.
-        at: Mesh (`scenes.grid`'s four arrays) at a time in [0, 1]; faces and texture coordinates stay the same.
-        bsdf, paint, two_sided: As for `scenes.shape`.
+        name: Class of the part.
+        at: Function of a time in [0, 1]: the mesh (`scenes.grid`'s four arrays); faces and texture coordinates stay.
+        bsdf, paint, two_sided: Arguments of `scenes.shape`.
     """
 
     name: str
@@ -71,7 +71,7 @@ def _wave(rng, low, high):
 
 # ---------------------------------------------------------------------------------- rigid
 def mug(rng, spot, color, accent):
-    """Slides on a small ellipse around `spot` (x, y) and turns, back and forth."""
+    """A mug that slides on a small ellipse around `spot` (x, y) and turns, back and forth."""
     profile = [(0, 0), (0.036, 0), (0.043, 0.005), (0.046, 0.03), (0.045, 0.085), (0.048, 0.108), (0.046, 0.11)]
     body = revolve(spline(np.array([*profile, (0.042, 0.09), (0.041, 0.02), (0.036, 0.009), (0, 0.008)]), 80))
     curve = [(0.044, 0, 0.09), (0.07, 0, 0.092), (0.083, 0, 0.06), (0.068, 0, 0.03), (0.044, 0, 0.026)]
@@ -114,7 +114,7 @@ def _glaze(rng, color, accent, height=256, width=512):
 
 
 def orange(rng, start, end):
-    """Rolls from `start` to `end` (x, y) and back, without slipping."""
+    """An orange that rolls from `start` to `end` (x, y) and back, without slipping."""
     phi = np.linspace(-np.pi / 2, np.pi / 2, 48)
     ball = revolve(ORANGE * np.stack([np.cos(phi), np.sin(phi)], 1), turn=(90, 25, 0), segments=64)
     start = np.asarray(start)
@@ -151,7 +151,7 @@ def _peel(rng, height=256, width=512):
 
 # ---------------------------------------------------------------------------- articulated
 def tongs(rng, spot, accent):
-    """Two arms on a pin close on what lies at `spot` (x, y), open, and are lifted a little meanwhile."""
+    """Tongs of two arms on a pin that close on what lies at `spot` (x, y), open, and are lifted a little meanwhile."""
     turn = np.radians(rng.uniform(-25, 25))
     lean = np.radians(rng.uniform(12, 26) * (1 if rng.random() < 0.5 else -1))
     base = _rotation(turn * _UP) @ _rotation((lean, 0, 0))
@@ -203,7 +203,7 @@ def _arm(side):
 
 # ------------------------------------------------------------------------------ deforming
 def jelly(rng, spot, colors):
-    """Wobbles on its plate at `spot` (x, y): squashed and stretched at constant volume, sheared and twisted."""
+    """A jelly that wobbles on its plate at `spot` (x, y): squashed at constant volume, sheared and twisted."""
     profile = [(0.098, 0.0), (0.1, 0.008), (0.094, 0.04), (0.083, 0.075), (0.066, 0.1), (0.045, 0.112)]
     profile = spline(np.array([*profile, (0.02, JELLY), (0, JELLY)]), 60)
     lobes = int(rng.integers(8, 13))
@@ -237,7 +237,7 @@ def jelly(rng, spot, colors):
 
 
 def towel(rng, middle, color, accent):
-    """Hangs from a rail, its upper edge's middle at `middle` (x, y, z), and sways before the wall."""
+    """A towel that hangs from a rail, its upper edge's middle at `middle` (x, y, z), and sways before the wall."""
     wide, long = rng.uniform((0.19, 0.2), (0.23, 0.23))
     v, u = np.meshgrid(np.linspace(0, 1, 36), np.linspace(-0.5, 0.5, 30), indexing="ij")
     waves = [_wave(rng, *r) for r in ((1.0, 1.5), (1.6, 2.2), (0.8, 1.2))]

@@ -131,7 +131,7 @@ def lemon(rng, place, scale=1.0):
 
 
 def plate(rng, spot, color, accent):
-    """Under the jelly at `spot` (x, y)."""
+    """The plate under the jelly at `spot` (x, y)."""
     profile = [(0, 0), (0.07, 0), (0.085, 0.004), (0.128, 0.013), (0.13, 0.016), (0.118, 0.0145), (0.09, 0.0115)]
     mesh = revolve(spline(np.array([*profile, (0, 0.0115)]), 60), (*spot, 0), segments=96)
     v = np.linspace(1, 0, 256)[:, None].repeat(64, 1)

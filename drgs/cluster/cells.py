@@ -235,7 +235,7 @@ def sees(token: str) -> bool:
 def do_cell(
     ours: Mapping[str, str], study: str, cell: Cell, runs: str, token: str, topic: str, number: int
 ) -> dict[str, Any]:
-    """Runs on a worker: one cell.
+    """Do one cell, on a worker.
 
     Args:
         ours: What the worker must agree with.

@@ -266,7 +266,7 @@ def _tensors(answer: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 
 def ask(ours: Mapping[str, str], scene: str, questions: str, number: int, view: bytes) -> dict[str, Any]:
-    """Runs on a worker: what one view says.
+    """Compute what one view says, on a worker.
 
     Args:
         ours: What the worker must agree with.

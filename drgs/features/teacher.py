@@ -74,7 +74,6 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
     Args:
         path: File to read.
         what: Kind of file that it must be, for the message.
-
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is anything but one plain tensor, is cut short, or claims more numbers than the file has.
@@ -125,7 +124,6 @@ def check_finite(values: torch.Tensor, path: str | os.PathLike) -> None:
     Args:
         values: (C, h, w) map, float16 or float32.
         path: File of the map, for the message.
-
     Raises:
         ValueError: If a value is NaN or infinite; names the first one's place.
     """

@@ -1,4 +1,4 @@
-"""Gathers what there is about a run and writes its page."""
+"""The page of a run: what there is about it, gathered and written."""
 
 from __future__ import annotations
 

@@ -223,7 +223,7 @@ def _scores(where: str, rows: list[dict[str, Any]]) -> dict[str, Score]:
 
 
 def _reader(view: View) -> Callable[[int], np.ndarray]:
-    """Reads a view's photograph, reduced; the file is opened at the first call."""
+    """A function that reads a view's photograph, reduced; the file is opened at its first call."""
 
     def read(width: int) -> np.ndarray:
         seen = view.checked()

@@ -1,4 +1,4 @@
-"""Starts viser behind the gate, and gives every browser a session."""
+"""The viewer: viser behind the gate, with a session for every browser."""
 
 from __future__ import annotations
 
