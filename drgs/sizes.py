@@ -26,8 +26,8 @@ def resized_alike(camera: Camera, sizes: dict[tuple[int, int], tuple[int, int]])
     """The camera at the size that its image probably has: images reduced after calibration are reduced alike.
 
     Args:
-        camera: Of the size that the camera file states.
-        sizes: Stated (width, height) -> that of the file, of images that have been opened.
+        camera: Camera of the size that the camera file states.
+        sizes: Stated (width, height) -> (width, height) of the file, for images that have been opened.
     """
     size = sizes.get((camera.width, camera.height))
     return camera.resized(*size) if size else camera
