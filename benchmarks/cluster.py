@@ -64,8 +64,7 @@ def ring(count: int) -> list[Camera]:
     K = intrinsics_from_fov(50.0, *SIZE)
     found = []
     for i in range(count):
-        # the golden angle
-        angle = 2.399963 * i
+        angle = 2.399963 * i  # the golden angle
         height = 0.25 + 1.0 * (i + 0.5) / count
         across = np.sqrt(max(2.6**2 - (2 * height) ** 2, 0.2))
         eye = (across * np.cos(angle), across * np.sin(angle), 2 * height)
@@ -94,7 +93,6 @@ def measured(arguments: argparse.Namespace) -> dict:
     g = scene(arguments.gaussians)
     cameras = ring(arguments.candidates + KNOWN)
     known = cameras[:: len(cameras) // KNOWN][:KNOWN]
-    candidates = []
     candidates = [camera for camera in cameras if all(camera is not other for other in known)]
     rows = []
     reference = None

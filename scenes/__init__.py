@@ -39,7 +39,9 @@ def noise(rng, height, width, cells, octaves=4, stretch=1.0):
         wide = cv2.resize(lattice, (3 * width, height), interpolation=cv2.INTER_CUBIC)
         total += 0.5**octave * wide[:, width : 2 * width]  # only the middle third has no seam
         weight += 0.5**octave
-    return np.clip((total / weight - 0.5) * 1.6 + 0.5, 0, 1)
+    return np.clip(
+        (total / weight - 0.5) * 1.6 + 0.5, 0, 1
+    )  # cubic interpolation overshoots, and the contrast is raised
 
 
 def mix(a, b, t):
@@ -83,7 +85,7 @@ def grid(points, closed=False, uv=None):
     for pole, beside in ((0, 1), (-1, -2)):  # a row shrunk to one point has no normal of its own
         if np.ptp(points[pole], axis=0).max() < 1e-9:
             normals[pole] = normals[beside].mean(0)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-20)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-20)  # of faces without an area: 0
     if uv is None:
         uv = np.stack(np.meshgrid(np.linspace(0, 1, cols), np.linspace(0, 1, rows)), -1)
     k = (np.arange(rows - 1)[:, None] * cols + np.arange(cols - 1)).ravel()
@@ -310,7 +312,7 @@ def dome(views, seed, center, distance, arc, elevations):
 
 def encode_srgb(linear):
     """Linear radiance to 8-bit sRGB."""
-    linear = np.clip(linear, 0, 1)
+    linear = np.clip(linear, 0, 1)  # what is brighter is overexposed
     curve = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)
 

@@ -74,6 +74,7 @@ def sparse_points(K, poses, views, count, seed):
         image, depth, labels = views(k)
         gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
         weight = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+        # A picture without any texture, too, has points: its weights are equal instead of 0.
         weight = ((weight + 0.1 * weight.mean() + 1e-3) * (depth > 0)).ravel().astype(np.float64)
         picked = rng.choice(weight.size, min(each, int((weight > 0).sum())), replace=False, p=weight / weight.sum())
         at = back_project(K, c2w, depth).reshape(-1, 3)[picked]

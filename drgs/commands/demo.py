@@ -30,6 +30,7 @@ from drgs.guards.outputs import Claim, claim
 from drgs.integrator import render
 from drgs.report.write import FILE
 from drgs.settings import RenderSettings
+from drgs.sizes import cropped
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
@@ -268,9 +269,7 @@ def _check(g: Gaussians, frame: Frame, image: torch.Tensor, crop: tuple[int, int
     camera = frame.camera
     width, height = crop
     x, y = (camera.width - width) // 2, (camera.height - height) // 2
-    K = camera.K.copy()
-    K[:2, 2] -= x, y
-    part = dataclasses.replace(camera, K=K, width=width, height=height)
+    part = cropped(camera, x, y, width, height)
     with torch.no_grad():  # compared, not optimized
         truth = reference.render(g, part, RenderSettings.preset("exact"))
     error = (image[y : y + height, x : x + width].double() - truth.rgb).abs()
@@ -306,7 +305,7 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
         return _draw(g, camera, settings).numpy()
 
     theirs = peer()[..., :3]
-    mse = float(np.mean((np.clip(theirs, 0, 1) - np.clip(ours(), 0, 1)) ** 2))
+    mse = float(np.mean((np.clip(theirs, 0, 1) - np.clip(ours(), 0, 1)) ** 2))  # as pictures are shown
     times = [(_seconds(ours), _seconds(peer)) for _ in range(repeats)]
     return {
         "fast": statistics.median(a for a, _ in times),

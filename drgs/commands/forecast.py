@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import torch
 
 from drgs.display.progress import Bar
 from drgs.integrator import render
+from drgs.sizes import cropped
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -34,11 +34,10 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
     rows = max(2, round(first.height * _SHARE))
 
     def seconds(place: float, height: int) -> float:
-        K = first.K.copy()
-        K[1, 2] -= int(place * max(first.height - height, 0))
+        band = cropped(first, 0, int(place * max(first.height - height, 0)), first.width, height)
         began = time.perf_counter()
         with torch.no_grad():  # as views are drawn: a graph would take time of its own
-            render(gaussians, dataclasses.replace(first, K=K, height=height), settings, ()).rgb.cpu().numpy()
+            render(gaussians, band, settings, ()).rgb.cpu().numpy()
         return time.perf_counter() - began
 
     with Bar("how long it will take", len(_BANDS)) as bar:

@@ -78,7 +78,9 @@ class FeatureColors:
             for row in features.detach():  # as NumPy wants it below
                 decoded = (row if decoder is None else decoder(row.to(decoder.matrix))).cpu().float()
                 length = decoded.norm(dim=1, keepdim=True)
-                parts = (decoded / length.clamp_min(1e-30) - self.mean) @ self.axes
+                parts = (
+                    decoded / length.clamp_min(1e-30) - self.mean
+                ) @ self.axes  # 0 / 0 of an empty pixel, left out below
                 span = (self.high - self.low).clamp_min(1e-12)  # of one color only, too, there is a span
                 rows.append(torch.where(length > 0, (parts - self.low) / span, 0.0))
         return to_bytes(torch.stack(rows).numpy())
@@ -96,7 +98,7 @@ def _sample(maps: Iterable[torch.Tensor], rows: int) -> torch.Tensor:
     sample = torch.cat(parts) if parts else torch.empty(0, 1)
     if not len(sample):
         raise ValueError("FeatureColors: maps must hold a feature that is finite and not 0, hold none")
-    return sample[:: -(-len(sample) // rows)].double()
+    return sample[:: -(-len(sample) // rows)].double()  # eigenvectors of a covariance of nearly equal colors
 
 
 @functools.cache

@@ -166,6 +166,7 @@ def cosines(features: torch.Tensor, vectors: torch.Tensor, decoder: Decoder | No
         for chunk in _chunks(features, max(channels, *rows.shape)):
             decoded = chunk if decoder is None else decoder(chunk.to(decoder.matrix)).cpu().float()
             _check_finite("cosines", decoded)
+            # torch's own 1e-12 would shorten features that are merely small; 0 stays 0.
             parts.append(torch.nn.functional.normalize(decoded, dim=1, eps=1e-30) @ rows.T)
     return torch.cat(parts).reshape(*features.shape[:-1], len(rows))
 

@@ -184,7 +184,7 @@ class Oracle:
         # The graph has served; kept, it would hold every intermediate of the oracle for as long as this object lives.
         self.back = {n: x.detach().double() for n, x in back.items()}
         self.back["camera"] = pose_gradient(cam, self.back["camera"])
-        self.u = {name: u.detach() for name, u in self.u.items()}
+        self.u = {name: u.detach() for name, u in self.u.items()}  # it was a variable to get J v, and is a number now
 
 
 def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
@@ -198,6 +198,7 @@ def gradients(
     g: Gaussians, cam: Camera, out: Output | reference.ReferenceOutput, u: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
     """float64 gradient of sum <u, image> by group, `camera` as a twist."""
+    # Sums over an image in float64: in float32 they lose more digits than the gradients are compared by.
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
     found = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
     return {**found, "camera": pose_gradient(cam, found["camera"])}
@@ -233,7 +234,7 @@ def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle)
     out = render(g, cam, settings, outputs="all")
     ref = oracle.out
     good = oracle.good
-    size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])
+    size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])  # a list holds numbers
     image = {}
     finite = True
     for name in (*FIELDS, "median_depth"):

@@ -36,6 +36,7 @@ from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
 from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
 from drgs.settings import RenderSettings
+from drgs.sizes import cropped
 
 __all__ = ["VERDICTS", "Result", "crops", "crossval"]
 
@@ -142,8 +143,8 @@ def crossval(
     places: list[Crop | None] = [None] * asked
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
         say("crops")
-        g, cameras, cropped = crops(g, cameras, starts[0].settings)
-        places = [*cropped]
+        g, cameras, found_places = crops(g, cameras, starts[0].settings)
+        places = [*found_places]
     dtype = getattr(rasterizer, "dtype", torch.float32)
     raw = with_pose(raw_of(g))
     signs = cotangents(cameras, seed)
@@ -307,9 +308,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
         for camera, image in drawn:
             width, height = min(camera.width, side), min(camera.height, side)
             x, y = _liveliest(image, width, height)
-            K = np.array(camera.K, float)
-            K[:2, 2] -= x, y
-            parts.append(dataclasses.replace(camera, K=K, width=width, height=height))
+            parts.append(cropped(camera, x, y, width, height))
             places.append(Crop(x, y, width, height, [camera.width, camera.height]))
             seen.append(_looked_at(g, parts[-1], settings)[1])
         if max(int(x.sum()) for x in seen) * side**2 <= _CROP_PAIRS:
@@ -322,14 +321,14 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
 
 def _looked_at(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
     """(H, W, 4) color and alpha, and (N,) bool: what is seen."""
-    with torch.no_grad():
+    with torch.no_grad():  # what is looked for is where to look
         out = render(g, camera, settings, outputs=("visibility",))
     return torch.cat([out.rgb, out.alpha[..., None]], -1).cpu(), out.visibility.cpu() > 0
 
 
 def _liveliest(image: torch.Tensor, width: int, height: int) -> tuple[int, int]:
     """Corner (x, y) of the crop of an (H, W, 4) image whose colors and alpha vary most."""
-    x = image.double().permute(2, 0, 1)[None]
+    x = image.double().permute(2, 0, 1)[None]  # the difference of two squares cancels in float32 where little varies
 
     def mean(values: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.avg_pool2d(values, (height, width), stride=_STEP)

@@ -64,6 +64,7 @@ def cotangents(cameras: list[Camera], seed: int, channels: int = 3) -> torch.Ten
 def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict[str, np.ndarray]:
     """What tells a scene from another: float32 raw parameters, world frame, cameras and background."""
     arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
+    # A file holds values, in float32 as rasterizers take them; a pose may be a leaf.
     arrays["viewmat"] = np.stack([float64(c.w2c).detach().float().numpy() for c in cameras])
     arrays["K"] = np.stack([np.asarray(c.K, np.float32) for c in cameras])
     arrays["width"] = np.int64(cameras[0].width)

@@ -208,7 +208,7 @@ def _backgrounds(case: _Case) -> Iterator[tuple]:
 
 
 def _transfers(case: _Case) -> Iterator[tuple]:
-    right = case.right.clip(0)
+    right = case.right.clip(0)  # a power of a negative color is NaN
     low, high = right <= 0.0031308, right <= 0.04045
     encoded = np.where(low, 12.92 * right, 1.055 * np.maximum(right, 1e-9) ** (1 / 2.4) - 0.055)
     yield "transfer", "encoded as sRGB", encoded
@@ -247,7 +247,7 @@ def _moves(case: _Case) -> Iterator[tuple]:
                 move[:count] += step
                 if np.abs(step * (1, 1, max(width, height))[:count]).max() < _MOVED:
                     break
-            move[:2] = move[:2].clip(-width, width)
+            move[:2] = move[:2].clip(-width, width)  # a search that diverged stays in numbers that can be warped by
             made, known = _moved(case.right, move)
             if (case.counts & known).sum() > 0.25 * case.counts.sum():
                 ends.append((case.explained(made, known), move, made, known))
@@ -262,7 +262,7 @@ def _moved(image: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     height, width = image.shape[:2]
     dx = move[0]
     dy = move[1]
-    zoom = 1 + float(np.clip(move[2], -0.5, 0.5))
+    zoom = 1 + float(np.clip(move[2], -0.5, 0.5))  # at -1 nothing would be left, beyond it all is mirrored
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     matrix = np.column_stack([zoom * np.eye(2), middle - zoom * middle + (dx, dy)])
 
@@ -318,7 +318,7 @@ def _place(case: _Case) -> Pattern | None:
 def _ratio(x: np.ndarray, y: np.ndarray) -> float:
     """The number times x that is nearest to y."""
     square = float((x * x).sum())
-    return float((x * y).sum()) / square if square > 1e-12 * x.size else 0.0
+    return float((x * y).sum()) / square if square > 1e-12 * x.size else 0.0  # of a black image: no number is nearest
 
 
 def _numbers(values: np.ndarray) -> str:

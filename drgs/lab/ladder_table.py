@@ -30,7 +30,7 @@ class Size:
     @classmethod
     def of(cls, step: torch.Tensor, total: torch.Tensor, exact: torch.Tensor) -> Size:
         """Measure a step beside the whole way and the exact end, three tensors of one shape."""
-        step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))
+        step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))  # norms over millions of values
         whole = float(total.norm())
         truth = float(exact.norm())
         size = float(step.norm())

@@ -33,6 +33,7 @@ COLORS = "colors"  # (N, D) in place of `sh`
 
 def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
     """Raw parameters in float64, world frame, without a graph: the leaves of every gradient."""
+    # A graph behind them would make these no leaves; float64, so that steps of central differences are exact.
     raw = {name: getattr(g, name).detach().double().cpu() for name in PARAMETERS}
     raw["means"] = raw["means"] + torch.tensor(np.asarray(g.origin, float))
     return raw

@@ -230,9 +230,10 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
     det = torch.linalg.cross(a, b).square().sum(-1)
     trace = (a * a + b * b).sum(-1)
     ratio = det / (det + s.dilation * (trace + s.dilation))
-    return ratio.clamp_min(floor).sqrt()
+    return ratio.clamp_min(floor).sqrt()  # at 0 the root's derivative is infinite
 
 
 def _linear(x: torch.Tensor) -> torch.Tensor:
     """Linear light of sRGB values."""
+    # The power is evaluated where it is not taken, too: below -0.055 it is NaN, and so would the gradient be.
     return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)

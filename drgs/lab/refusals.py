@@ -80,7 +80,7 @@ def _broken_camera() -> Attempts:
         K[0, 0] = w2c[0, 3] = value
         yield lambda K=K: dataclasses.replace(cam, K=K), "K must"
         yield lambda w2c=w2c: dataclasses.replace(cam, w2c=w2c), "pose must be finite"
-        moved = dataclasses.replace(cam, w2c=cam.w2c.detach().clone())
+        moved = dataclasses.replace(cam, w2c=cam.w2c.detach().clone())  # no leaf: it is changed in place
         moved.w2c[0, 3] = value  # a pose that an optimizer moved
         for traversal in ("tiles", "bvh"):
             settings = RenderSettings.preset("exact", traversal=traversal)

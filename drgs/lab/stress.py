@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.sizes import cropped
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
@@ -279,10 +281,7 @@ def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
                 best = max(best, (low * (right - left + 1), left, bottom + 1 - low, right - left + 1, low))
     _, x, y, w, h = (int(v) for v in best)
     w, h = (w, max(1, min(h, most // w))) if w <= most else (most, 1)
-    K = cam.K.copy()
-    K[0, 2] = K[0, 2] - x
-    K[1, 2] = K[1, 2] - y
-    return dataclasses.replace(cam, K=K, width=w, height=h)
+    return cropped(cam, x, y, w, h)
 
 
 def refused(case: Refusal) -> StressRow:

@@ -27,14 +27,16 @@ from drgs.lab.tradeoff_rows import (
     rows_of,
     why_skipped,
 )
+from drgs.sizes import by_share
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
+    from drgs.information.choices import Method
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["clocked", "measure", "placed"]
+__all__ = ["clocked", "measure", "placed", "scaled_diagonal"]
 
 Tensors = dict[str, torch.Tensor]
 _Result = TypeVar("_Result")
@@ -153,7 +155,7 @@ class _Stage:
 
     def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
         """(H, W, 3), whatever the share of its resolution that is rendered."""
-        out = render(g, _reduced(camera, share), settings, outputs=())
+        out = render(g, by_share(camera, share), settings, outputs=())
         self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)  # a yes or no has no derivative
         if share == 1:
             return out.rgb
@@ -183,11 +185,8 @@ class _Stage:
         return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
 
     def information(self, camera: Camera, settings: RenderSettings, share: float) -> Tensors:
-        """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is looked at."""
-        small = _reduced(camera, share)
-        found = fisher.diagonal(self.gaussians, small, settings)
-        scale = camera.width * camera.height / (small.width * small.height)
-        return {name: x * scale for name, x in found.items()} if share != 1 else found
+        """The Fisher diagonal by group."""
+        return scaled_diagonal(self.gaussians, camera, settings, share)
 
 
 class _Turn:
@@ -254,6 +253,7 @@ class _Turn:
 
     def _compare(self, truth: _Answer, seen: _Answer) -> None:
         """Add one view's differences from the truth: sizes of pixels', sums by group, medians of entries."""
+        # In float64 from here on: squares of differences of 1e-6 are summed over all pixels.
         self.pixels.append((seen.image - truth.image).abs().double().reshape(-1).numpy())
         for name, x in seen.slopes.items():
             a, b = self.slopes.get(name, (0.0, 0.0))
@@ -261,7 +261,7 @@ class _Turn:
             self.slopes[name] = a + _squares(x - y), b + _squares(y)
         for name, x in (seen.information or {}).items() if truth.information else ():
             y = truth.information[name]
-            (a, b) = self.parts.get(name, (0.0, 0.0))
+            a, b = self.parts.get(name, (0.0, 0.0))
             self.parts[name] = a + float((x - y).abs().sum()), b + float(y.sum())
             known = y > _UNSEEN * y.max()
             if bool(known.any()):
@@ -381,10 +381,22 @@ def _squares(x: torch.Tensor) -> float:
     return float(x.double().square().sum())
 
 
-def _reduced(camera: Camera, share: float) -> Camera:
-    if share == 1:
-        return camera
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+def scaled_diagonal(
+    gaussians: Gaussians, camera: Camera, settings: RenderSettings, share: float = 1.0, method: Method = "exact"
+) -> Tensors:
+    """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is looked at.
+
+    Args:
+        gaussians: Gaussians of the scene.
+        camera: View at full size.
+        settings: Render settings.
+        share: Share of the view's width and height that is looked at.
+        method: Method of `drgs.fisher.diagonal`.
+    """
+    small = by_share(camera, share)
+    found = fisher.diagonal(gaussians, small, settings, method)
+    scale = camera.width * camera.height / (small.width * small.height)
+    return {name: x * scale for name, x in found.items()} if share != 1 else found
 
 
 def clocked(work: Callable[[], _Result]) -> tuple[_Result, float]:

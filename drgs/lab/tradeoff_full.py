@@ -136,7 +136,7 @@ class _Work:
         return clocked(lambda: getattr(self, "_" + self.clock)(camera, row.settings))[1]
 
     def _forward(self, camera: Camera, settings: RenderSettings) -> object:
-        with torch.no_grad():
+        with torch.no_grad():  # what an image alone takes
             out = render(self.gaussians, camera, settings, outputs=())
         return out.rgb.cpu(), out.alpha.cpu()  # as `drgs render` takes them
 

@@ -6,7 +6,6 @@ the picture that is no longer wanted, not for all of it.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ import torch
 
 from drgs.ellipsoids import colors_only
 from drgs.integrator import render
-from drgs.sizes import at_most
+from drgs.sizes import at_most, cropped
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -49,9 +48,7 @@ def bands(camera: Camera, pixels: int = _BAND) -> list[Camera]:
     rows = max(1, pixels // camera.width)
     parts = []
     for top in range(0, camera.height, rows):
-        K = np.array(camera.K)
-        K[1, 2] -= top
-        parts.append(dataclasses.replace(camera, K=K, height=min(rows, camera.height - top)))
+        parts.append(cropped(camera, 0, top, camera.width, min(rows, camera.height - top)))
     return parts
 
 
@@ -76,7 +73,7 @@ def drawn(
         seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
     below = 0
     for part in bands(camera):
-        with torch.no_grad():
+        with torch.no_grad():  # entered for each band: between two of them the thread does other work
             parts.append(read(render(seen, part, settings, ("depth",))))
         below += part.height
         yield below / camera.height

@@ -70,7 +70,7 @@ class Pose:
         """Whether both show the same picture, to a small part of a pixel."""
         if other is None:
             return False
-        reach = 1e-6 * (1.0 + float(np.abs(self.position).max()))
+        reach = 1e-6 * (1.0 + float(np.abs(self.position).max()))  # what the client's float32 loses of a coordinate
         turn = abs(float(self.wxyz @ other.wxyz)) / float(np.linalg.norm(self.wxyz) * np.linalg.norm(other.wxyz))
         return bool(
             np.abs(self.position - other.position).max() < reach

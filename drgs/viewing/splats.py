@@ -57,7 +57,7 @@ class ClientGaussians:
             axes = semi_axes(g.quats.double(), (scales * factor).clamp_max(_MOST**0.5))
             covariances = (axes @ axes.transpose(1, 2)).float().clamp(-_MOST, _MOST).cpu().numpy()
             if rgbs is None:
-                color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)
+                color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)  # bytes would wrap around
                 rgbs = (255 * color).round().to(torch.uint8).cpu().numpy()
             # Beyond float32 a center would be infinite, which the client draws nothing of, neighbors included.
             centers = (g.means.double() * factor).clamp(-_FARTHEST, _FARTHEST).float().cpu().numpy()
