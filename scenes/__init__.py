@@ -39,9 +39,7 @@ def noise(rng, height, width, cells, octaves=4, stretch=1.0):
         wide = cv2.resize(lattice, (3 * width, height), interpolation=cv2.INTER_CUBIC)
         total += 0.5**octave * wide[:, width : 2 * width]  # only the middle third has no seam
         weight += 0.5**octave
-    return np.clip(
-        (total / weight - 0.5) * 1.6 + 0.5, 0, 1
-    )  # cubic interpolation overshoots, and the contrast is raised
+    return np.clip((total / weight - 0.5) * 1.6 + 0.5, 0, 1)  # with more contrast; cubic interpolation overshoots
 
 
 def mix(a, b, t):

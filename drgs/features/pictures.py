@@ -78,9 +78,8 @@ class FeatureColors:
             for row in features.detach():  # as NumPy wants it below
                 decoded = (row if decoder is None else decoder(row.to(decoder.matrix))).cpu().float()
                 length = decoded.norm(dim=1, keepdim=True)
-                parts = (
-                    decoded / length.clamp_min(1e-30) - self.mean
-                ) @ self.axes  # 0 / 0 of an empty pixel, left out below
+                # An empty pixel is 0 / 0, and is left out below.
+                parts = (decoded / length.clamp_min(1e-30) - self.mean) @ self.axes
                 span = (self.high - self.low).clamp_min(1e-12)  # of one color only, too, there is a span
                 rows.append(torch.where(length > 0, (parts - self.low) / span, 0.0))
         return to_bytes(torch.stack(rows).numpy())

@@ -179,21 +179,21 @@ def crossval(
     if not any(bool(alpha.any()) for _, alpha in drawn):
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
-    beside = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
-    judge(case, model, beside)
-    if not beside.agrees:
+    comparison = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
+    judge(case, model, comparison)
+    if not comparison.agrees:
         say("what the error looks like")
         models = {"the model at its conventions": model} if found.findings else {}
         models |= {f"preset {claimed}": found.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
-        beside.views = with_errors(beside, pictures, models, drawn_by)
-    not_offered = {} if POSE in beside.groups else {POSE: "its image has no gradient of them"}
+        comparison.views = with_errors(comparison, pictures, models, drawn_by)
+    not_offered = {} if POSE in comparison.groups else {POSE: "its image has no gradient of them"}
     if channels:
-        wide, reason = _wide_gradients(case, model, beside, channels, seed, functools.partial(ties_of, model))
-        beside.groups |= wide
+        wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
+        comparison.groups |= wide
         not_offered |= {COLORS: reason} if reason else {}
-    worst = min((row.verdict for row in beside.groups.values()), key=VERDICTS.index)
-    if not beside.agrees:
+    worst = min((row.verdict for row in comparison.groups.values()), key=VERDICTS.index)
+    if not comparison.agrees:
         worst = min(worst, "model difference", key=VERDICTS.index)
     elif found.findings:
         worst = min(worst, "other convention", key=VERDICTS.index)
@@ -203,12 +203,12 @@ def crossval(
         "preset": claimed,
         "conventions": [dataclasses.asdict(finding) for finding in found.findings],
         "image": {
-            "agrees": beside.agrees,
+            "agrees": comparison.agrees,
             "before": found.before,
             "after": found.after,
-            "views": [dataclasses.asdict(row) for row in beside.views],
+            "views": [dataclasses.asdict(row) for row in comparison.views],
         },
-        "groups": {name: row.json() for name, row in beside.groups.items()},
+        "groups": {name: row.json() for name, row in comparison.groups.items()},
         "not_offered": not_offered,
         "reference": "float64 oracle" if oracle else "drgs.render",
         "gaussians": len(g),
@@ -217,9 +217,9 @@ def crossval(
         "cameras": [camera.name for camera in cameras],
         "size": [cameras[0].width, cameras[0].height],
         "crops": [None if place is None else dataclasses.asdict(place) for place in places],
-        "pixels": beside.ties.numel(),
-        "near_ties": int(beside.ties.sum()),
-        "near_ties_counted": beside.counted,
+        "pixels": comparison.ties.numel(),
+        "near_ties": int(comparison.ties.sum()),
+        "near_ties_counted": comparison.counted,
         "background": list(background),
         "tolerance": case.tolerance,
         "seed": seed,
@@ -232,7 +232,7 @@ def crossval(
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
         true, _ = _drawn(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
-    return Result(report, images, beside.groups, beside.views, found.findings, model, g, cameras)
+    return Result(report, images, comparison.groups, comparison.views, found.findings, model, g, cameras)
 
 
 def _scope(r: dict) -> list[str]:

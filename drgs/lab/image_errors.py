@@ -91,7 +91,7 @@ class _Case:
 
 
 def error_row(
-    wrong: np.ndarray, model: np.ndarray, counts: np.ndarray, pattern: Pattern, beside: str
+    wrong: np.ndarray, model: np.ndarray, counts: np.ndarray, pattern: Pattern, changed: str
 ) -> ErrorRow | None:
     """The place where an image is off the model's, with a pattern; None where no pixel is off.
 
@@ -100,7 +100,7 @@ def error_row(
         model: (H, W, 3) image of the model.
         counts: (H, W) bool, the pixels that count.
         pattern: Pattern of the error, as `pattern_of` finds it.
-        beside: What the pattern changes, in words.
+        changed: What the pattern changes, in words.
     """
     error = np.abs(wrong - model).max(-1) * counts
     ys, xs = np.nonzero(error > OFF)
@@ -116,7 +116,7 @@ def error_row(
         rasterizer=[float(v) for v in wrong[y, x]],
         model=[float(v) for v in model[y, x]],
         pattern=pattern.name,
-        what=f"the image of {beside}, {pattern.what}" if known else pattern.what,
+        what=f"the image of {changed}, {pattern.what}" if known else pattern.what,
         explained=pattern.explained if known else None,
     )
 

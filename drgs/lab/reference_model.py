@@ -138,10 +138,10 @@ class ReferenceModel:
         if image.shape[-1] == 3 and self.channels in ORDERS:
             image = image[..., ["rgb".index(c) for c in self.channels]]
         if self.transfer != "none":
-            behind = 0.0
+            background = 0.0
             if self.transfer.endswith("behind"):
-                behind = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
-            image = _linear(image - behind) + behind
+                background = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
+            image = _linear(image - background) + background
         return image, alpha
 
     def _flipped(self, picture: torch.Tensor) -> torch.Tensor:

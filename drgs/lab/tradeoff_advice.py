@@ -88,8 +88,8 @@ def interval(ratios: Sequence[float]) -> Interval | None:
 def leaders(measured: Measured, clock: str, budgets: Sequence[float]) -> list[str]:
     """Names of the rows that are worth timing at full size: the fastest within each budget, and preset `fast`."""
     names = []
-    for use, (its, _) in USES.items():
-        for budget in budgets if its == clock else ():
+    for use, (timed, _) in USES.items():
+        for budget in budgets if timed == clock else ():
             rows = [row for row, _ in _within(measured, use, budget) if row.times[clock].ratio < 1]
             names += [min(rows, key=lambda row: row.times[clock].ratio).name] if rows else []
     fast = [row.name for row in measured.rows if row.name == "fast" and row.skipped is None and row.times[clock]]
