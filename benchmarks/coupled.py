@@ -67,7 +67,7 @@ def added(a: dict, b: dict) -> dict:
 
 
 def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int) -> dict:
-    """Of entries and of the scores of all views but the first two, which are known, by estimate; preset `fast`."""
+    """Errors of entries and of the scores of all views but the first two, which are known, by estimate, on `fast`."""
     settings = Preset("fast")
     colors = [fisher.diagonal(g, view, settings, groups=(*GEOMETRY, "sh")) for view in views]
 

@@ -112,7 +112,7 @@ def judged(scores: list[np.ndarray], truth: np.ndarray) -> list[float]:
 
 
 def errors(scene: DynamicGaussians, views: list[Camera], known: int, exact: int, seeds: int) -> dict:
-    """Of every estimate against `exact` probes, by score."""
+    """Errors of every estimate against `exact` probes, by score."""
     candidates = views[known:]
     halves = [told(scene, views, exact // 2, seed, True) for seed in (77, 78)]
     many = [{name: (a[name] + b[name]) / 2 for name in a} for a, b in zip(*halves, strict=True)]

@@ -43,7 +43,7 @@ def huge() -> Gaussians:
 
 
 def errors(g: Gaussians, camera: Camera, window: tuple[int, int, int, int]) -> dict:
-    """Of the pixels of a window: shares that are ambiguous, and off among all and among the others."""
+    """Errors of the pixels of a window: shares that are ambiguous, and off among all and among the others."""
     x, y, width, height = window
     seen = drgs.render(g, camera, MITSUBA).rgb[y : y + height, x : x + width]
     truth = drgs.reference.render(g, camera, MITSUBA, window=window, tolerance=3e-4)

@@ -56,8 +56,8 @@ class Reader:
     """One reader's inputs and what they came to, over all processes that it took.
 
     Args:
-        name: Of `TARGETS`.
-        row: What earlier runs counted; is added to.
+        name: Name of the reader in `TARGETS`.
+        row: Counts of earlier runs; is added to.
         corpus: Folder of what reached new lines, where atheris chooses.
     """
 

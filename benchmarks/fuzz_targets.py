@@ -29,7 +29,7 @@ class Target:
     """A reader.
 
     Attributes:
-        name: Of the reader, as tables have it.
+        name: Name of the reader, as tables have it.
         seeds: Functions that write valid files into an empty folder each.
         files: Patterns of the files that are damaged, below that folder.
         read: Reads the folder.

@@ -71,7 +71,7 @@ def spent() -> float:
 
 
 def place_of(error: BaseException) -> str:
-    """Where in drgs an error came from, file:line, by which findings of one cause are told."""
+    """The place in drgs that an error came from, file:line, by which findings of one cause are told."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if f"{ROOT}/drgs" in frame.filename] or list(frames)
     return f"{os.path.relpath(own[-1].filename, ROOT)}:{own[-1].lineno}" if own else "?"

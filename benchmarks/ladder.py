@@ -291,7 +291,7 @@ def apart(heads: list[str], reports: list[dict], others: list[dict]) -> list[str
 
 
 def rms(part: dict, order: str, name: str) -> float:
-    """Of one rung."""
+    """RMS of one rung."""
     return next(row["rms"] for row in part[order] if row["rung"] == name)
 
 

@@ -61,7 +61,7 @@ def volprim(gaussians, camera, differentiate: bool, **shape):
     """`volprim_rf_basic` as shipped, without its sRGB step (whose gradient is wrong) and with unlimited depth.
 
     Args:
-        shape: Of the shape, beside or instead of what `ellipsoids_shape` says.
+        shape: Properties of the shape, beside or instead of what `ellipsoids_shape` says.
     """
     mi = runtime.mitsuba()
     import drjit as dr

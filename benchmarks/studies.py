@@ -114,7 +114,7 @@ def rank_correlation(a, b, kind: str = "spearman") -> float:
 
 
 def stamp(script: str) -> str:
-    """Where and when a study ran."""
+    """The line that says where and when a study ran."""
     at = ran()
     return f"`python benchmarks/{script}.py`, {at['machine']}, {at['date']}, commit {at['commit']}."
 
@@ -147,9 +147,9 @@ def command(
     the first, whose page it is, to SCRIPT-SET.jsonl.
 
     Args:
-        script: Its name, and that of its part of the page.
-        page: Where the tables go.
-        scales: What --scale may be, the default first.
+        script: Name of the script, and of its part of the page.
+        page: Page that the tables are written into.
+        scales: Values of --scale, the default first.
         study_of: Scale, folder of runs -> study.
         units_of: Study, --seeds and, with `sets`, the scenes -> units, as `Study.cells` takes them.
         planned: --seeds -> cells of the whole study.

@@ -60,7 +60,7 @@ def rasterize(
         srgb: Mitsuba's `srgb_primitives`.
         sh_degree: 0..3 or None.
         backgrounds: (C, 3) or None for black.
-        near_plane: Where rays start.
+        near_plane: Distance at which rays start.
         **unused: Other options of gsplat are ignored.
     Returns:
         (C, H, W, 3) image, (C, H, W, 1) alpha, {}; float32.
