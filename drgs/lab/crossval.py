@@ -297,24 +297,27 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     Raises:
         ValueError: If no view shows a Gaussian.
     """
-    drawn = [(camera, *_looked_at(g, camera, settings)) for camera in cameras]
-    drawn = [(camera, image) for camera, image, seen in drawn if bool(seen.any())]
+    drawn = []
+    for camera in cameras:
+        image, seen = _looked_at(g, camera, settings)
+        if bool(seen.any()):
+            drawn.append((camera, image))
     if not drawn:
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     for side in _SIDES:
         parts = []
         places = []
-        seen = []
+        in_crops = []
         for camera, image in drawn:
             width, height = min(camera.width, side), min(camera.height, side)
             x, y = _liveliest(image, width, height)
             parts.append(cropped(camera, x, y, width, height))
             places.append(Crop(x, y, width, height, [camera.width, camera.height]))
-            seen.append(_looked_at(g, parts[-1], settings)[1])
-        if max(int(x.sum()) for x in seen) * side**2 <= _CROP_PAIRS:
+            in_crops.append(_looked_at(g, parts[-1], settings)[1])
+        if max(int(x.sum()) for x in in_crops) * side**2 <= _CROP_PAIRS:
             break
-    index = torch.nonzero(torch.stack(seen).any(0))[:, 0]
-    # What is compared has leaves of its own, which a graph of the scene's parameters would lead past.
+    index = torch.nonzero(torch.stack(in_crops).any(0))[:, 0]
+    # Leaves of their own: gradients are to end here, not at the parameters of the whole scene.
     fields = {name: getattr(g, name).detach()[index] for name in PARAMETERS}
     return Gaussians(**fields, origin=g.origin), parts, places
 
@@ -323,6 +326,7 @@ def _looked_at(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[
     """(H, W, 4) color and alpha, and (N,) bool: what is seen."""
     with torch.no_grad():  # what is looked for is where to look
         out = render(g, camera, settings, outputs=("visibility",))
+    assert out.visibility is not None  # asked for
     return torch.cat([out.rgb, out.alpha[..., None]], -1).cpu(), out.visibility.cpu() > 0
 
 
@@ -381,8 +385,7 @@ def _wide_gradients(
     except Exception as error:  # whatever a function raises that knows three channels only
         return {}, f"it draws no image of {channels} channels: {one_line(error)}"
     wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0)
-    with torch.no_grad():  # images alone are compared
-        drawn = [tuple(x.cpu() for x in model.draw(raw, camera, case.oracle))]
+    drawn = [_drawn(model, raw, camera, case.oracle)]
     found = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
     right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]
     found.groups = {name: row for name, row in found.groups.items() if name == COLORS or name in right}
