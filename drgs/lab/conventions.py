@@ -13,8 +13,8 @@ from drgs.lab.reference_model import ORDERS, ReferenceModel
 
 __all__ = ["LEAST", "Finding", "Found", "find"]
 
-_SHARE = 0.3  # of the remaining difference that a variation must explain to be named
-LEAST = 0.1  # of the pixels: fewer that are without near ties say nothing
+_SHARE = 0.3  # share of the remaining difference that a variation must explain to be named
+LEAST = 0.1  # share of the pixels: fewer that are without near ties say nothing
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,10 +20,10 @@ from drgs.oracle import float64
 __all__ = ["Differences", "central"]
 
 _STEPS = 4  # each half of the one before
-_FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # in units of what changes the image by its own size
-_EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # of an image: rounding, and of float32 renderers in general
-_LEFT = 0.5  # of the pixels that an entry changes must be kept
-_JUMP = 0.05  # of the largest slope in the image: what no smooth change of half a step reaches
+_FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # first step, in units of what changes the image by its own size
+_EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # rounding of an image, of float32 renderers in general
+_LEFT = 0.5  # share of the pixels that an entry changes which must be kept
+_JUMP = 0.05  # share of the largest slope that no smooth change of half a step reaches
 
 
 @dataclasses.dataclass(frozen=True)

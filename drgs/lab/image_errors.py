@@ -43,12 +43,12 @@ PATTERNS = {
 OFF = 1e-3
 """A pixel that differs by more is off."""
 _PLACES = ("border", "edges", "few pixels", "none")
-_FOUND = 0.9  # of the squared error that a pattern must explain
-_AS_GOOD = 0.01  # of the squared error: a simpler pattern that explains that little less is taken
-_SIDE = 0.1  # of the width or height: what a border is at most
-_STEEP = 0.1  # of the pixels: those of the largest gradient
-_FEW = 0.05  # of the pixels
-_SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)  # of blurs, in pixels
+_FOUND = 0.9  # share of the squared error that a pattern must explain
+_AS_GOOD = 0.01  # share of the squared error: a simpler pattern that explains so little less is taken
+_SIDE = 0.1  # share of the width or height that a border is at most
+_STEEP = 0.1  # share of the pixels, those of the largest gradient
+_FEW = 0.05  # share of the pixels
+_SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)  # standard deviations of blurs, in pixels
 _MOVES = 20  # steps of the search for a shift, each about squares the error of the one before
 _MOVED = 1e-4  # pixels that the last of these steps moves something by
 

@@ -25,9 +25,9 @@ __all__ = ["ORDERS", "ReferenceModel"]
 
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
 _WINDOW = 16  # pixels a side
-_NEAR = 2e-6  # of the distance: some ten times what float32 loses where it computes a depth
-_EFFECT = 1e-5  # of a weight: what moves less moves no gradient by what counts
-_COMPENSATION_FLOOR = 0.005**2  # of the ratio of determinants
+_NEAR = 2e-6  # share of the distance: some ten times what float32 loses where it computes a depth
+_EFFECT = 1e-5  # part of a weight: what moves less moves no gradient by what counts
+_COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants
 
 
 @dataclasses.dataclass(frozen=True)

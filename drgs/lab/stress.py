@@ -36,7 +36,7 @@ BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fi
 """What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
 
 _DENSE = 3_000_000  # pixels^2 x Gaussians: the dense Jacobian of that takes the oracle a few seconds
-_ROUNDING = 8 * 6e-8  # of `bvh`, times distance / smallest sigma: docs/numerics.md
+_ROUNDING = 8 * 6e-8  # rounding of `bvh`, times distance / smallest sigma: docs/numerics.md
 
 _CRITERIA = ("logdet", "eig", "trace_cov")
 

@@ -42,11 +42,11 @@ Tensors = dict[str, torch.Tensor]
 _Result = TypeVar("_Result")
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
-_AT_LEAST = 3  # but not before so many
-_RAYS = 200  # of a sample on Mitsuba's traversal
+_AT_LEAST = 3  # rounds, before which they do not end
+_RAYS = 200  # rays of a sample on Mitsuba's traversal
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
 _NOTHING = 1e-6  # alpha of a view that shows nothing
-_UNSEEN = 1e-6  # of the largest: entries of the diagonal that are left out of relative errors
+_UNSEEN = 1e-6  # share of the largest: smaller entries of the diagonal are left out of relative errors
 
 
 def measure(

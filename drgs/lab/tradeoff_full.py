@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FullSize", "measure_full"]
 
-_ROUNDS = 3  # that say how much times scatter
-_FORWARD = 0.6  # of the seconds are for images, which is what is drawn at full size
+_ROUNDS = 3  # rounds that say how much times scatter
+_FORWARD = 0.6  # share of the seconds for images, which is what is drawn at full size
 _GROW = 4  # times as many pixels are tried next, on the way to full size
 
 

@@ -31,7 +31,7 @@ __all__ = [
 CLOCKS = ("forward", "forward_backward", "fisher")
 """What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""
 
-_UNSEEN = 1e-6  # of the largest: groups that are left out of relative errors
+_UNSEEN = 1e-6  # share of the largest: smaller groups are left out of relative errors
 
 
 # ------------------------------------------------------------------------------- which settings

@@ -24,7 +24,7 @@ from drgs.lab.rows import AlphaRow, GroupRow, OwnRow, ViewRow, WorstGaussian, Wo
 
 __all__ = ["Case", "Compared", "compared", "judge", "with_errors"]
 
-_FEW = 0.01  # of the pixels: so few that are off hang on a cut-off or on the order, and are left out
+_FEW = 0.01  # share of the pixels: so few that are off hang on a cut-off or on the order, and are left out
 _IMAGE = 1e-3  # RMS of images that agree
 _ENOUGH = 3  # converged differences that a verdict needs
 _OWN = 0.02  # relative difference from its own central differences that is a bug

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["FILE", "write_report"]
 
 FILE = "report.html"
-_VIEWS = 4  # that are shown with pictures
+_VIEWS = 4  # views that are shown with pictures
 
 _log = logging.getLogger(__name__)
 

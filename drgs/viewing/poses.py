@@ -14,9 +14,9 @@ from drgs.cameras import Camera, intrinsics
 
 __all__ = ["Pose", "camera_of", "looking", "pose_of"]
 
-_WIDEST = math.radians(150.0)  # of a client's view; a wider one is drawn so wide
+_WIDEST = math.radians(150.0)  # widest view of a client; a wider one is drawn so wide
 _LARGEST = 1 << 15  # pixels of a side of a window
-_FARTHEST = 1e30  # of a coordinate: its square is a number, too
+_FARTHEST = 1e30  # largest coordinate: its square is a number, too
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -42,9 +42,9 @@ REST = 0.3
 _PRESETS = ("exact", "fast", "gsplat")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
-_COVERS = 0.5  # of half a view's narrower side: a frustum that reaches farther is hidden
+_COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
-_MOMENTS = 48  # at most so many times in a round of playing
+_MOMENTS = 48  # times in a round of playing, at most
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
 
