@@ -177,7 +177,7 @@ def _view(
     name: str,
 ) -> dict:
     """Mask and picture of a view, and its row of query.json."""
-    with torch.no_grad():  # a picture
+    with torch.no_grad():  # a picture is looked at only
         out = render(g, camera, settings, ())
     _, selected = query.score(out.features, decoder)
     mask = (selected & (out.alpha.cpu() >= OPAQUE)).numpy()

@@ -19,8 +19,10 @@ def fit_command(config: FitConfig, active: ActiveConfig | None, data: Path, outp
     """`drgs fit ...` with every option that is not the default's.
 
     Args:
-        config, active: Of the fit; None: it was fitted to all views.
-        data, output: The data set and the run folder.
+        config: Configuration of the fit.
+        active: How views were chosen; None: it was fitted to all views.
+        data: Folder of the data set.
+        output: Folder of the run.
     Returns:
         The line for a shell, and the fields of `config` that no option sets, as `name=value`: these need Python.
     """
@@ -65,7 +67,7 @@ def _option(name: str, value: Any, default: Any) -> list[str]:
 
 
 def _value(value: Any) -> str:
-    """As the command line reads it."""
+    """A value as the command line reads it."""
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if isinstance(value, float) else str(value)
