@@ -74,7 +74,7 @@ SHARED = {
 }
 
 # Rooms in which modules still know each other. None may be added.
-CIRCLES = {"data", "fitting", "cluster", "commands"}
+CIRCLES = {"data", "fitting", "commands"}
 
 LINES = 600  # one subject, unpacked; above it a file is about two things
 
