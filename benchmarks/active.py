@@ -31,7 +31,7 @@ from drgs.studies.curves import draw_curves
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import at_views, values_of
 from drgs.studies.tables import fill_between, study_report
-from drgs.train import ActiveConfig, FitConfig
+from drgs.train import FitConfig, SelectionConfig
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")
 REPORT = ("office", "statue", "room-5", "room-6", "room-7", "still-1", "still-2", "still-3")
@@ -87,8 +87,12 @@ SPLITS = {"banana": ((7, 0), (7, 3)), "captures": ((4, 0), (4, 2)), "room": ((3,
 three elevations in turn, and the lowest would be held out whole.
 """
 SCALES = {
-    "small": (FitConfig(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, semantics="ignore"), 40, (160, 120)),
-    "paper": (FitConfig(max_pixels=130_000, max_gaussians=30_000, max_steps=7000, semantics="ignore"), 200, (320, 240)),
+    "small": (FitConfig.of(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, semantics="ignore"), 40, (160, 120)),
+    "paper": (
+        FitConfig.of(max_pixels=130_000, max_gaussians=30_000, max_steps=7000, semantics="ignore"),
+        200,
+        (320, 240),
+    ),
 }
 
 
@@ -109,8 +113,7 @@ def study_of(scale: str, runs: Path) -> Study:
         name=f"active-{scale}",
         folder=folder,
         policies=POLICIES,
-        fit=fit,
-        active=ActiveConfig(initial=2, add=10, every=every, measure=(3, 4, 6, 8)),
+        fit=fit.replace(selection=SelectionConfig(initial=2, add=10, every=every, measure=(3, 4, 6, 8))),
         metrics=METRICS,
         reference="random",
         comparisons=tuple(

@@ -14,7 +14,7 @@ from drgs.runtime import version
 
 if TYPE_CHECKING:
     from drgs.commands.options import Cite
-    from drgs.fitting.config import ActiveConfig
+    from drgs.fitting.config import SelectionConfig
     from drgs.fitting.records import FitRecord
 
 __all__ = ["cited", "run"]
@@ -26,22 +26,22 @@ class _Used(NamedTuple):
     Attributes:
         record: Of its fit.
         format: Of its data set.
-        active: How views were chosen; of a run that chose none, None.
+        selection: How views were chosen; of a run that chose none, None.
         lpips: Whether LPIPS was measured.
     """
 
     record: FitRecord
     format: str
-    active: ActiveConfig | None
+    selection: SelectionConfig | None
     lpips: bool
 
     def chose(self, *policies: str) -> bool:
         """Whether views were chosen by one of these policies."""
-        return self.active is not None and self.active.policy in policies
+        return self.selection is not None and self.selection.policy in policies
 
     def scored(self, *criteria: str) -> bool:
         """Whether policy `fisher` scored by one of these criteria."""
-        return self.active is not None and self.active.policy == "fisher" and self.active.criterion in criteria
+        return self.chose("fisher") and self.selection is not None and self.selection.scoring.criterion in criteria
 
 
 class _Work(NamedTuple):
@@ -230,7 +230,7 @@ _WORKS = (
         lambda used: (
             used.chose("fisherrf")
             or used.scored("eig")
-            or (used.chose("fisher") and used.active is not None and used.active.method == "fisherrf")
+            or (used.chose("fisher") and used.selection is not None and used.selection.scoring.method == "fisherrf")
         ),
         "inproceedings",
         "jiang2024fisherrf",
@@ -346,7 +346,7 @@ def cited(folder: Path | None) -> str:
 def _used(folder: Path) -> _Used:
     """What a run did; it need not have come to its end."""
     from drgs.files import Run  # loads torch, which a list without a run does not need
-    from drgs.fitting.records import active_record, fit_record
+    from drgs.fitting.records import fit_record
 
     run = Run(folder)
     record = fit_record(run)
@@ -354,7 +354,7 @@ def _used(folder: Path) -> _Used:
     metrics: Any = read_json(path, "a run's metrics.json") if path.is_file() else {}
     mean = metrics.get("mean") if isinstance(metrics, dict) else None
     lpips = isinstance(mean, dict) and mean.get("lpips") is not None
-    return _Used(record, str(run.config().get("format", "")), active_record(run), lpips)
+    return _Used(record, str(run.config().get("format", "")), record.config.selection, lpips)
 
 
 def _entry(work: _Work) -> str:
