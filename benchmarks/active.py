@@ -32,7 +32,7 @@ from drgs.studies.experiments import SIZES, fisher_policy
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import at_views, values_of
 from drgs.studies.tables import fill_between, study_report
-from drgs.train import ActiveConfig, FitConfig
+from drgs.train import FitConfig, SelectionConfig
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")
 REPORT = ("office", "statue", "room-5", "room-6", "room-7", "still-1", "still-2", "still-3")
@@ -91,8 +91,8 @@ def study_of(scale: str, runs: Path) -> Study:
     sizes = SIZES["static", scale]
     width, height = sizes.image
     # Colors alone: what the paper's study says of features holds for none of these fits.
-    names = ("max_pixels", "max_gaussians", "max_steps")
-    fit = FitConfig(semantics="ignore", **{name: getattr(sizes.fit, name) for name in names})
+    sized = {"max_pixels": sizes.fit.data.max_pixels, "max_gaussians": sizes.fit.density.max_gaussians}
+    fit = FitConfig.of(semantics="ignore", max_steps=sizes.fit.max_steps, **sized)
 
     def folder(scene: str, split: tuple[int, int]) -> Path:
         name, _, seed = scene.partition("-")
@@ -107,8 +107,7 @@ def study_of(scale: str, runs: Path) -> Study:
         name=f"active-{scale}",
         folder=folder,
         policies=POLICIES,
-        fit=fit,
-        active=ActiveConfig(initial=2, add=10, every=sizes.every, measure=(3, 4, 6, 8)),
+        fit=fit.replace(selection=SelectionConfig(initial=2, add=10, every=sizes.every, measure=(3, 4, 6, 8))),
         metrics=METRICS,
         reference="random",
         comparisons=tuple(

@@ -67,25 +67,25 @@ def base(name: str, runs: Path, views: int, steps: int) -> tuple:
     The first training view and those farthest from it; kept as a checkpoint for the next call.
     """
     train, test = dataset(name, runs).split(8)
-    config = FitConfig(**BASE, max_steps=steps)
+    config = FitConfig.of(**BASE, max_steps=steps)
     chosen = initial_views([view.camera for view in train], views)
-    pool = load_frames(train, config.max_pixels)
-    held_out = load_frames(test, config.max_pixels)
+    pool = load_frames(train, config.data.max_pixels)
+    held_out = load_frames(test, config.data.max_pixels)
     frames = [pool[i] for i in chosen]
     path = runs / "base" / f"{name}-{views}-{steps}.safetensors"
     if path.exists():
         tensors, header = load_state(path)
         return Trainer.from_state(config, frames, tensors, header, str(path)), pool, chosen, held_out
     views_seen = [train[i] for i in chosen]
-    points, colors, _ = initial_points(views_seen, seed=0, max_points=config.max_gaussians)
+    points, colors, _ = initial_points(views_seen, seed=0, max_points=config.density.max_gaussians)
     dense = any(view.depth_path is not None for view in views_seen)
     import torch
 
     model = GaussianRows.from_points(
         torch.from_numpy(points),
         torch.from_numpy(colors),
-        config.dense_opacity if dense else config.initial_opacity,
-        config.dense_scale if dense else 1.0,
+        config.density.dense_opacity if dense else config.density.initial_opacity,
+        config.density.dense_scale if dense else 1.0,
     )
     trainer = Trainer(config, frames, model, scene_extent([f.camera for f in frames], points))
     while trainer.step_index < steps:

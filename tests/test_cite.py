@@ -13,7 +13,7 @@ import pytest
 from drgs import cli
 from drgs.commands import cite
 from drgs.files import SCHEMA
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.semantic_record import SemanticRecord
 from drgs.settings import RenderSettings
 
@@ -34,12 +34,12 @@ def keys(text: str) -> set[str]:
 def run(tmp_path):
     """Writes the record of a fit; what it does not say is as a plain fit of a transforms.json has it."""
 
-    def write(preset: str = "fast", active: ActiveConfig | None = None, lpips: float | None = None, **fields):
-        config = FitConfig(settings=RenderSettings.preset(preset))
+    def write(preset: str = "fast", active: SelectionConfig | None = None, lpips: float | None = None, **fields):
+        config = FitConfig(settings=RenderSettings.preset(preset), selection=active)
         record = {"schema": SCHEMA, "command": "fit", "data": "scene", "format": "transforms", "train": ["a"]}
         record |= {"test": ["b"], "fit": config.to_json(), **fields}
         if active is not None:
-            record |= {"active": active.to_json(), "pool": ["a"]}
+            record |= {"pool": ["a"]}
         (tmp_path / "config.json").write_text(json.dumps(record))
         (tmp_path / "metrics.json").write_text(json.dumps({"mean": {"psnr": 20.0, "lpips": lpips}}))
         return tmp_path
@@ -76,15 +76,15 @@ def test_what_a_fit_used(run, asked, more):
 @pytest.mark.parametrize(
     ("active", "more"),
     [
-        (ActiveConfig(), {"ash2021bait"}),
-        (ActiveConfig(criterion="eig"), {"jiang2024fisherrf"}),
-        (ActiveConfig(criterion="logdet"), {"wilson2025popgs"}),
-        (ActiveConfig(criterion="block_logdet"), {"wilson2025popgs"}),
-        (ActiveConfig(policy="fisherrf"), {"jiang2024fisherrf"}),
-        (ActiveConfig(method="fisherrf"), {"ash2021bait", "jiang2024fisherrf"}),
-        (ActiveConfig(policy="moments"), {"ewen2025moments"}),
-        (ActiveConfig(policy="farthest"), set()),
-        (ActiveConfig(policy="random", method="fisherrf"), set()),
+        (SelectionConfig(), {"ash2021bait"}),
+        (SelectionConfig.of(criterion="eig"), {"jiang2024fisherrf"}),
+        (SelectionConfig.of(criterion="logdet"), {"wilson2025popgs"}),
+        (SelectionConfig.of(criterion="block_logdet"), {"wilson2025popgs"}),
+        (SelectionConfig.of(policy="fisherrf"), {"jiang2024fisherrf"}),
+        (SelectionConfig.of(method="fisherrf"), {"ash2021bait", "jiang2024fisherrf"}),
+        (SelectionConfig.of(policy="moments"), {"ewen2025moments"}),
+        (SelectionConfig.of(policy="farthest"), set()),
+        (SelectionConfig.of(policy="random", method="fisherrf"), set()),
     ],
 )
 def test_how_views_were_chosen(run, active, more):

@@ -37,8 +37,8 @@ from drgs.cluster.options import check_address
 from drgs.cluster.payloads import Missing, Payload, keep, opened_payload
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
-from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.information.pool import Scoring
+from drgs.fitting.config import FitConfig
+from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings
@@ -523,12 +523,12 @@ def folder_of(folder: Path, scene: str, split: tuple[int, int]) -> Path:
 
 def study_of(folder: Path, **fields) -> Study:
     """Three policies, many short steps."""
+    few = {"initial": 2, "add": 1, "every": 3}
     return Study(
         name="tiny",
         folder=functools.partial(folder_of, folder),
         policies={name: {"policy": name} for name in ("farthest", "random", "uniform")},
-        fit=FitConfig(**{"max_steps": 12, "max_gaussians": 60, "sh_degree": 1, "save_every": 4, **fields}),
-        active=ActiveConfig(initial=2, add=1, every=3),
+        fit=FitConfig.of(**{"max_steps": 12, "max_gaussians": 60, "sh_degree": 1, "save_every": 4, **few, **fields}),
         metrics=(Metric("psnr", "PSNR", 2),),
         reference="random",
     )

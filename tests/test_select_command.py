@@ -25,7 +25,7 @@ def place(tmp_path_factory):
     """`data`, an active run `run` on it (views 1, 5 and two more), `scene.ply`, `cameras.json`."""
     folder = tmp_path_factory.mktemp("select")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
-    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12, selection=plan()), progress=False)
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=SIZE))
     return folder
 

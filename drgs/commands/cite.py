@@ -16,7 +16,7 @@ from drgs.runtime import version
 
 if TYPE_CHECKING:
     from drgs.commands.options import Cite
-    from drgs.fitting.config import ActiveConfig
+    from drgs.fitting.config import SelectionConfig
     from drgs.fitting.records import FitRecord
 
 __all__ = ["cited", "run"]
@@ -28,26 +28,26 @@ class _Used(NamedTuple):
     Attributes:
         record: Record of its fit.
         format: Format of its data set.
-        active: How views were chosen, or None if none were.
+        selection: How views were chosen, or None if none were.
         lpips: Whether LPIPS was measured.
     """
 
     record: FitRecord
     format: str
-    active: ActiveConfig | None
+    selection: SelectionConfig | None
     lpips: bool
 
     def chose(self, *policies: str) -> bool:
         """Whether views were chosen by one of these policies."""
-        return self.active is not None and self.active.policy in policies
+        return self.selection is not None and self.selection.policy in policies
 
     def scored(self, *criteria: str) -> bool:
         """Whether policy `fisher` scored by one of these criteria."""
-        return self.active is not None and self.active.policy == "fisher" and self.active.criterion in criteria
+        return self.chose("fisher") and self.selection is not None and self.selection.scoring.criterion in criteria
 
     def with_fisherrf(self) -> bool:
         """Whether FisherRF's criterion, policy or method chose views."""
-        by_method = self.chose("fisher") and self.active is not None and self.active.method == "fisherrf"
+        by_method = self.chose("fisher") and self.selection is not None and self.selection.scoring.method == "fisherrf"
         return self.chose("fisherrf") or self.scored("eig") or by_method
 
 
@@ -102,7 +102,7 @@ def cited(folder: Path | None) -> str:
 def _used(folder: Path) -> _Used:
     """What a run did; it need not have come to its end."""
     from drgs.files import Run  # loads torch, which a list without a run does not need
-    from drgs.fitting.records import active_record, fit_record
+    from drgs.fitting.records import fit_record
 
     run = Run(folder)
     record = fit_record(run)
@@ -110,7 +110,7 @@ def _used(folder: Path) -> _Used:
     metrics: Any = read_json(path, "a run's metrics.json") if path.is_file() else {}
     mean = metrics.get("mean") if isinstance(metrics, dict) else None
     lpips = isinstance(mean, dict) and mean.get("lpips") is not None
-    return _Used(record, str(run.config().get("format", "")), active_record(run), lpips)
+    return _Used(record, str(run.config().get("format", "")), record.config.selection, lpips)
 
 
 def _entries() -> dict[str, str]:

@@ -156,14 +156,14 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
 
     start = time.perf_counter()
     dataset = load(data)
-    config = FitConfig(
+    config = FitConfig.of(
         max_steps=plan.steps, max_gaussians=plan.gaussians, max_pixels=plan.width * plan.height, save_every=plan.steps
     )
     run_folder.clear(_OWN)
     fitted = fit(dataset, out_dir / "run", config, progress=progress)
     lap("fit", start)
     g, mean = fitted.gaussians, fitted.metrics["mean"]
-    frames = load_frames(dataset.split()[1], config.max_pixels, config.mask)
+    frames = load_frames(dataset.split()[1], config.data.max_pixels, config.data.mask)
     say(
         f"2. Fit: {len(g)} Gaussians, {plan.steps} steps in {fitted.seconds:.0f} s; {len(frames)} views that it never "
         f"saw: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}, FLIP {mean['flip']:.3f}"

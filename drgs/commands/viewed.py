@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.commands.fisher import MAP_PRIOR, Told, added
-from drgs.commands.orbits import UP, Wish, capture_orbit, scene_orbit, seen_distance
+from drgs.commands.orbit_keys import UP
+from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
@@ -16,7 +17,6 @@ from drgs.data.capture import Focus, upright
 from drgs.ellipsoids import Gaussians
 from drgs.files import Run, state_header
 from drgs.fitting.records import fitted_views
-from drgs.gain import Prior
 from drgs.guards.foreign import refuse_foreign
 from drgs.viewing.layers import layers_of
 from drgs.viewing.placed_views import PlacedView, Ranking, placed_views_of, read_ranking
@@ -169,7 +169,7 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
     if not cameras:
         return None
     told = Told.of(given, args, given.settings("fast"), cameras)
-    prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
+    prior = args.given_prior() or MAP_PRIOR
     return Uncertainty(
         cameras,
         lambda camera: added(told.said(camera)),

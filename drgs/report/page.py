@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.report.pictures import Picture
 
 if TYPE_CHECKING:
@@ -276,16 +276,19 @@ def _memory(account: Account) -> str:
 
 def _configuration(account: Account) -> list[tuple[str, str, bool]]:
     """Name, value and whether it is not the default, of every field."""
-    config = account.record.config.to_json()
+    config = account.record.config
+    usual = FitConfig() if config.selection is None else FitConfig(selection=SelectionConfig())
+    return _rows("", config.to_json(), usual.to_json())
+
+
+def _rows(way: str, fields: dict, usual: dict) -> list[tuple[str, str, bool]]:
+    """Those of a nested record, its innermost fields by their ways."""
     rows = []
-    usual = FitConfig().to_json()
-    for name, value in config.pop("settings").items():
-        rows.append((f"settings.{name}", _text(value), value != usual["settings"][name]))
-    rows += [(name, _text(value), value != usual[name]) for name, value in config.items()]
-    active = account.config.get("active")
-    if isinstance(active, dict):
-        usual = ActiveConfig().to_json()
-        rows += [(f"active.{name}", _text(value), value != usual.get(name)) for name, value in active.items()]
+    for name, value in fields.items():
+        if isinstance(value, dict) and isinstance(usual[name], dict) and usual[name]:
+            rows += _rows(f"{way}{name}.", value, usual[name])
+        elif name != "selection":
+            rows.append((way + name, _text(value), value != usual[name]))
     return rows
 
 

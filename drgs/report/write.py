@@ -124,11 +124,11 @@ class _Cast:
     def of(cls, account: Account, dataset: Dataset) -> _Cast:
         """The cameras of a data set, by the split of the fit."""
         config = account.record.config
-        train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
+        train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
 
         def camera(view: View) -> Camera:
             plain = dataclasses.replace(view.camera.undistorted(), name=view.name)
-            return at_most(plain, config.max_pixels)
+            return at_most(plain, config.data.max_pixels)
 
         cameras = {view.name: camera(view) for view in train}
         tested = {view.name: camera(view) for view in test}
