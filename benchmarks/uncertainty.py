@@ -122,7 +122,7 @@ def table(rows: list[dict], scenes: list[str]) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--set", choices=list(active.SETS), default="report")
-    parser.add_argument("--scale", choices=list(active.SCALES), default="small")
+    parser.add_argument("--scale", choices=active.SCALES, default="small")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
     args = parser.parse_args()

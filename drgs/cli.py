@@ -24,7 +24,7 @@ from tyro import MISSING
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
-from drgs.cluster.wanted import check_wanted
+from drgs.cluster.options import check_options
 from drgs.commands.config_file import config_fields, default_of, named_config
 from drgs.commands.making_options import Demo, Reproduce, Scene, Sfm, Teach
 from drgs.commands.option_groups import Clustered
@@ -105,7 +105,7 @@ def main(argv: list[str] | None = None) -> int:
         if not 0 <= getattr(args, "seed", 0) < 1 << 31:
             raise ValueError(f"--seed must be in [0, {(1 << 31) - 1}], got {args.seed}; choose another")
         if isinstance(args, Clustered):
-            check_wanted(args.scheduler, args.workers)
+            check_options(args.scheduler, args.workers)
         with interrupts.handled(outputs.clean, lambda error: f"drgs {name}: {_ending(error)}\n"):
             try:
                 # Whatever a command does without a bar of its own is not silent either.

@@ -271,12 +271,12 @@ def test_what_is_refused_leaves_nothing(still, tmp_path, capsys):
 def test_workers_get_whole_paths(tmp_path, monkeypatch):
     """What is sent to workers, which have working directories of their own, does not depend on this one."""
     pytest.importorskip("cloudpickle")
-    from drgs.cluster.payloads import Parcel
+    from drgs.cluster.payloads import Payload
 
     sent = []
 
     def run_cells(study, *rest):
-        sent.append(Parcel.of(study))
+        sent.append(Payload.of(study))
         return [], {}
 
     monkeypatch.setattr("drgs.commands.reproduce.run_cells", run_cells)

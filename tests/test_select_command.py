@@ -59,6 +59,16 @@ def test_unused_views_of_a_run(place, monkeypatch, capsys):
     assert all(word in text for word in ("means", "rot.", "scales", "opac.", "sh", "margin"))
 
 
+def test_what_is_made_once(place, monkeypatch, capsys, made):
+    """Settings of the command are made once, and those of the run's record; of a view no more than two cameras: as it
+    is read, and under its name, at its size or without its lens."""
+    report, _ = select("run --candidates cameras.json --preset fast", place, monkeypatch, capsys)
+    views = len(load(place / "data").views) + len(report["candidates"])
+    assert made["RenderSettings"] <= 3
+    assert len(report["known"]["names"]) == len(report["candidates"]) == 4
+    assert made["Camera"] <= 2 * views
+
+
 def test_commands_know_the_backdrop(place, monkeypatch, capsys):
     """Unless told otherwise `drgs select` counts it, by `v_opt` and lambda 1e-2; `drgs fisher` as well."""
     report, text = select("run --candidates data --preset fast", place, monkeypatch, capsys)

@@ -214,10 +214,12 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
     of its picture, in scene units, or None where it sees nothing.
     """
 
+    fast = RenderSettings.preset("fast")
+
     def distance(camera: Camera) -> float | None:
         small = at_most(camera.undistorted(), _PROBE_PIXELS)
         with torch.no_grad():  # looked at, not optimized
-            out = render(gaussians, small, RenderSettings.preset("fast"), ("depth",))
+            out = render(gaussians, small, fast, ("depth",))
         rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
         depth = out.depth[rows, columns].cpu().numpy()
         alpha = out.alpha[rows, columns].cpu().numpy()

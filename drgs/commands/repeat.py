@@ -20,8 +20,9 @@ def fit_command(config: FitConfig, data: Path, output: Path) -> tuple[str, list[
     """`drgs fit ...` with every option that is not the default's.
 
     Args:
-        config: Of the fit.
-        data, output: The data set and the run folder.
+        config: Configuration of the fit.
+        data: Folder of the data set.
+        output: Folder of the run.
     Returns:
         The line for a shell, and the fields that no option sets, as `name=value`: these need a file (--config).
     """
@@ -68,7 +69,7 @@ def _option(name: str, value: Any, default: Any) -> list[str]:
 
 
 def _value(value: Any) -> str:
-    """As the command line reads it."""
+    """A value as the command line reads it."""
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if isinstance(value, float) else str(value)

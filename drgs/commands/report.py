@@ -50,9 +50,9 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
     """Write the page of a run.
 
     Args:
-        run: The run folder.
-        path: The HTML file.
-        dataset: What was fitted; None where it is no longer there.
+        run: Folder of the run.
+        path: HTML file to write.
+        dataset: Data set that was fitted; None where it is no longer there.
     """
     record = fit_record(run)
     command, beyond = fit_command(record.config, record.data, run.path)

@@ -34,11 +34,11 @@ _SHORT = {
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
     check_counts(args)
-    args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     wanted = args.scoring()  # before files are read, too
     given = SceneInput.of(args)
-    settings = given.settings(args.preset)
+    settings = given.over_background(settings)
     scoring = dataclasses.replace(wanted, settings=settings, semantics=given.semantics())
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)

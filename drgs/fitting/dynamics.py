@@ -290,7 +290,8 @@ def _sizes(header: dict, networks: dict[str, dict], where: str) -> FieldConfig:
     """The sizes of a checkpoint's field, as far as its tensors bear them out: nothing is made by what a header says."""
     kind: dict[str, Any] = dict.fromkeys(("channels", "resolution", "time_resolution", "width", "depth"), int)
     check_json(where, header, {"field": {**kind, "levels": [int], "last_std": float}}, _ADVICE)
-    said = header["field"]
+    # A depth of 0 was one layer, as 1 is, in files of older versions.
+    said = {**header["field"], "depth": max(header["field"]["depth"], 1)}
     try:
         sizes = FieldConfig(**{**said, "levels": tuple(said["levels"])})
     except (TypeError, ValueError) as error:
@@ -301,7 +302,7 @@ def _sizes(header: dict, networks: dict[str, dict], where: str) -> FieldConfig:
     layers = sum(key.startswith("trunk.") and key.endswith(".weight") for key in mlp)
     shape = lambda x: None if x is None else tuple(x.shape)  # noqa: E731
     sides = [sizes.resolution * level for level in sizes.levels]
-    borne_out = len(grid) == 6 * len(sides) + 2 and layers == max(sizes.depth, 1)
+    borne_out = len(grid) == 6 * len(sides) + 2 and layers == sizes.depth
     for k, side in enumerate(sides):
         borne_out = borne_out and shape(grid.get(str(6 * k))) == (side, side, sizes.channels)
         borne_out = borne_out and shape(grid.get(str(6 * k + 3))) == (sizes.time_resolution, side, sizes.channels)

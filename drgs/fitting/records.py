@@ -306,14 +306,17 @@ def fit_record(run: Run) -> FitRecord:
     )
 
 
-def fitted_views(run: Run) -> list[str]:
+def fitted_views(run: Run, record: FitRecord | None = None) -> list[str]:
     """Names of the views that a run was fitted to: all of its training split, or those chosen so far.
 
+    Args:
+        run: The run folder.
+        record: Its `fit_record`, where that has been read already.
     Raises:
         FileNotFoundError: If it is no run folder, or an active run without selection.json.
         ValueError: If a file is damaged.
     """
-    record = fit_record(run)
+    record = record or fit_record(run)
     if not record.is_active:
         return list(record.train)
     path = run.path / "selection.json"

@@ -36,11 +36,15 @@ class Shown:
     """What was drawn for a page.
 
     Attributes:
-        charts: `progress`, `scores`, `cameras` -> SVG, or None.
-        previews: Pictures of the way.
-        views: Names of the views that are shown, with pictures by name: `photos`, `semantics` and `maps`.
-        moments: Stills of one camera, and its name.
-        notes: What is left out, and why.
+        charts: Name (`progress`, `scores`, `cameras`) -> SVG, or None.
+        previews: Pictures of how the fit went.
+        views: Names of the views that are shown.
+        photos: Name of a view -> photograph and rendering.
+        semantics: Name of a view -> picture of its labels.
+        maps: Name of a view -> its maps.
+        moments: Stills of one camera at several times.
+        moments_of: Name of that camera.
+        notes: Sentences that say what is left out, and why.
     """
 
     charts: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
@@ -58,10 +62,10 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
     """The page.
 
     Args:
-        account: How the fit went.
+        account: Account of how the fit went.
         shown: Charts and pictures.
-        command: That repeats the fit.
-        command_text: What it does not repeat, if anything.
+        command: Command that repeats the fit.
+        command_text: What the command does not repeat, if anything.
     """
     from jinja2 import Environment
     from markupsafe import Markup
@@ -247,7 +251,7 @@ def _picks(account: Account) -> dict[str, Any]:
 
 
 def _timings(account: Account) -> list[tuple[str, str, str]]:
-    """Where the wall time went."""
+    """Name and seconds of each part of the wall time."""
     steps = _seconds(account)
     wall = account.wall
     picks = account.selection["picks"] if account.selection else []

@@ -21,7 +21,7 @@ from drgs.studies.cells import Metric, Study
 from drgs.studies.choices import ExperimentName, StudyScale
 from drgs.studies.made import Sizes, made_folder
 
-__all__ = ["EXPERIMENTS", "SIZES", "Experiment", "PaperNumbers", "metrics_of", "study_of"]
+__all__ = ["EXPERIMENTS", "SIZES", "Experiment", "PaperNumbers", "fisher_policy", "metrics_of", "study_of"]
 
 PaperNumbers = Mapping[str, float]
 """Metric -> what the paper states."""
@@ -32,20 +32,21 @@ _DEFAULT = "geometry+semantic+backdrop, v_opt"
 _MOVING_DEFAULT = "joint+backdrop, v_opt"
 
 
-def _fisher(criterion: str, *blocks: str, **fields: Any) -> dict[str, Any]:
+def fisher_policy(criterion: str, *blocks: str, **fields: Any) -> dict[str, Any]:
+    """Fields of a `SelectionConfig` of policy `fisher` with a criterion and blocks, and whatever else is given."""
     return {"policy": "fisher", "criterion": criterion, "blocks": blocks, **fields}
 
 
 _EVERYTHING = ("geometry", "semantic", "deformation")
 _POLICIES: Mapping[str, Mapping[str, Any] | None] = {
     **{name: {"policy": name} for name in _BASELINES},
-    _JOINT: _fisher("eig", "geometry", "semantic"),
+    _JOINT: fisher_policy("eig", "geometry", "semantic"),
     _DEFAULT: {"policy": "fisher"},
-    "geometry": _fisher("eig", "geometry"),
-    "geometry+semantic": _fisher("eig", "geometry", "semantic"),
-    "geometry+deformation": _fisher("eig", "geometry", "deformation"),
-    "joint": _fisher("eig", *_EVERYTHING),
-    **{f"joint, lambda {x}": _fisher("eig", *_EVERYTHING, prior=Prior(float(x))) for x in ("0", "1e-7", "1e-5")},
+    "geometry": fisher_policy("eig", "geometry"),
+    "geometry+semantic": fisher_policy("eig", "geometry", "semantic"),
+    "geometry+deformation": fisher_policy("eig", "geometry", "deformation"),
+    "joint": fisher_policy("eig", *_EVERYTHING),
+    **{f"joint, lambda {x}": fisher_policy("eig", *_EVERYTHING, prior=Prior(float(x))) for x in ("0", "1e-7", "1e-5")},
     _MOVING_DEFAULT: {"policy": "fisher"},
     "all views": None,
 }
