@@ -24,7 +24,8 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cameras")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=20))
-    line = f"select {folder}/scene.ply --train {folder}/cameras.json --candidates orbit --count 9 --up z -k 3 --quiet"
+    orbit_of = "--candidates orbit --count 9 --orbit up=z"
+    line = f"select {folder}/scene.ply --train {folder}/cameras.json {orbit_of} -k 3 --quiet"
     assert cli.main([*line.split(), "--policy", "farthest", "-o", f"{folder}/picked.json"]) == 0
     return folder
 
