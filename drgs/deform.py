@@ -80,7 +80,7 @@ class FieldConfig:
         """The sizes of 4D Gaussian Splatting for videos of rooms (`neu3d`) or for one synthetic object (`dnerf`).
 
         Args:
-            name: Of the preset.
+            name: Name of the preset.
             times: How many distinct times there are; there is a node in time for every two of them, as in 4DGS. None
                 for those of its own data sets: 300 (`neu3d`) and 100 (`dnerf`).
             **fields: Fields that replace the preset's.

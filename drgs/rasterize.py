@@ -96,7 +96,7 @@ def rasterization(
             (..., C, N, K, 3), of which the first (sh_degree + 1)^2 are used.
         viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
         Ks: (..., C, 3, 3) in pixels, pixel centers at +0.5. A skew is followed (gsplat ignores it).
-        width, height: Of every image.
+        width, height: Size of every image, in pixels.
         near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out.
         radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
         eps2d: Added to the diagonal of the projected covariance, in px^2.

@@ -68,7 +68,7 @@ class Splats:
     degree: int | None
 
     def take(self, index: torch.Tensor) -> Splats:
-        """Those at `index`."""
+        """The Gaussians at `index`."""
         parts: dict[str, Any] = {name: x[index] for name, x in vars(self).items() if name != "degree"}
         return Splats(**parts, degree=self.degree)
 

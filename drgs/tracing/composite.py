@@ -53,7 +53,7 @@ def arranged(
     """The compositor of a view, and what it composites.
 
     Args:
-        lib, settings, traversal, want, width, couple: As `Compositor` takes them.
+        lib, settings, traversal, want, width, couple: Arguments of `Compositor`.
         p: Flat raw parameters by name, of which `sh` and `features` are read.
         coefficients: SH coefficients in `p["sh"]`.
         origins, directions: Three (P,) columns each, unit directions, both in the world of the means. Needed where rays
@@ -136,10 +136,10 @@ class Compositor:
         """Flat images rgb, alpha, and where there are any depth and features.
 
         Args:
-            record: Per-Gaussian floats, laid out as `records` says.
+            record: Columns (N,) of floats, laid out as `records` says.
             sh: Flat (N K 3) when SH are evaluated along rays, else None.
             features: Flat (N D) or None.
-            carried: Per-ray floats: SH basis values, then o and d of world rays.
+            carried: Columns (rays,): SH basis values, then o and d of world rays.
             keep: The adjoint may follow.
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
@@ -226,7 +226,7 @@ class Compositor:
         return out
 
     def _parts(self, channels: Channels) -> list[Part]:
-        """Of a pass: features need none where their weights are held."""
+        """The parts that a pass walks: features need none where their weights are held."""
         return [x for x in self.parts if x.weights is None] if channels.channels and not channels.color else self.parts
 
     def _primal(

@@ -26,7 +26,8 @@ class Replayed(Protocol):
     """A derivative that depends on the order by what lies in front of a hit and behind it.
 
     Attributes:
-        m, channels: Of the primal pass.
+        m: Says what a hit is.
+        channels: What the primal pass composited.
         finals: Per shared ray, its final state.
     """
 
@@ -38,7 +39,7 @@ class Replayed(Protocol):
         """Float64 sums along shared ray k, of which each hit takes its part."""
 
     def terms(self, k: int, values: list[Float], depth: Float, place: list, ok: Mask) -> list[Float]:
-        """Of each sum, what a hit's weight is multiplied by; values: its channels."""
+        """What a hit's weight is multiplied by in each sum; `values` are the channels of the hit."""
 
 
 class Table:
@@ -46,7 +47,7 @@ class Table:
 
     Args:
         part: Rays in the order of the lists of tiles, by which it is read.
-        count: Of the numbers that say what lies behind.
+        count: How many numbers say what lies behind.
     """
 
     def __init__(self, lib: Lib, part: Part, count: int) -> None:
@@ -63,8 +64,8 @@ class Table:
         return list(dr.gather(self.lib.ArrayXf, self.array, slot, active, shape=(self.count, dr.width(slot))))
 
     def read(self, place: list, a: Float) -> tuple[Float, Float, list[Float], Mask]:
-        """Of a hit of opacity `a` whose place begins with what was loaded: T, its weight, what lies behind it, and
-        whether it is one.
+        """T in front of a hit of opacity `a`, its weight, what lies behind it, and whether it is one; its place begins
+        with what was loaded.
         """
         T, *behind = place[0]
         return T, T * a, behind[: self.numbers - 1], T > 0
@@ -72,7 +73,7 @@ class Table:
     def if_any_hit(
         self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask, take: Callable
     ) -> list[dict]:
-        """As `derivatives.if_any_hit`, without looking at the Gaussian."""
+        """What `derivatives.if_any_hit` does, without looking at the Gaussian."""
         hits = self.lib.Bool(False)
         loaded = []
         for k, (st, place) in enumerate(zip(states, places, strict=True)):
@@ -95,7 +96,7 @@ def by_lists(
     hits the same ones along the lists of tiles, with a table.
 
     Args:
-        count: Of the numbers that say what lies behind a hit; None: no table, all rays as they are.
+        count: How many numbers say what lies behind a hit; None: no table, all rays as they are.
         kernel: Part, final states -> what says how these numbers are summed up.
     """
     if count is None or part.in_lists is None:
@@ -109,9 +110,9 @@ class Behind:
     """Replay of a primal pass in exact order that fills a table.
 
     Args:
-        kernel: Takes the derivative afterwards; says what is summed up along a ray.
-        part: Whose rays they are, in the table's tiles.
-        table: That is filled.
+        kernel: Takes the derivative afterwards, and says what is summed up along a ray.
+        part: Rays that are replayed, in the table's tiles.
+        table: The table that is filled.
     """
 
     def __init__(self, kernel: Replayed, part: Part, table: Table) -> None:
@@ -151,7 +152,7 @@ def passed(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok:
     Args:
         final: State of the ray after the primal pass.
         st: State with `T`, `alive` and `rest`, a Float64 for each term.
-        terms: Of each sum along the ray, what the hit's weight is multiplied by.
+        terms: What the hit's weight is multiplied by in each sum along the ray.
     """
     T = st["T"]
     left = 1 - a

@@ -48,11 +48,11 @@ class SortedHits:
     """The hits of the pixels of some tiles, found and sorted when they are walked along (`opened`).
 
     Args:
-        in_lists: Makes a part with these pixels, four a lane, along the lists of the tiles.
+        in_lists: Function that makes a part with these pixels, four a lane, along the lists of the tiles.
         index: (entries,) Gaussians of all lists; of the same key the first entry is the nearer hit.
         lengths: (tiles,) of the lists of these tiles.
         cut: (tiles,) what is taken off the squared extents, or None.
-        room: To hold the order in once it is known.
+        room: Memory to hold the order in once it is known.
     """
 
     def __init__(
@@ -151,9 +151,9 @@ class _Finder:
     """Writes the word of every hit into the row of its pixel; a `Kernel`.
 
     Args:
-        part: Whose rays they are.
-        words: Of all rows.
-        starts: Per shared ray, of its row.
+        part: Rays that look for hits.
+        words: Buffer of all rows.
+        starts: Per shared ray, where its row starts.
         cut: What is taken off the squared extents.
     """
 
@@ -201,7 +201,7 @@ def _sort(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor) -> N
 
 
 def _sort_at_once(words: torch.Tensor, lengths: torch.Tensor) -> None:
-    """By words, then, stably, by rows."""
+    """Sort by words, then, stably, by rows: cards sort one long array faster than many short ones."""
     row = torch.arange(PIXELS * len(lengths), device=words.device)
     row = row.repeat_interleave(lengths.repeat_interleave(PIXELS))
     used = words[: len(row)]

@@ -48,7 +48,7 @@ class TileTraversal:
 
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
-        trimmed: In `ray` order, leave tails out whose opacities add up to `_TAILS` at most in a pixel.
+        trimmed: Leave tails out, in `ray` order, whose opacities add up to `_TAILS` at most in a pixel.
     """
 
     world = False
@@ -384,7 +384,7 @@ def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
 
 
 class _Tiles:
-    """Of pairs of a Gaussian and a tile: whether there is a pixel center that may be hit.
+    """Whether a Gaussian may hit a pixel center of a tile, for pairs of these.
 
     Args:
         loaded: The first entries of each lane's record.
@@ -403,7 +403,7 @@ class _Tiles:
             self.limit = dr.minimum(self.limit, needed + 1e-4 * abs(needed) + 1e-4)
 
     def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
-        """Of tile (x, y), from the anchor."""
+        """Center of tile (x, y) from the anchor, in pixels."""
         at = (self.lib.Float(v) + 0.5 for v in (x, y))
         dx, dy = (v * TILE - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
         return dx, dy

@@ -221,10 +221,10 @@ def _matrix(buffer: Float) -> torch.Tensor:
 
 
 def signed(x: UInt32) -> torch.Tensor:
-    """In torch, which knows few operations of unsigned integers."""
+    """The same bits as int32 in torch, which knows few operations of unsigned integers."""
     return x.torch().view(torch.int32)
 
 
 def _unsigned(lib: Lib, x: torch.Tensor) -> UInt32:
-    """In Dr.Jit."""
+    """Numbers >= 0 of torch as unsigned integers of Dr.Jit."""
     return lib.UInt32(lib.Int32(x.to(torch.int32)))
