@@ -321,6 +321,7 @@ def _checked_bounds(bounds: ArrayLike | torch.Tensor) -> torch.Tensor:
         )
     middle = box.mean(0)
     size = box[1] - box[0]
+    # Coordinates are divided by it: a flat scene has a side of 0, a single point three.
     size = size.clamp_min(_FLATTEST * float(size.max()) or 1.0)
     return torch.stack([middle - size / 2, middle + size / 2])
 

@@ -92,7 +92,7 @@ class OracleScene:
     def take(self, keep: torch.Tensor) -> OracleScene:
         """The Gaussians at `keep`, a mask or an index."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        taken = {name: x[keep] for name, x in fields.items() if isinstance(x, torch.Tensor)}
+        taken: dict[str, Any] = {name: x[keep] for name, x in fields.items() if isinstance(x, torch.Tensor)}
         screen = None if self.screen is None else self.screen.take(keep)
         return dataclasses.replace(self, **taken, screen=screen)
 

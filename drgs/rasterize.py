@@ -246,6 +246,8 @@ def _projected(
         z = torch.where(valid, z, 1)  # the others have no projection
         u, v = x / z, y / z
         means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
+        # The Jacobian of a mean far outside of the view is that at the view's widened edge, and has no derivative by
+        # where the mean is along that axis: the rasterizers' own rule.
         if settings.fov_clamp == "gsplat":
             half = 0.15 * camera.width / fx, 0.15 * camera.height / fy
             u = u.clamp(-cx / fx - half[0], (camera.width - cx) / fx + half[0])

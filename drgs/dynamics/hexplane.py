@@ -108,6 +108,7 @@ def _between(x: torch.Tensor, nodes: int, dtype: torch.dtype) -> tuple[torch.Ten
 
     NaN stays NaN in the second, and is a legal index.
     """
+    # What lies outside sees the border, and has no derivative by where it is.
     x = x.clamp(0, 1) * (nodes - 1)
     below = x.detach().long().clamp(0, nodes - 2)  # which cell it is has no derivative
     return below, (x - below).to(dtype)

@@ -234,6 +234,7 @@ def proxy_scene(
 
 def _groups(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of equal columns (k, N) side by side, and where each group starts, one more at the end."""
+    # Stable: primitives come in an order that no sort chooses.
     order = np.argsort(columns[0], kind="stable")
     x = columns[0, order]
     equal = np.flatnonzero(x[1:] == x[:-1])
@@ -387,6 +388,7 @@ def _coherent(lib: Lib, rays: list[Float]) -> UInt32:
             bits = lib.UInt64((x - y) * scale)
             for b in range(10):
                 key |= ((bits >> b) & 1) << (6 * b + group + k)
+    # Only which rays share a packet: each is composited on its own, so that the image is the same in any order.
     order = lib.UInt32(dr.argsort(key))
     dr.eval(order)
     return order

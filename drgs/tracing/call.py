@@ -16,8 +16,7 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
-from drgs.tracing.composite import Arguments, Compositor, arranged
-from drgs.tracing.operation import Composite
+from drgs.tracing.composite import Arguments, Composite, Compositor, compositor_of
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.tiles import TileTraversal
 from drgs.tracing.walk import Traversal
@@ -196,7 +195,7 @@ class Call:
             trimmed = not self.want & {"depth", "count"}
             traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed)
         rays = self._column(p, "ray_origins"), self._column(p, "ray_directions")
-        return arranged(
+        return compositor_of(
             lib, s, traversal, p, self.coefficients, *rays, want=self.want, width=self.width, couple=self.couple
         )
 

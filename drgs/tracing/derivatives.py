@@ -25,7 +25,7 @@ import drjit as dr
 
 from drgs.tracing.arrays import Float, Mask, UInt32
 from drgs.tracing.harmonics import sh_color
-from drgs.tracing.hit_table import Table, passed
+from drgs.tracing.hit_table import Table, replayed_hit
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_packed, packed_size
@@ -161,7 +161,7 @@ class Adjoint:
                 a0 = dr.detach(a)
                 (s,) = self.terms(number, values, depth, place, ok)
                 if self.table is None:
-                    T, w, (behind,), new = passed(self.finals[number], st, a0, [s], place, ok)
+                    T, w, (behind,), new = replayed_hit(self.finals[number], st, a0, [s], place, ok)
                 else:
                     T, w, (behind,), ok = self.table.read(place, a0)
                     new = dict(st)

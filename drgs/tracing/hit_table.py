@@ -19,7 +19,7 @@ from drgs.tracing.kernels import Channels, HitModel
 from drgs.tracing.primitives import Ray
 from drgs.tracing.walk import Part
 
-__all__ = ["Replayed", "Table", "by_lists", "passed"]
+__all__ = ["Replayed", "Table", "along_lists", "replayed_hit"]
 
 
 class Replayed(Protocol):
@@ -89,7 +89,7 @@ class Table:
         )
 
 
-def by_lists(
+def along_lists(
     lib: Lib, part: Part, finals: list[dict], count: int | None, kernel: Callable[[Part, list[dict]], Replayed]
 ) -> tuple[Part, list[dict], Table | None]:
     """What a derivative walks of a part: its rays with their final states; in place of rays along rows of their own
@@ -102,11 +102,11 @@ def by_lists(
     if count is None or part.in_lists is None:
         return part, finals, None
     table = Table(lib, part.in_lists(), count)
-    dr.eval(part.run(Behind(kernel(part, finals), part, table)), table.array)
+    dr.eval(part.run(_TableFiller(kernel(part, finals), part, table)), table.array)
     return table.part, [], table
 
 
-class Behind:
+class _TableFiller:
     """Replay of a primal pass in exact order that fills a table.
 
     Args:
@@ -140,13 +140,13 @@ class Behind:
         loaded: Any = kernel.channels.load(self.m.lib, index, ray, going)
         a, depth, ok = self.m.hit(loaded["record"], ray, going)
         terms = kernel.terms(0, kernel.channels.values(self.m, loaded, ray), depth, place, ok)
-        T, _, behind, new = passed(kernel.finals[0], st, a, terms, place, ok)
+        T, _, behind, new = replayed_hit(kernel.finals[0], st, a, terms, place, ok)
         numbers = [T, *behind, *[self.m.lib.Float(0)] * (table.count - table.numbers)]
         dr.scatter(table.array, self.m.lib.ArrayXf(numbers), self.part.slot(0, place), ok)
         return [new]
 
 
-def passed(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok: Mask) -> tuple:
+def replayed_hit(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok: Mask) -> tuple:
     """A hit of opacity `a` replayed: T in front of it, its weight, what lies behind it and the new state of the ray.
 
     Args:
