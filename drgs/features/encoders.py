@@ -14,7 +14,7 @@ trained. What comes out is a vector a patch that a text embedding can be compare
 
 Nothing is downloaded and no pickle is run: weights are safetensors, or torch files read with `weights_only`.
 
-References:
+Reference:
     Radford et al. 2021 (CLIP); Zhou, Loy, Dai 2022, "Extract Free Dense Labels from CLIP" (MaskCLIP), section 3.
 """
 
