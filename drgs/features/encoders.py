@@ -126,7 +126,7 @@ class ClipEncoder:
             pixels = self._pixels(image, scale)
             found = self.patches(pixels)
             if flip:
-                mirrored = self.patches(pixels.flip(3)).flip(2)
+                mirrored = self.patches(pixels.flip(3)).flip(2)  # back again, so that patches lie on one another
                 found = torch.stack([_unit(found), _unit(mirrored)]).mean(0)
             resized = torch.nn.functional.interpolate(_unit(found)[None], (height, width), mode="bilinear")[0]
             total += resized.cpu()
