@@ -29,7 +29,7 @@ from test_network_information import swarm
 
 from drgs import cli
 from drgs.cameras import orbit
-from drgs.cluster import connect, parcels
+from drgs.cluster import connect, payloads
 from drgs.cluster.agreement import Disagreement, check_agreement, statement
 from drgs.cluster.cells import run_cells_on
 from drgs.cluster.connect import opened
@@ -288,8 +288,8 @@ def test_parcels_bring_closures_and_tensors():
 
 def test_a_worker_keeps_the_last_few(monkeypatch):
     """Parcels come in pieces, in any order; those that were not used for longest make room, and are missing then."""
-    monkeypatch.setattr(parcels, "_PIECE", 10)
-    made = [Parcel.of(f"parcel {i}") for i in range(parcels._KEPT + 1)]
+    monkeypatch.setattr(payloads, "_PIECE", 10)
+    made = [Parcel.of(f"parcel {i}") for i in range(payloads._KEPT + 1)]
     assert len(made[0].pieces()) > 1
     for i, parcel in enumerate(made):
         for piece in reversed(parcel.pieces()):

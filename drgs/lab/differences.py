@@ -162,7 +162,7 @@ def _extrapolated(sums: list[float], bars: list[float]) -> tuple[float | None, f
         if best is None or error < best[1]:
             best = value, error, k
     value, error, k = best
-    # An error of 1e-3 is far below what is a bug (judgement._OWN).
+    # An error of 1e-3 is far below what is a bug (verdicts._OWN).
     if error <= 1e-3 * abs(value) or all(gap <= 4 * bar for gap, bar in zip(gaps, bars[1:], strict=True)):
         return value, error  # settled, or below rounding on all steps
     # A gap of 0 has a logarithm, too, far from 2.
