@@ -62,7 +62,7 @@ class FitResult:
 
     Attributes:
         gaussians: The Gaussians, also in `run.point_cloud`; those of a scene that moves are at rest.
-        metrics: As in metrics.json.
+        metrics: Contents of metrics.json.
         run: The run folder.
         seconds: Wall time of all steps, of resumed runs together.
     """
@@ -87,7 +87,7 @@ def fit(
     """Fit Gaussians to a data set and write a run folder.
 
     Args:
-        dataset: As `drgs.data.load` returns it.
+        dataset: Result of `drgs.data.load`.
         out_dir: The run folder: new, or with `resume` one that a fit of the same config has begun.
         config: What to do; the defaults if left out. With a `selection` the fit begins with a few views and chooses
             more on the way; the data set is best loaded with `lazy=True` and without points, so that nothing of views

@@ -62,7 +62,7 @@ class Experiment:
         policies: Label -> what the table calls it.
         reference: The label that the others are compared with.
         paper: Label -> the paper's numbers, as far as its text states them.
-        source: Where in the paper, on which data.
+        source: Place in the paper, and its data.
     """
 
     title: str
@@ -221,8 +221,8 @@ def study_of(
     """The study that an experiment's cells are of.
 
     Args:
-        study: Which of the two.
-        scale: Of its fits, and of the scenes that are made.
+        study: Name of the study.
+        scale: Scale of its fits, and of the scenes that are made.
         made: Folder of the scenes that are made.
         given: Scene -> data set, of those that are not made.
         policies: Label -> fields of `SelectionConfig`; default those of all its experiments.
