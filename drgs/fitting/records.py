@@ -340,6 +340,12 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     kind |= {"networks": [str]} if "networks" in header else {}
     kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
     check_json(str(path), header, kind, advice)
+    active = (header.get("active") or {}).get("config")  # of versions that wrote it there
+    check_json(str(path), {"active": active}, {"active": (None, dict)}, advice)
+    try:
+        recorded_config(header["config"], active)
+    except (ValueError, NotImplementedError) as error:
+        raise ValueError(f"{path}: {error}; {advice}") from None
     least = {"step": 0, "bad_steps": 0, "start_count": 1, "seconds": 0}
     for name, low in least.items():
         if header.get(name, low) < low:
