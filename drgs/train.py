@@ -26,7 +26,18 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig, FitConfig, SelectionConfig
+from drgs.fitting.config import (
+    ActiveConfig,
+    DataConfig,
+    DensityConfig,
+    FeatureConfig,
+    FitConfig,
+    LossConfig,
+    MotionConfig,
+    RateConfig,
+    SavingConfig,
+    SelectionConfig,
+)
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
@@ -48,7 +59,21 @@ if TYPE_CHECKING:
     from drgs.fitting.parts import Parts
     from drgs.information.pool import Workers
 
-__all__ = ["ActiveConfig", "FitConfig", "FitResult", "SelectionConfig", "Trainer", "fit"]
+__all__ = [
+    "ActiveConfig",
+    "DataConfig",
+    "DensityConfig",
+    "FeatureConfig",
+    "FitConfig",
+    "FitResult",
+    "LossConfig",
+    "MotionConfig",
+    "RateConfig",
+    "SavingConfig",
+    "SelectionConfig",
+    "Trainer",
+    "fit",
+]
 
 _log = logging.getLogger(__name__)
 

@@ -126,8 +126,8 @@ class Scoring(Record):
         """The blocks that are scored of a scene.
 
         Args:
-            gaussians: As they are at some time of it.
-            where: For messages.
+            gaussians: Gaussians of the scene at some time.
+            where: Name of the caller, for messages.
             scene: Itself; None: it is these Gaussians, which do not move.
         Raises:
             ValueError: If one is wanted that the scene does not have.
