@@ -107,6 +107,19 @@ def test_what_ran_before_goes_on():
         assert FitConfig(max_steps=9) != config
 
 
+def test_active_of_fit_goes_on(tmp_path):
+    """`fit(active=...)` is the config's selection: it is that which a data set without views is refused for."""
+    from drgs.data import Dataset
+    from drgs.train import fit
+
+    nothing = Dataset(tmp_path, "transforms", [])
+    with (
+        pytest.warns(DeprecationWarning, match="is written fit"),
+        pytest.raises(ValueError, match="active: there must be at least one training view"),
+    ):
+        fit(nothing, tmp_path / "run", active=SelectionConfig(), progress=False)
+
+
 # ------------------------------------------------------------------------------------------------------- as files
 
 

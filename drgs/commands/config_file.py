@@ -72,7 +72,7 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
 
     Args:
         options: The dataclass of the command.
-        fields: As `config_fields` returns them; those that the command has no use for are passed over.
+        fields: Result of `config_fields`; what the command has no use for is passed over.
         required: What stands for an option that has no default.
     """
     given = dict(fields)
@@ -80,7 +80,7 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
     if settings is not None:
         given["preset"], differences = settings.nearest_preset()
         given["overrides"] = tuple(override(name, x) for name, x in differences.items())
-        if "background" in options.__dataclass_fields__:
+        if hasattr(options, "background"):
             given["background"] = settings.background
         elif settings.background != RenderSettings.background:
             given["overrides"] += (override("background", settings.background),)

@@ -55,7 +55,7 @@ class ActiveViews:
     Attributes:
         active: How views are chosen.
         views: The training split, in its order; what has not been picked has not been opened.
-        timetable: When one is picked, and among which.
+        timetable: Steps at which views are picked, and among which.
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
         measured: One record for each number of views at which the held-out views were measured on the way.
@@ -147,7 +147,7 @@ class ActiveViews:
 
         Args:
             frame: Its photograph.
-            scene: As it is now, seen at the time of the view.
+            scene: Scene at this step, seen at the time of the view.
         Returns:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
@@ -238,7 +238,7 @@ class ActiveViews:
 
         Args:
             step: Steps done.
-            result: Its.
+            result: Metrics that it returned.
         """
         labels = (result.get("segmentation") or {}).get("run") or {}
         record = {"views": len(self.chosen), "step": step, "mean": result["mean"], "median": result["median"]}
@@ -249,10 +249,10 @@ class ActiveViews:
         """Choose one more view, then read it.
 
         Args:
-            scene: As it is now, seen by each view at its time.
+            scene: Scene at this step, seen by each view at its time.
             frames: The photographs seen so far; of these, too, only the cameras matter, and the masks.
             step: Steps done.
-            decoder: Of the features as it is now; they count in its metric.
+            decoder: Decoder of the features at this step; they count in its metric.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """

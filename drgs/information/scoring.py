@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Scoring"]
 
+_EXACT = RenderSettings.preset("exact")
 _KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
 
 
@@ -79,9 +80,7 @@ class Scoring(Record):
     """
 
     criterion: Criterion = CRITERION_NAMES[0]
-    settings: RenderSettings = dataclasses.field(
-        default_factory=lambda: RenderSettings.preset("exact"), metadata=TRANSIENT
-    )
+    settings: RenderSettings = dataclasses.field(default=_EXACT, metadata=TRANSIENT)
     method: Method = METHODS[0]
     prior: Prior | None = None
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -127,8 +126,8 @@ class Scoring(Record):
         """The blocks that are scored of a scene.
 
         Args:
-            gaussians: As they are at some time of it.
-            where: For messages.
+            gaussians: Gaussians of the scene at some time.
+            where: Name of the caller, for messages.
             scene: Itself; None: it is these Gaussians, which do not move.
         Raises:
             ValueError: If one is wanted that the scene does not have.
