@@ -72,7 +72,7 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
 
     Args:
         options: The dataclass of the command.
-        fields: As `config_fields` returns them; those that the command has no use for are passed over.
+        fields: Fields that `config_fields` returns; those that the command has no use for are passed over.
         required: What stands for an option that has no default.
     """
     given = dict(fields)

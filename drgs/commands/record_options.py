@@ -50,8 +50,8 @@ def options_of(kind: type[Record], only: Collection[str] = (), without: Collecti
 
     Args:
         kind: The record.
-        only: Fields that become options; none: all but
-        without: these. Parts that are named are left out as a whole.
+        only: Fields that become options; empty: all fields but those of `without`.
+        without: Fields that become no options. Parts that are named are left out as a whole.
     """
     fields = list[tuple[str, Any, Any]]()
     _collect(kind, kind(), set(only), set(without), fields)
