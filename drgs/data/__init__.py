@@ -10,18 +10,20 @@ from pathlib import Path
 
 from drgs.data.checks import list_images
 from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
+from drgs.data.dataset import Dataset
 from drgs.data.guesses import scene_extent
 from drgs.data.llff import load_llff
 from drgs.data.multicamera import find_camera_folders, frame_folders, load_cameras
 from drgs.data.neu3d import POSES_BOUNDS, find_posed_frames, find_videos, load_neu3d
 from drgs.data.points import added_points, initial_points, triangulated_count, triangulated_points
 from drgs.data.replica import POSES, load_replica
-from drgs.data.semantics import Semantics, attach
+from drgs.data.semantics import Semantics
+from drgs.data.sidecars import attach
 from drgs.data.train_meta import META, load_train_meta
 from drgs.data.transforms import find_transforms, load_transforms
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import check_times
-from drgs.data.views import Dataset, View
+from drgs.data.views import View
 from drgs.guards.foreign import refuse_foreign
 
 __all__ = [

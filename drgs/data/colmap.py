@@ -11,9 +11,11 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import file_inside
+from drgs.data.dataset import Dataset
 from drgs.data.masks import mask_file
-from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
-from drgs.data.views import Dataset, View
+from drgs.data.resizing import fit_to_image
+from drgs.data.view_checks import go_on_without, make_unique
+from drgs.data.views import View
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 

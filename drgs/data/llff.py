@@ -10,8 +10,10 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import inverse_pose, list_images, read_npy
-from drgs.data.view_checks import fit_to_image, make_unique
-from drgs.data.views import Dataset, View
+from drgs.data.dataset import Dataset
+from drgs.data.resizing import fit_to_image
+from drgs.data.view_checks import make_unique
+from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 
 __all__ = ["load_llff", "pose_rows", "row_camera"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.data.checks import image_size, read_image, unit_range
-from drgs.data.view_checks import nearest_resized
+from drgs.data.resizing import nearest_resized
 from drgs.guards.foreign import is_file
 
 __all__ = ["ALPHA_MASKS", "feature_mask", "mask_file", "masked_photo", "masks_of", "read_mask"]

@@ -18,8 +18,8 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import list_images
 from drgs.data.colmap import find_model, model_camera, model_points, read_model
+from drgs.data.dataset import Dataset
 from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous
-from drgs.data.views import Dataset
 
 __all__ = ["add_model_points", "find_camera_folders", "frame_folders", "frames_of", "load_cameras"]
 

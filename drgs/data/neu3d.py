@@ -10,11 +10,11 @@ import logging
 import re
 from pathlib import Path
 
+from drgs.data.dataset import Dataset
 from drgs.data.llff import pose_rows, row_camera
 from drgs.data.multicamera import add_model_points, frame_folders, frames_of
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.videos import VIDEO_SUFFIXES, VideoFile, list_videos, read_video
-from drgs.data.views import Dataset
 from drgs.display.progress import Bar
 
 __all__ = ["POSES_BOUNDS", "find_posed_frames", "find_videos", "load_neu3d"]

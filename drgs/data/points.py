@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.data.dataset import Dataset
 from drgs.data.guesses import (
     FEWEST,
     MASK_KEEP,
@@ -18,7 +19,7 @@ from drgs.data.guesses import (
 )
 from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
-from drgs.data.views import Dataset, View
+from drgs.data.views import View
 from drgs.display.progress import Bar
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.ply_lists import ply_source

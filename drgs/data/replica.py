@@ -19,7 +19,8 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, read_text, repaired_pose
-from drgs.data.views import Dataset, View
+from drgs.data.dataset import Dataset
+from drgs.data.views import View
 
 __all__ = ["POSES", "load_replica"]
 

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size
+from drgs.data.dataset import Dataset
+from drgs.data.resizing import fit_to_image, resized_to
 from drgs.data.videos import VideoFile, VideoFrame
-from drgs.data.view_checks import fit_to_image, go_on_without, resized_to
-from drgs.data.views import Dataset, View
+from drgs.data.view_checks import go_on_without
+from drgs.data.views import View
 from drgs.guards.foreign import is_file
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.capture import Focus
 from drgs.data.checks import file_inside, read_npz, repaired_pose
+from drgs.data.dataset import Dataset
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
-from drgs.data.views import Dataset
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.json_files import check_json, read_json
 

@@ -12,10 +12,12 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, file_inside, image_size, inverse_pose, repaired_pose
+from drgs.data.dataset import Dataset
 from drgs.data.points import read_point_ply
+from drgs.data.resizing import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME
-from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
-from drgs.data.views import Dataset, View
+from drgs.data.view_checks import go_on_without, make_unique
+from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 from drgs.guards.foreign import is_file
 from drgs.guards.json_files import check_json, read_json

@@ -1,4 +1,4 @@
-"""Views and data sets: cameras with images, masks, depth and feature maps and labels that are read when asked for."""
+"""Views: cameras with images, masks, depth and feature maps and labels, which are read when they are asked for."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import read_image, read_npy, unit_range
 from drgs.data.masks import read_mask
+from drgs.data.resizing import fit_to_image, nearest_resized, resize_area
 from drgs.data.semantics import Semantics, plain_labels
-from drgs.data.splits import SplitRule
 from drgs.data.undistortion import lens_maps, undistorted_map
 from drgs.data.videos import VideoFrame
-from drgs.data.view_checks import fit_to_image, nearest_resized
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Dataset", "View"]
+__all__ = ["View"]
 
 
 @dataclass
@@ -115,7 +114,7 @@ class View:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
-        return _resize_area(data, *self._size(width, height))
+        return resize_area(data, *self._size(width, height))
 
     def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.
@@ -133,7 +132,7 @@ class View:
             unseen = lens_maps(self.camera)[2]
             if unseen is not None:
                 data = np.where(unseen, np.float32(0), data)
-        return _resize_area(data, *self._size(width, height))
+        return resize_area(data, *self._size(width, height))
 
     def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is
@@ -217,106 +216,3 @@ class View:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return data
-
-
-@dataclass
-class Dataset:
-    """Views of one scene and, where the data set has them, its points.
-
-    Attributes:
-        path: what was loaded.
-        format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras`` or ``train_meta``.
-        views: in the order of the data set.
-        points: (P,3) float64 world points, or None.
-        colors: (P,3) float32 in [0,1], or None.
-        point_source: where the points come from, one line, empty without points.
-        test_every: every how many views one is held out.
-        test_offset: index, by name, of the first view that is held out.
-        absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
-            alone, which therefore stays the same whatever is missing.
-        semantics: a teacher's maps, labels and classes, or None where there are none.
-        test_cameras: names of the cameras that are held out at all times, which wins over the other rules; None or
-            empty: the other rules hold.
-        frames: numbers of the frames that were used, the same of each video or camera, one for each of `times`; empty
-            where there are no synchronous cameras.
-    """
-
-    path: Path
-    format: str
-    views: list[View]
-    points: np.ndarray | None = None
-    colors: np.ndarray | None = None
-    point_source: str = ""
-    test_every: int = 8
-    absent: list[View] = dataclasses.field(default_factory=list)
-    test_offset: int = 0
-    semantics: Semantics | None = None
-    test_cameras: tuple[str, ...] | None = None
-    frames: tuple[int, ...] = ()
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """The distinct times of the views, ascending; empty if none has one."""
-        return _times(self.views)
-
-    @property
-    def is_dynamic(self) -> bool:
-        """Whether the training views were taken at two times or more."""
-        return len(_times(self.split()[0])) >= 2
-
-    @property
-    def camera_names(self) -> tuple[str, ...]:
-        """The names of synchronous cameras, sorted; empty where views are photographs of their own."""
-        return tuple(sorted({view.camera_name for view in (*self.views, *self.absent)} - {""}))
-
-    def split(
-        self,
-        test_every: int | None = None,
-        test_offset: int | None = None,
-        test_cameras: tuple[str, ...] | None = None,
-    ) -> tuple[list[View], list[View]]:
-        """(train, test) views, both sorted by name, by the rule that `split_rule` names.
-
-        Cameras that are held out by name win over a split that the data set's own files state (`View.split`), and this
-        wins over both numbers.
-
-        Args:
-            test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
-            test_offset: 2 holds out the 3rd view first; the data set's own number if left out, 0 if `test_every` is
-                given alone.
-            test_cameras: names of the cameras that are held out at all times; the data set's own if left out.
-        Raises:
-            ValueError: If a number is out of range, the offset lies beyond the last view, or there is no such camera.
-        """
-        train, test = self._rule(test_every, test_offset, test_cameras).parts([*self.views, *self.absent])
-        there = {id(view) for view in self.views}
-        return [view for view in train if id(view) in there], [view for view in test if id(view) in there]
-
-    def split_rule(
-        self,
-        test_every: int | None = None,
-        test_offset: int | None = None,
-        test_cameras: tuple[str, ...] | None = None,
-    ) -> str:
-        """The rule of `split` in words, to be recorded with results."""
-        return self._rule(test_every, test_offset, test_cameras).words()
-
-    def _rule(self, test_every: int | None, test_offset: int | None, test_cameras: tuple[str, ...] | None) -> SplitRule:
-        if test_offset is None:
-            test_offset = self.test_offset if test_every is None else 0
-        every = self.test_every if test_every is None else test_every
-        cameras = self.test_cameras if test_cameras is None else test_cameras
-        return SplitRule.of([*self.views, *self.absent], len(self.views), every, test_offset, cameras or ())
-
-
-def _times(views: list[View]) -> tuple[float, ...]:
-    return tuple(sorted({view.camera.time for view in views if view.camera and view.camera.time is not None}))
-
-
-def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
-    import cv2
-
-    if data.shape[1::-1] == (width, height):
-        return np.ascontiguousarray(data)
-    shrinks = width <= data.shape[1] and height <= data.shape[0]
-    return cv2.resize(data, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
