@@ -12,6 +12,7 @@ import numpy as np
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import file_inside
 from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.masks import mask_file
 from drgs.data.resizing import fit_to_image
 from drgs.data.view_checks import go_on_without, make_unique
@@ -19,7 +20,7 @@ from drgs.data.views import View
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
+__all__ = ["COLMAP", "MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 # COLMAP's model numbers and parameter counts, for the camera models that drgs renders.
@@ -48,7 +49,6 @@ def load_colmap(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
     """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a
     folder).
@@ -105,6 +105,9 @@ def load_colmap(
         point_source=source,
         absent=absent,
     )
+
+
+COLMAP = Format(lambda path: find_model(path) is not None, load_colmap, MODEL_FOLDERS)
 
 
 def _image_folder(path: Path, model: Path) -> Path:

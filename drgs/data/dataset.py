@@ -23,7 +23,8 @@ class Dataset:
 
     Attributes:
         path: what was loaded.
-        format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras`` or ``train_meta``.
+        format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras``, ``train_meta``, or what a
+            loader from elsewhere calls it.
         views: in the order of the data set.
         points: (P,3) float64 world points, or None.
         colors: (P,3) float32 in [0,1], or None.

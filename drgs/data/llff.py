@@ -11,15 +11,19 @@ import numpy as np
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import inverse_pose, list_images, read_npy
 from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.resizing import fit_to_image
+from drgs.data.videos import list_videos
 from drgs.data.view_checks import make_unique
 from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 
-__all__ = ["load_llff", "pose_rows", "row_camera"]
+__all__ = ["LLFF", "POSES_BOUNDS", "load_llff", "pose_rows", "row_camera"]
+
+POSES_BOUNDS = "poses_bounds.npy"
 
 
-def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), lazy: bool = False, **_) -> Dataset:
+def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), lazy: bool = False) -> Dataset:
     """Load an LLFF data set: (N,17) rows of a 3x5 matrix [pose | height, width, focal] and two
     depth bounds.
 
@@ -29,12 +33,17 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
         lazy: open no image, see `drgs.data.load`.
 
     Raises:
-        FileNotFoundError: no such file, or no ``images``.
+        FileNotFoundError: no such file, no ``images``, or videos in their place whose names do not say their order.
         ValueError: not an (N,17) array, another number of images, or a pose that is not one.
     """
-    file = path if path.is_file() else path / "poses_bounds.npy"
-    rows = pose_rows(file)
+    file = path if path.is_file() else path / POSES_BOUNDS
     folder = file.parent / "images"
+    if (videos := list_videos(file.parent)) and not folder.is_dir():
+        raise FileNotFoundError(
+            f"{path}: videos of {file.name} must be named cam00.mp4, cam01.mp4, ..., got {videos[0].name}; "
+            "rename them in the order of its rows"
+        )
+    rows = pose_rows(file)
     if not folder.is_dir():
         raise FileNotFoundError(f"{file}: the photos must lie in {folder}, found no such folder; move them there")
     images = list_images(folder)
@@ -58,6 +67,9 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
         )
     make_unique(views)
     return Dataset(path, "llff", views)
+
+
+LLFF = Format(lambda path: (path / POSES_BOUNDS).is_file(), load_llff, (POSES_BOUNDS,), suffix=".npy")
 
 
 def pose_rows(file: Path) -> np.ndarray:

@@ -19,9 +19,10 @@ from drgs.cameras import Camera
 from drgs.data.checks import list_images
 from drgs.data.colmap import find_model, model_camera, model_points, read_model
 from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous
 
-__all__ = ["add_model_points", "find_camera_folders", "frame_folders", "frames_of", "load_cameras"]
+__all__ = ["CAMERA_FOLDERS", "add_model_points", "frame_folders", "frames_of", "load_cameras"]
 
 _NUMBER = re.compile(r"(?<!\d)(\d{1,20})$")  # at the end of a name
 _MODEL = "sparse_"  # where 4DGaussians has it
@@ -31,7 +32,7 @@ _ROUNDING = 1e-6  # of coordinates in text; one camera alone has no extent
 _log = logging.getLogger(__name__)
 
 
-def find_camera_folders(path: Path) -> list[Path]:
+def _find_camera_folders(path: Path) -> list[Path]:
     """The folders of two cameras or more that have frames; empty where there are none, or no COLMAP model with them."""
     return [] if _model(path) is None else frame_folders(path)
 
@@ -51,7 +52,6 @@ def load_cameras(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
     """Load folders of frames. A frame's number is at the end of its file's name; frames of one number are of one time.
 
@@ -66,7 +66,7 @@ def load_cameras(
         ValueError: a damaged model, none of whose images is named by a camera, cameras that move, or two frames of one
             number.
     """
-    model, folders = _model(path), find_camera_folders(path)
+    model, folders = _model(path), _find_camera_folders(path)
     reconstruction = read_model(model, points)
     images = _images_of(reconstruction, model, [folder.name for folder in folders])
     posed = {name: found[0] for name, found in images.items()}
@@ -92,6 +92,11 @@ def load_cameras(
     if points:
         _add_points(dataset, reconstruction, model, posed, test_cameras)
     return dataset
+
+
+CAMERA_FOLDERS = Format(
+    lambda path: path.is_dir() and bool(_find_camera_folders(path)), load_cameras, ("cam*/ beside a COLMAP model",)
+)
 
 
 def frames_of(folders: Sequence[Path], times: int) -> tuple[tuple[int, ...], dict[str, dict[int, Path]]]:

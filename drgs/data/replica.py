@@ -20,9 +20,10 @@ import numpy as np
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, read_text, repaired_pose
 from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.views import View
 
-__all__ = ["POSES", "load_replica"]
+__all__ = ["POSES", "REPLICA", "load_replica"]
 
 POSES = "traj_w_c.txt"
 _FIELD_OF_VIEW = 90.0  # degrees across the width
@@ -37,7 +38,6 @@ def load_replica(
     test_every: int = 8,
     test_offset: int = 0,
     lazy: bool = False,
-    **_,
 ) -> Dataset:
     """Load a sequence of Replica. Views are named by their numbers, with as many digits as the last one has, so that
     their names sort as they were taken: ``rgb_002`` for ``rgb_2.png`` of 900.
@@ -92,6 +92,9 @@ def load_replica(
         view.background = background
         view.is_checked = not lazy
     return dataset
+
+
+REPLICA = Format(lambda path: (path / POSES).is_file(), load_replica, (POSES,))
 
 
 def _poses(file: Path) -> np.ndarray:

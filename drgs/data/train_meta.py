@@ -17,13 +17,14 @@ from drgs.cameras import Camera
 from drgs.data.capture import Focus
 from drgs.data.checks import file_inside, read_npz, repaired_pose
 from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["META", "load_train_meta"]
+__all__ = ["TRAIN_META", "load_train_meta"]
 
-META = "train_meta.json"
+_META = "train_meta.json"
 _TEST = "test_meta.json"
 _POINTS = "init_pt_cld.npz"
 _IMAGES = "ims"
@@ -39,7 +40,6 @@ def load_train_meta(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
     """Load a data set of synchronous cameras. A camera is named by its ``cam_id``; frame k is the k-th of the lists.
 
@@ -51,16 +51,18 @@ def load_train_meta(
         FileNotFoundError: no such file, or too few of the images.
         ValueError: broken JSON, lists of different lengths, a pose that is not one, or camera-to-world matrices.
     """
-    file = path if path.is_file() else path / META
+    file = path if path.is_file() else path / _META
     folder = file.parent
     taken, count = _cameras(file)
     stated = {}
-    if (folder / _TEST).is_file() and file.name == META:
+    if (folder / _TEST).is_file() and file.name == _META:
         stated, tested = _cameras(folder / _TEST)
         if tested != count:
-            raise ValueError(f"{folder / _TEST}: must have the {count} times of {META}, has {tested}; cut one")
+            raise ValueError(f"{folder / _TEST}: must have the {count} times of {_META}, has {tested}; cut one")
         if twice := sorted(set(taken) & set(stated)):
-            raise ValueError(f"{folder / _TEST}: must have other cameras than {META}, {twice[0]} is in both; remove it")
+            raise ValueError(
+                f"{folder / _TEST}: must have other cameras than {_META}, {twice[0]} is in both; remove it"
+            )
     xyz = colors = None
     if (folder / _POINTS).is_file() and points:
         xyz, colors = _points(folder / _POINTS)
@@ -75,6 +77,11 @@ def load_train_meta(
     source = "" if xyz is None else f"{_POINTS}, {len(xyz)} points"
     dataset = Dataset(path, "train_meta", [], xyz, colors, source)
     return synchronous(dataset, recordings, numbers, where=file, background=background, lazy=lazy, strict=strict)
+
+
+TRAIN_META = Format(
+    lambda path: path.name == _META if path.is_file() else (path / _META).is_file(), load_train_meta, (_META,)
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, file_inside, image_size, inverse_pose, repaired_pose
 from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.points import read_point_ply
 from drgs.data.resizing import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME
@@ -22,7 +23,7 @@ from drgs.guards.camera_checks import check_handedness
 from drgs.guards.foreign import is_file
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["find_transforms", "load_transforms"]
+__all__ = ["TRANSFORMS", "load_transforms"]
 
 _SPLITS = ("train", "val", "test")
 _LENSES = {
@@ -37,7 +38,7 @@ _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
 
 
-def find_transforms(path: Path) -> list[Path]:
+def _files(path: Path) -> list[Path]:
     """The transforms files of a data set: one, or one a split; empty if there are none."""
     if path.is_file():
         return [path]
@@ -55,7 +56,6 @@ def load_transforms(
     points: bool = True,
     strict: bool = False,
     test_cameras: tuple[str, ...] | None = None,
-    **_,
 ) -> Dataset:
     """Load a ``transforms.json`` data set (OpenGL camera axes).
 
@@ -73,7 +73,7 @@ def load_transforms(
         FileNotFoundError: no such file, too few of the images that it names, or a mask or depth map is missing.
         ValueError: broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
     """
-    files = find_transforms(path)
+    files = _files(path)
     if not files:
         raise FileNotFoundError(
             f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
@@ -111,6 +111,14 @@ def load_transforms(
     dataset.colors = colors
     dataset.point_source = source
     return dataset
+
+
+TRANSFORMS = Format(
+    lambda path: path.is_dir() and bool(_files(path)),
+    load_transforms,
+    ("transforms.json", "transforms_{train,val,test}.json"),
+    suffix=".json",
+)
 
 
 def _name_cameras(dataset: Dataset, times: list[Any]) -> None:
