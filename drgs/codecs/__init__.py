@@ -17,15 +17,15 @@ from __future__ import annotations
 
 import logging
 import os
-import zipfile
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.codecs.folders import file_of_folder, refuse_checkpoint
+from drgs.codecs.codec import Codec
+from drgs.codecs.folders import file_of_folder, is_checkpoint, refuse_checkpoint
 from drgs.files import atomic_write, load_ply, save_ply
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
+from drgs.guards.registry import Registry
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,17 +34,28 @@ if TYPE_CHECKING:
 
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["READ", "WRITTEN", "check_suffix", "load_gaussians", "save_gaussians"]
+__all__ = ["CODECS", "Codec", "check_suffix", "load_gaussians", "readable", "save_gaussians"]
 
-READ = ".ply, .spz, .splat, .ksplat, .sog and .glb, a SOG folder or a model folder of INRIA's"
-WRITTEN = (".ply", ".spz", ".glb")
-_MADE_BY = {
-    ".sog": "`npx @playcanvas/splat-transform -g cpu {ply} {path}`, or SuperSplat (superspl.at/editor)",
-    ".splat": "`python convert.py {ply} --output {path}` of github.com/antimatter15/splat, or SuperSplat "
-    "(superspl.at/editor)",
-    ".ksplat": "`node util/create-ksplat.js {ply} {path}` of github.com/mkkellogg/GaussianSplats3D",
-}
-"""What makes a file that is only read of a PLY."""
+CODECS: Registry[Codec] = Registry(
+    "format of Gaussians",
+    "drgs.codecs",
+    {
+        "packed_ply": "drgs.codecs.packed_ply:PACKED_PLY",
+        "ply": Codec(".ply", load_ply, lambda path, head: head.startswith((b"ply\n", b"ply\r")), by_suffix=False),
+        "spz": "drgs.codecs.spz:SPZ",
+        "splat": "drgs.codecs.splat:SPLAT",
+        "ksplat": "drgs.codecs.ksplat:KSPLAT",
+        "sog": "drgs.codecs.sog:SOG",
+        "glb": "drgs.codecs.gltf:GLB",
+    },
+    Codec,
+)
+"""Formats of Gaussians, in the order in which they are asked whether a file is theirs; those of other packages and
+scripts come after these. PLY is written by `drgs.save_ply`, which alone has room for more columns.
+"""
+
+_HEAD = 1 << 18  # bytes: the longest header of a PLY
+_WHATEVER_THE_SUFFIX = (b"version https://git-lfs", b"PK\x03\x04")  # pointers and archives, which no reader opens
 _log = logging.getLogger(__name__)
 
 
@@ -67,30 +78,33 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
         ValueError: If it is damaged, of another kind (which is named, with the way round), or holds values that are
             not finite (the first index is named).
     """
-    from drgs.codecs import gltf, ksplat, packed_ply, sog, splat, spz
     from drgs.guards.inputs import check_path
 
     path = check_path("load_gaussians", path)
     if path.is_dir():
         found = file_of_folder(path)
         if found is None:
-            raise FileNotFoundError(f"{path}: must hold Gaussians, holds no file that is known; name one of {READ}")
+            raise FileNotFoundError(
+                f"{path}: must hold Gaussians, holds no file that is known; name one of {readable()}"
+            )
         path = found
     elif not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file of Gaussians, found none; check the path")
-    kind = _kind(path)
-    if kind == "spz":
-        return spz.load_spz(path, as_stored)
-    readers = {"packed": packed_ply.load_packed_ply, "sog": sog.load_sog, "glb": gltf.load_glb}
-    readers |= {"splat": splat.load_splat, "ksplat": ksplat.load_ksplat}
-    if kind in readers:
-        return readers[kind](path)
-    if kind == "checkpoint":
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    codec = _codec_of(path, head)
+    if codec is not None:
+        return codec.load_as_stored(path) if as_stored and codec.load_as_stored else codec.load(path)
+    if is_checkpoint(path, head):
         refuse_checkpoint(path)
-    if kind == "ply":
-        return load_ply(path)
     refuse_foreign(path, "a file of Gaussians")
-    raise ValueError(f"{path}: must be a file of Gaussians, is of no format that is known; what is read: {READ}")
+    raise ValueError(f"{path}: must be a file of Gaussians, is of no format that is known; what is read: {readable()}")
+
+
+def readable() -> str:
+    """What `load_gaussians` reads, for messages."""
+    *suffixes, last = dict.fromkeys(codec.suffix for codec in CODECS.values())
+    return f"{', '.join(suffixes)} and {last}, a SOG folder or a model folder of INRIA's"
 
 
 def save_gaussians(
@@ -110,8 +124,6 @@ def save_gaussians(
         ValueError: If the suffix is another one, a parameter is not finite (the first index is named), or the format
             cannot hold it.
     """
-    from drgs.codecs.gltf import encode_glb
-    from drgs.codecs.spz import encode_spz
     from drgs.guards.inputs import check_path, check_scene
 
     if isinstance(g, str | os.PathLike):
@@ -129,7 +141,8 @@ def save_gaussians(
     g.validate("save_gaussians")
     if g.features is not None:
         _log.warning("%s: left out the %d semantic features, %s has no room", path, g.features.shape[1], suffix)
-    data = (encode_spz if suffix == ".spz" else encode_glb)(_plain(g))
+    encode = next(codec.encode for codec in CODECS.values() if codec.suffix == suffix and codec.encode)
+    data = encode(_plain(g))
     with atomic_write(path) as file:
         file.write(data)
 
@@ -141,17 +154,19 @@ def check_suffix(where: str, path: Path) -> str:
         ValueError: If no such format is written; of those that are only read it says which program makes one.
     """
     suffix = path.suffix.lower()
-    if suffix in WRITTEN:
+    written = [".ply", *(codec.suffix for codec in CODECS.values() if codec.encode)]
+    if suffix in written:
         return suffix
-    known = f"{where}: {path.name} must end with {', '.join(WRITTEN)}, got {suffix or 'no suffix'}"
+    known = f"{where}: {path.name} must end with {', '.join(written)}, got {suffix or 'no suffix'}"
     if path.name.lower() == "meta.json":
         suffix = ".sog"  # the index of the same, in a folder
-    if suffix not in _MADE_BY:
+    made_by = next((codec.made_by for codec in CODECS.values() if codec.suffix == suffix), "")
+    if not made_by:
         raise ValueError(f"{known}; rename it")
     ply = path.with_name(("scene" if path.stem == "meta" else path.stem) + ".ply")
     raise ValueError(
         f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
-        f"{_MADE_BY[suffix].format(ply=ply, path=path)}"
+        f"{made_by.format(ply=ply, path=path)}"
     )
 
 
@@ -167,42 +182,11 @@ def _plain(g: Gaussians) -> Gaussians:
     return g.replace(**floats, features=None, origin=np.zeros(3))
 
 
-def _kind(path: Path) -> str | None:
-    """Of a file, by its first bytes; by its suffix where a format has no mark."""
-    with path.open("rb") as file:
-        head = file.read(1 << 18)  # the header of a PLY
-    suffix = path.suffix.lower()
-    if head.startswith((b"ply\n", b"ply\r")):
-        return "packed" if b" packed_position" in head.partition(b"\nend_header")[0] else "ply"
-    if head.startswith(b"version https://git-lfs"):
+def _codec_of(path: Path, head: bytes) -> Codec | None:
+    """The codec of a file, by its first bytes; by its suffix where none recognizes them."""
+    for codec in CODECS.values():
+        if codec.recognizes is not None and codec.recognizes(path, head):
+            return codec
+    if head.startswith(_WHATEVER_THE_SUFFIX):
         return None
-    if head.startswith(b"NGSP") or (head.startswith(b"\x1f\x8b") and _begin(head).startswith(b"NGSP")):
-        return "spz"
-    if head.startswith(b"glTF"):
-        return "glb"
-    if head.startswith(b"PK\x03\x04"):
-        return _kind_of_zip(path)
-    if path.name == "meta.json" and b'"means"' in head:
-        return "sog"
-    return {".splat": "splat", ".ksplat": "ksplat", ".ckpt": "checkpoint", ".sog": "sog", ".spz": "spz"}.get(suffix)
-
-
-def _begin(head: bytes) -> bytes:
-    """The first bytes of a gzip stream."""
-    try:
-        return zlib.decompressobj(wbits=31).decompress(head, 16)
-    except zlib.error:
-        return b""
-
-
-def _kind_of_zip(path: Path) -> str | None:
-    """Of a zip archive, by the names in it."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        names = []
-    if any(name.rpartition("/")[2] == "data.pkl" for name in names) or path.suffix.lower() == ".ckpt":
-        return "checkpoint"
-    known = any(name.rpartition("/")[2] == "meta.json" for name in names)
-    return "sog" if known or path.suffix.lower() == ".sog" else None
+    return next((x for x in CODECS.values() if x.by_suffix and x.suffix == path.suffix.lower()), None)

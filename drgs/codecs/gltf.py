@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
 from drgs.ellipsoids import Y_00
 from drgs.guards.json_files import check_json, parse_json
@@ -27,7 +28,7 @@ from drgs.guards.json_files import check_json, parse_json
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["encode_glb", "load_glb"]
+__all__ = ["GLB", "encode_glb", "load_glb"]
 
 _AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"
@@ -246,3 +247,6 @@ class _Accessors:
         if not accessor.get("normalized"):
             return raw.astype(np.float32)
         return np.maximum(raw.astype(np.float32) / one, -1.0)
+
+
+GLB = Codec(".glb", load_glb, lambda path, head: head.startswith(b"glTF"), by_suffix=False, encode=encode_glb)

@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.splat import LEAST_FLOAT
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["load_ksplat"]
+__all__ = ["KSPLAT", "load_ksplat"]
 
 _HEADER = 4096
 _SECTION = 1024
@@ -170,3 +171,10 @@ def _bucket_centers(path: Path, data: bytes, section: _Section) -> np.ndarray:
     stride = section.bucket_bytes
     raw = np.frombuffer(data, np.uint8, stride * section.buckets, at).reshape(section.buckets, stride)[:, :12]
     return np.ascontiguousarray(raw).view("<f4")[bucket].astype(np.float64)
+
+
+KSPLAT = Codec(
+    ".ksplat",
+    load_ksplat,
+    made_by="`node util/create-ksplat.js {ply} {path}` of github.com/mkkellogg/GaussianSplats3D",
+)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
 from drgs.guards.ply_headers import read_ply_header
 from drgs.guards.ply_lists import ply_source
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.guards.ply_headers import PlyElement
 
-__all__ = ["load_packed_ply"]
+__all__ = ["PACKED_PLY", "load_packed_ply"]
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -123,3 +124,11 @@ def _higher(rows: np.ndarray, coefficients: int) -> np.ndarray:
     table[[0, 255]] = 0, 1
     values = (table - 0.5) * 8
     return values[stored].reshape(-1, 3, coefficients).transpose(0, 2, 1)
+
+
+def _is_packed(path: Path, head: bytes) -> bool:
+    """Whether a PLY has packed columns in its header."""
+    return head.startswith((b"ply\n", b"ply\r")) and b" packed_position" in head.partition(b"\nend_header")[0]
+
+
+PACKED_PLY = Codec(".ply", load_packed_ply, _is_packed, by_suffix=False)

@@ -21,13 +21,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.codecs.bounded import Archive, pixels_of_webp
+from drgs.codecs.codec import Codec
+from drgs.codecs.folders import is_checkpoint, names_in_archive
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
 from drgs.guards.json_files import check_json, parse_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["load_sog"]
+__all__ = ["SOG", "load_sog"]
 
 _META = 4 << 20  # bytes
 _PALETTE = 64  # rows of SH side by side
@@ -195,3 +197,19 @@ class _Reader:
         most = 4 * self.count + (1 << 16)
         codes = self._pixels("shN", 1, self.count, most).reshape(-1, 4)[: self.count].astype(np.int64)
         return codes[:, 0] + 256 * codes[:, 1]
+
+
+def _is_sog(path: Path, head: bytes) -> bool:
+    """Whether it is an archive with a meta.json, or the meta.json of a folder."""
+    if head.startswith(b"PK\x03\x04"):
+        known = path.suffix.lower() == ".sog" or "meta.json" in names_in_archive(path)
+        return known and not is_checkpoint(path, head)
+    return path.name == "meta.json" and b'"means"' in head
+
+
+SOG = Codec(
+    ".sog",
+    load_sog,
+    _is_sog,
+    made_by="`npx @playcanvas/splat-transform -g cpu {ply} {path}`, or SuperSplat (superspl.at/editor)",
+)

@@ -27,12 +27,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.bounded import GzipReader, unzstd
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["encode_spz", "load_spz"]
+__all__ = ["SPZ", "encode_spz", "load_spz"]
 
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
 _COLOR = 0.15
@@ -249,3 +250,22 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     codes = magnitude | np.where(np.signbit(others), 512, 0).astype(np.uint32)
     shifted = largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
     return shifted.astype("<u4")
+
+
+def _is_spz(path: Path, head: bytes) -> bool:
+    """Whether it begins with the mark of SPZ, packed with gzip or not."""
+    if not head.startswith(b"\x1f\x8b"):
+        return head.startswith(b"NGSP")
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 16).startswith(b"NGSP")
+    except zlib.error:
+        return False
+
+
+SPZ = Codec(
+    ".spz",
+    load_spz,
+    _is_spz,
+    load_as_stored=lambda path: load_spz(path, as_stored=True),
+    encode=encode_spz,
+)

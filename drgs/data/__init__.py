@@ -51,6 +51,7 @@ LOADERS: Registry[Format] = Registry(
         "llff": "drgs.data.llff:LLFF",
         "replica": "drgs.data.replica:REPLICA",
     },
+    Format,
 )
 """Formats of data sets, in the order in which they are asked whether a folder is theirs; those of other packages and
 scripts come after these, so that no folder changes its meaning when something is installed.
@@ -145,14 +146,9 @@ def _format_of(path: Path) -> str:
 
     Raises:
         FileNotFoundError: If none does, for a folder.
-        ValueError: If none does, for a file, or a row of the table is no `Format`.
+        ValueError: If none does, for a file.
     """
     for name, form in LOADERS.items():
-        if not isinstance(form, Format):
-            raise ValueError(
-                f"load: the data set format {name!r} must be a drgs.data.Format, got {type(form).__name__}; write "
-                "Format(recognizes, load)"
-            )
         if form.recognizes(path):
             return name
     if not path.is_file():
