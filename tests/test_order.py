@@ -12,7 +12,7 @@ from scenes_random import Oracle, camera, compare, gaussians, relative
 from drgs import fisher, reference, runtime
 from drgs.integrator import render
 from drgs.settings import RenderSettings
-from drgs.tracing import rows, tiles, walk, words
+from drgs.tracing import rows, sort_keys, tiles, walk
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
 
@@ -71,7 +71,7 @@ def test_tables_of_few_tiles(rng, monkeypatch, width):
 
     def noted(view, *args):
         made = list(bands(view, *args))
-        parts.append((len(made), max(part.slots.size for part, _ in made)))
+        parts.append((len(made), max(band.slots for band in made)))
         return iter(made)
 
     monkeypatch.setattr(tiles.TileTraversal, "_bands", noted)
@@ -95,13 +95,13 @@ def test_words_of_hits(rng):
     keys = np.concatenate([keys, rng.lognormal(0, 20, 200)]).astype(np.float32)
     names = np.array([0, 1, 5, 2**31, 2**32 - 1], dtype=np.uint32)
     key, name = (x.ravel() for x in np.meshgrid(keys, names, indexing="ij"))
-    word = words.word_of(lib, lib.Float(key), lib.UInt32(name))
+    word = sort_keys.word_of(lib, lib.Float(key), lib.UInt32(name))
     normal = np.maximum(key, np.float32(1.2e-38))  # below, keys are all one
     assert (np.argsort(word.numpy(), kind="stable") == np.lexsort((name, normal))).all()
-    assert (word.numpy() > words.EMPTY).all()
-    assert (word.numpy() < words.BEYOND).all()
-    assert (words.name_of(lib, word).numpy() == name).all()
-    assert dr.all(words.word_of(lib, lib.Float(words.EMPTY), lib.UInt32(0)) < 0)
+    assert (word.numpy() > sort_keys.EMPTY).all()
+    assert (word.numpy() < sort_keys.BEYOND).all()
+    assert (sort_keys.name_of(lib, word).numpy() == name).all()
+    assert dr.all(sort_keys.word_of(lib, lib.Float(sort_keys.EMPTY), lib.UInt32(0)) < 0)
 
 
 @pytest.mark.parametrize("held", [0, 1 << 20])
@@ -119,7 +119,7 @@ def test_rows_have_every_hit_in_order(rng, monkeypatch, held):
     stream = part.stream.opened()
     assert (part.stream.held is stream) == bool(held)
     hits, start, end = (x.numpy() for x in (stream.hits, stream.start, stream.end))
-    entries = hits if held else words.name_of(lib, stream.hits).numpy()
+    entries = hits if held else sort_keys.name_of(lib, stream.hits).numpy()
     listed, found = compositor.traversal.lists.index.numpy(), {}
     for pixel, a, b in zip(part.flat[0].numpy(), start, end, strict=True):
         if a < b:
@@ -148,9 +148,9 @@ def test_both_ways_to_sort_rows(rng, monkeypatch, threads):
     for n, own in zip(lengths.tolist(), counts.tolist(), strict=True):
         for count in own:
             row = rng.lognormal(0, 9, count)
-            flat += [*row, *[words.BEYOND] * (n - count)]
-            expected += [*sorted(row), *[words.BEYOND] * (n - count)]
-    flat.append(words.BEYOND)  # buffers have one tile's slots more than they need
+            flat += [*row, *[sort_keys.BEYOND] * (n - count)]
+            expected += [*sorted(row), *[sort_keys.BEYOND] * (n - count)]
+    flat.append(sort_keys.BEYOND)  # buffers have one tile's slots more than they need
     one, other = (torch.tensor(flat, dtype=torch.float64) for _ in range(2))
     rows._sort_by_tile(one, lengths, counts, threads)
     rows._sort_at_once(other, lengths)

@@ -43,6 +43,7 @@ __all__ = [
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
 _PIXELS = 1200  # of a view as its depth is looked at
+_FAST = RenderSettings.preset("fast")  # measures depth along the ray, as `ewa` does not
 _SOLID = 0.5  # opacity from which on that is the depth of a surface
 _FARTHEST = 0.95  # of all depths
 _AROUND = 1.05  # of the distance of the outermost camera, which is inside
@@ -98,8 +99,7 @@ def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) ->
         # Without its lens, which tiles do not know: what is wanted is how far away things are, about.
         plain = colors_only(scene, camera.time)
         small = at_most(camera.undistorted(), _PIXELS)
-        # `fast` measures depth along the ray, `ewa` along the axis of the camera.
-        out = render(plain, small, RenderSettings.preset("fast"), outputs=("median_depth",))
+        out = render(plain, small, _FAST, outputs=("median_depth",))
     assert out.median_depth is not None
     return {"depths": out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu()}
 
