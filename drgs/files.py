@@ -60,6 +60,8 @@ _SHOWN = 200  # characters of a reader's own message
 def load_ply(path: str | os.PathLike) -> Gaussians:
     """Gaussians from a 3DGS PLY; columns are found by name, in any order.
 
+        g = drgs.load_ply("point_cloud.ply")
+
     Args:
         path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24 or 45 of them, channel by channel),
             opacity (logit), scale_0..2 (log) and rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS
@@ -156,6 +158,8 @@ def save_ply(
     comments: tuple[str, ...] = (),
 ) -> None:
     """Write Gaussians as INRIA's trainer does: binary little-endian float32, normals 0, the same order of columns.
+
+        drgs.save_ply(g, "out.ply", comments=("made by hand",))
 
     `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32. Features, where there
     are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.

@@ -103,6 +103,9 @@ def diagonal(
 ) -> Information:
     """The diagonal of J^T J, summed over views.
 
+        information = drgs.diagonal(g, cameras)
+        information["means"]  # (N, 3)
+
     Args:
         gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
         cameras: One or several; nothing of a view is kept but its sum.

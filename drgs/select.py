@@ -60,6 +60,9 @@ def select(
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
 
+        chosen = drgs.select_views(g, candidates=cameras[2:], train=cameras[:2], k=2)
+        [pick.name for pick in chosen.picks], chosen.scores
+
     With k = 1 one candidate's information is held at a time (criterion `v_opt`: that of all, where it fits); with k > 1
     that of all, 4 bytes a parameter and view.
     k picks at once are those of k calls in a row that move each pick from `candidates` to `train` (`uniform` and

@@ -75,7 +75,7 @@ SHARED = {
 }
 
 # Rooms in which modules still know each other. None may be added.
-CIRCLES = {"data", "fitting", "commands"}
+CIRCLES = {"commands"}
 
 LINES = 600  # one subject, unpacked; above it a file is about two things
 

@@ -62,6 +62,8 @@ _log = logging.getLogger(__name__)
 def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gaussians:
     """Gaussians from a file or folder of any format that is read, in the axes of 3DGS PLY files.
 
+        g = drgs.load_gaussians("point_cloud.ply")
+
     The format is found by the first bytes; .splat and .ksplat, which have no mark, by their suffix. SPZ and glTF have
     other axes than PLY files: they are turned, SH included (drgs/codecs/spz.py, drgs/codecs/gltf.py).
 
@@ -115,6 +117,8 @@ def save_gaussians(
     comments: tuple[str, ...] = (),
 ) -> None:
     """Write Gaussians in the format of a suffix: .ply, .spz (version 3) or .glb (KHR_gaussian_splatting); atomically.
+
+        drgs.save_gaussians(g, "scene.spz")
 
     Args:
         g: In the axes of 3DGS PLY files; SPZ and glTF get theirs.

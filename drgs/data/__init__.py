@@ -74,6 +74,10 @@ def load(
     """Load a data set; its format is found out from its files. No image is decoded, but the first and the last frame of
     each video, to check its time stamps.
 
+        dataset = drgs.load_data("scene")
+        train, test = dataset.split()
+        photograph = test[0].image()  # (H, W, 3) float32 in [0, 1], of test[0].camera.undistorted()
+
     Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json`` (D-NeRF's too); videos
     ``cam*.mp4`` beside ``poses_bounds.npy`` (Neural 3D Video); ``train_meta.json`` (Dynamic 3D Gaussians); folders of
     frames ``cam00``, ``cam01``, ... beside a COLMAP model, also in ``sparse_``, or beside ``poses_bounds.npy``; a
