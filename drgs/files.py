@@ -22,8 +22,7 @@ from drgs.guards import outputs
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
-from drgs.guards.ply_headers import EXTRA, extra_kind, read_ply_header
-from drgs.guards.ply_lists import ply_source
+from drgs.guards.ply_headers import EXTRA, extra_kind, ply_source, read_ply_header
 from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:

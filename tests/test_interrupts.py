@@ -174,7 +174,7 @@ def test_pycolmap_does_not_take_sigterm(tmp_path):
     code = (
         "import signal, os; from drgs.guards import interrupts\n"
         "with interrupts.between_steps() as is_interrupted:\n"
-        "    from drgs.data.native import pycolmap\n"
+        "    from drgs.data.pycolmap import pycolmap\n"
         "    os.kill(os.getpid(), signal.SIGTERM); print(is_interrupted(), flush=True)\n"
     )
     pytest.importorskip("pycolmap")

@@ -70,8 +70,8 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
     Args:
         path: A .ply (3DGS's or SuperSplat's compressed one), .spz, .splat, .ksplat, .sog or .glb; a folder of a SOG
             scene or its meta.json; a model folder of INRIA's, whose latest iteration is taken.
-        as_stored: Of an SPZ, keep the axes of the file: some writers leave out the turn that its specification asks
-            for.
+        as_stored: Keep the axes of the file, where the format (SPZ) has others than PLY: some writers leave out the
+            turn that its specification asks for.
     Returns:
         float32 `Gaussians`. Where a byte stands for an opacity of 0 or 1, or a scale is 0, its logit or logarithm is
         finite (drgs/codecs/values.py).
@@ -121,7 +121,7 @@ def save_gaussians(
         drgs.save_gaussians(g, "scene.spz")
 
     Args:
-        g: In the axes of 3DGS PLY files; SPZ and glTF get theirs.
+        g: Gaussians in the axes of 3DGS PLY files; SPZ and glTF get theirs.
         path: The file.
         extra, comments: Columns and lines that only a PLY has room for; see `save_ply`.
     Raises:

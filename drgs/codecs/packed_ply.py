@@ -15,8 +15,7 @@ import numpy as np
 
 from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
-from drgs.guards.ply_headers import read_ply_header
-from drgs.guards.ply_lists import ply_source
+from drgs.guards.ply_headers import ply_source, read_ply_header
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians

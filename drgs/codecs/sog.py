@@ -145,7 +145,7 @@ class _Reader:
         return quats_of_smallest(codes[:, 3].astype(int) - 252, (codes[:, :3] / 127.5 - 1.0) / 2**0.5)
 
     def _degree(self) -> int:
-        """Of the SH. Version 1 tells by the width of the palette's image."""
+        """Degree of the SH; version 1 tells it by the width of the palette's image."""
         if not self.has_sh:
             return 0
         if self.version == 1:

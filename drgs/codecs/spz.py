@@ -51,7 +51,7 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
 
     Args:
         path: The file; versions 2 and 3 may be packed with gzip or not.
-        as_stored: In the file's own axes, not in those of PLY files.
+        as_stored: Keep the file's own axes, in place of those of PLY files.
     Raises:
         ValueError: If it is damaged, of another version, or has extensions that may change what values mean.
     """

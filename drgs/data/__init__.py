@@ -91,26 +91,25 @@ def load(
     times, unless ``test_meta.json`` says which are.
 
     Args:
-        path: folder or file.
-        test_every: every how many views `Dataset.split` holds one out; 0 for none.
+        path: Folder or file.
+        test_every: Every how many views `Dataset.split` holds one out; 0 for none.
         test_offset: index, by name, of the first view that is held out, below `test_every`.
-        background: color in [0,1] that images with an alpha channel are composited on.
-        lazy: open no image, mask or depth file at all: cameras have the size that the camera file states, until
+        background: Color in [0,1] that images with an alpha channel are composited on.
+        lazy: Open no image, mask or depth file at all: cameras have the size that the camera file states, until
             `View.checked` compares it with the image. Where intrinsics are angles and no size is stated (Blender), all
             views get the size of the first training image, the only one opened.
         points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
             from all its images; of a model of synchronous cameras, those are read that two cameras show which are not
             held out.
-        strict: refuse a data set that lists images which are not there. By default at least 3 must be left; the
+        strict: Refuse a data set that lists images which are not there. By default at least 3 must be left; the
             missing ones are named in the log and held in `Dataset.absent`.
-        semantics: look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
-        times: how many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
+        semantics: Look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
+        times: How many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
             if there are no more; `Dataset.frames` says which. D-NeRF's photographs are all used.
-        test_cameras: names of synchronous cameras that `Dataset.split` holds out at all times, which wins over
+        test_cameras: Names of synchronous cameras that `Dataset.split` holds out at all times, which wins over
             `test_every`; None: those that the format holds out; empty: none.
-
     Raises:
-        FileNotFoundError: nothing there, photos without poses, or too few of the photos.
+        FileNotFoundError: Nothing there, photos without poses, or too few of the photos.
         ValueError: a file that is damaged or says something that cannot be.
     """
     path = Path(path)

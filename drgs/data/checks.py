@@ -91,9 +91,8 @@ def read_text(path: Path, what: str, largest: int) -> str:
     Args:
         what: It must be, for messages, e.g. "a list of poses".
         largest: Bytes that it may have.
-
     Raises:
-        FileNotFoundError: no such file.
+        FileNotFoundError: No such file.
         ValueError: larger, of another format, or bytes that are no text.
     """
     if not path.is_file():
@@ -112,8 +111,8 @@ def read_npy(path: Path) -> np.ndarray:
     size first.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a numeric npy file, or shorter than its header claims.
+        FileNotFoundError: No such file.
+        ValueError: Not a numeric npy file, or shorter than its header claims.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a .npy file, found none; check the path")
@@ -159,7 +158,7 @@ def check_npz(path: Path) -> list[str]:
     """The names of the arrays of an ``.npz`` archive, none of which claims more bytes than the file can hold.
 
     Raises:
-        ValueError: another archive, or one that lies.
+        ValueError: Another archive, or one that lies.
     """
     names = []
     with _reading_archive(path, "arrays of numbers"), zipfile.ZipFile(path) as archive:
@@ -178,8 +177,8 @@ def read_npz(path: Path, name: str) -> np.ndarray:
     """Read one plain numeric array of an ``.npz`` archive.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no such archive or array, or as `read_npy`.
+        FileNotFoundError: No such file.
+        ValueError: No such archive or array, or as `read_npy`.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an .npz file, found none; check the path")
@@ -219,7 +218,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of an image; only the header is read, where it says so.
 
     Raises:
-        ValueError: not an image, of no or more than 2^31 pixels, or of more than its file can hold.
+        ValueError: Not an image, of no or more than 2^31 pixels, or of more than its file can hold.
     """
     if is_heif(path):
         return heif_size(path)
@@ -241,8 +240,8 @@ def read_image(path: Path) -> np.ndarray:
     they are turned, these are the pixels that are shown, in 8 bits.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an image that can be decoded, or one whose data end early.
+        FileNotFoundError: No such file.
+        ValueError: Not an image that can be decoded, or one whose data end early.
     """
     import cv2
 

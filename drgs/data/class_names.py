@@ -24,7 +24,6 @@ def read_class_names(path: Path) -> tuple[dict[int, str], set[int]]:
 
     Returns:
         Number in label images -> name; and the numbers of what is no class (`NO_CLASS`).
-
     Raises:
         FileNotFoundError: No such file.
         ValueError: Not that layout, a number twice, or no class at all.

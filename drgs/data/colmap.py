@@ -54,12 +54,11 @@ def load_colmap(
     folder).
 
     Args:
-        path: the data set, or the model's own folder.
-        background: color that images with alpha are composited on.
-        lazy, points, strict: open no image, read no points and observations, need every image, see `drgs.data.load`.
-
+        path: The data set, or the model's own folder.
+        background: Color that images with alpha are composited on.
+        lazy, points, strict: Open no image, read no points and observations, need every image, see `drgs.data.load`.
     Raises:
-        FileNotFoundError: no model, no ``images`` folder, or too few of the images that the model lists.
+        FileNotFoundError: No model, no ``images`` folder, or too few of the images that the model lists.
         ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
     """
     model = find_model(path)
@@ -168,13 +167,15 @@ def model_points(reconstruction: Any, model: Path, seen_by: set[int] | None = No
     return points, colors
 
 
-# ------------------------------------------------------------------------------------ checks before
-# pycolmap reads
-
-
 def read_model(model: Path, points: bool = True) -> object:
-    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file
-    does not hold. Without `points`, points3D is not opened and observations are skipped.
+    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file does not hold.
+
+    Args:
+        model: Folder of the model.
+        points: False: points3D is not opened, and observations of images are skipped.
+    Raises:
+        FileNotFoundError: If a file of the model is missing.
+        ValueError: If one is damaged, or has a camera model that drgs does not render.
     """
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name in _REQUIRED:
@@ -201,7 +202,7 @@ def read_model(model: Path, points: bool = True) -> object:
 
 def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
     """What pycolmap reads in a folder; errors name the model."""
-    from drgs.data.native import pycolmap
+    from drgs.data.pycolmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
@@ -335,7 +336,7 @@ def _parameter_count(path: Path, number: int) -> int:
     for model_number, parameters in _MODELS.values():
         if model_number == number:
             return parameters
-    from drgs.data.native import pycolmap
+    from drgs.data.pycolmap import pycolmap
 
     try:
         name = pycolmap.CameraModelId(number).name
@@ -389,11 +390,11 @@ def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
 
 
 def _image_lines(lines: list[tuple[int, str]]) -> Iterator[tuple[int, list[str], tuple[int, str] | None]]:
-    """Of each image of images.txt: the number of its first line, the 10 words of this, of which the last is the name,
-    and its line of observations; None where the file ends before.
+    """The number of the first line of each image of images.txt, the 10 words of this line, of which the last is the
+    name, and its line of observations; None where the file ends before.
 
     Args:
-        lines: Their numbers and texts, without comments.
+        lines: Numbers and texts of the file's lines, without comments.
     """
     index = 0
     while index < len(lines):

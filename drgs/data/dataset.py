@@ -22,21 +22,21 @@ class Dataset:
     """Views of one scene and, where the data set has them, its points.
 
     Attributes:
-        path: what was loaded.
+        path: What was loaded.
         format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras``, ``train_meta``, or what a
             loader from elsewhere calls it.
-        views: in the order of the data set.
+        views: Views whose image is there, in the order of the data set.
         points: (P,3) float64 world points, or None.
         colors: (P,3) float32 in [0,1], or None.
-        point_source: where the points come from, one line, empty without points.
-        test_every: every how many views one is held out.
+        point_source: Origin of the points in one line; empty without points.
+        test_every: Every how many views one is held out.
         test_offset: index, by name, of the first view that is held out.
-        absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
+        absent: Views that the data set lists, but whose image is not there; they have no camera, and count in `split`
             alone, which therefore stays the same whatever is missing.
         semantics: a teacher's maps, labels and classes, or None where there are none.
-        test_cameras: names of the cameras that are held out at all times, which wins over the other rules; None or
+        test_cameras: Names of the cameras that are held out at all times, which wins over the other rules; None or
             empty: the other rules hold.
-        frames: numbers of the frames that were used, the same of each video or camera, one for each of `times`; empty
+        frames: Numbers of the frames that were used, the same of each video or camera, one for each of `times`; empty
             where there are no synchronous cameras.
     """
 
@@ -83,7 +83,7 @@ class Dataset:
             test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
             test_offset: 2 holds out the 3rd view first; the data set's own number if left out, 0 if `test_every` is
                 given alone.
-            test_cameras: names of the cameras that are held out at all times; the data set's own if left out.
+            test_cameras: Names of the cameras that are held out at all times; the data set's own if left out.
         Raises:
             ValueError: If a number is out of range, the offset lies beyond the last view, or there is no such camera.
         """
@@ -179,7 +179,7 @@ class SplitRule:
         return train, listed[self.offset :: self.every]
 
     def words(self) -> str:
-        """To be recorded with results."""
+        """The rule in words, to be recorded with results."""
         if self.cameras:
             noun = "camera" if len(self.cameras) == 1 else "cameras"
             return f"{noun} {', '.join(self.cameras)} held out at all times"

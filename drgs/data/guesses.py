@@ -38,7 +38,7 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
     it; 1.0 without points.
 
     Args:
-        cameras: at least one.
+        cameras: Cameras, at least one.
         points: (P,3) world points, used only in that case.
     """
     if not cameras:
@@ -62,11 +62,11 @@ def points_beside(
     a grid get none; the other cells, of all views alike, as many each.
 
     Args:
-        views: at least one.
+        views: Views, at least one.
         points: (P,3) triangulated ones.
         shown: (V,P) which of them each view shows; one shows one at least.
-        count: of new points.
-        rng: of pixels and depths.
+        count: Number of new points.
+        rng: Generator of pixels and depths.
     """
     cameras = [view.camera.undistorted() for view in views]
     own = [camera.project(points[mine]) for camera, mine in zip(cameras, shown, strict=True)]
@@ -120,7 +120,7 @@ def _open_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
 
 
 def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.random.Generator) -> np.ndarray:
-    """For each flat pixel the index of one of the places (P,2) that are nearest to it."""
+    """Index, for each flat pixel, of one of the places (P,2) that are nearest to it."""
     centers = np.stack([pixels % width, pixels // width], axis=-1) + 0.5
     count = min(_NEAREST, len(places))
     which = rng.integers(0, count, len(pixels))

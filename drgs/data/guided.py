@@ -92,7 +92,7 @@ class Matches:
     """Pictures and what has been matched between them, so that one more costs only its own pairs.
 
     Attributes:
-        pictures: In the order in which they were added.
+        pictures: Pictures in the order in which they were added.
     """
 
     def __init__(self):

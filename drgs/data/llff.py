@@ -28,13 +28,12 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
     depth bounds.
 
     Args:
-        path: the folder, or the ``.npy`` file.
-        background: color that images with alpha are composited on.
-        lazy: open no image, see `drgs.data.load`.
-
+        path: The folder, or the ``.npy`` file.
+        background: Color that images with alpha are composited on.
+        lazy: Open no image, see `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file, no ``images``, or videos in their place whose names do not say their order.
-        ValueError: not an (N,17) array, another number of images, or a pose that is not one.
+        FileNotFoundError: No such file, no ``images``, or videos in their place whose names do not say their order.
+        ValueError: Not an (N,17) array, another number of images, or a pose that is not one.
     """
     file = path if path.is_file() else path / POSES_BOUNDS
     folder = file.parent / "images"

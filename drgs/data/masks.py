@@ -44,7 +44,7 @@ def masks_of(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
     No mask is decoded.
 
     Raises:
-        FileNotFoundError: no such folder, or a photograph has no mask there.
+        FileNotFoundError: No such folder, or a photograph has no mask there.
         ValueError: a folder without masks.
     """
     if masks == ALPHA_MASKS:
@@ -80,9 +80,8 @@ def feature_mask(photo: Path, mask: Path) -> np.ndarray:
     Args:
         photo: The photograph.
         mask: Its mask; the photograph itself for its alpha channel.
-
     Raises:
-        ValueError: no alpha channel, another shape than the photograph's, or nothing is kept.
+        ValueError: No alpha channel, another shape than the photograph's, or nothing is kept.
     """
     if mask == photo:
         raw = read_image(photo)

@@ -58,11 +58,10 @@ def load_cameras(
     Points are those of the model that images of at least two cameras show which are not held out.
 
     Args:
-        path: the folder.
-        background, times, test_cameras, lazy, points, strict: see `drgs.data.load`.
-
+        path: The folder.
+        background, times, test_cameras, lazy, points, strict: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: too few of the frames are there, or with `strict` a camera without a pose.
+        FileNotFoundError: Too few of the frames are there, or with `strict` a camera without a pose.
         ValueError: a damaged model, none of whose images is named by a camera, cameras that move, or two frames of one
             number.
     """
@@ -121,7 +120,7 @@ def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras:
     Its images are named by the cameras, and it must have their poses: else its world is another one.
 
     Args:
-        dataset: Without points.
+        dataset: Data set that has no points yet.
         cameras: Name -> camera.
         test_cameras: Names of those that are held out; None: those of the data set.
     """
@@ -142,7 +141,7 @@ def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras:
 
 
 def _extent(cameras: Iterable[Camera]) -> float:
-    """Of the cameras' places, along the axis where it is largest."""
+    """Extent of the cameras' places along the axis where it is largest, in scene units."""
     return float(np.ptp([camera.center for camera in cameras], axis=0).max())
 
 

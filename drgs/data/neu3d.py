@@ -56,11 +56,10 @@ def load_neu3d(
     frame, if there is one (`add_model_points`).
 
     Args:
-        path: the folder, or its ``poses_bounds.npy``.
-        background, times, test_cameras, lazy, points, strict: see `drgs.data.load`.
-
+        path: The folder, or its ``poses_bounds.npy``.
+        background, times, test_cameras, lazy, points, strict: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file.
+        FileNotFoundError: No such file.
         ValueError: a damaged video, poses for another number of them or of another shape, a pose that is none, or with
             `strict` videos of different length.
     """

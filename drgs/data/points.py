@@ -22,7 +22,7 @@ from drgs.data.matching import nearby_pairs
 from drgs.data.views import View
 from drgs.display.progress import Bar
 from drgs.guards.foreign import is_file, refuse_foreign
-from drgs.guards.ply_lists import ply_source
+from drgs.guards.ply_headers import ply_source
 
 __all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_count", "triangulated_points"]
 
@@ -57,10 +57,9 @@ def initial_points(
 
     Args:
         data: a data set, or views (then there are no given points).
-        seed: of all random choices.
-        max_points: at most so many.
-        progress: called with (stage, done, total) while triangulating.
-
+        seed: Seed of all random choices.
+        max_points: Number of points at most.
+        progress: Called with (stage, done, total) while triangulating.
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
@@ -99,12 +98,11 @@ def triangulated_points(
     """Points to start Gaussians from that all of these views together show, without depth maps.
 
     Args:
-        views: at least two, with images.
-        seed: of all random choices.
-        max_points: at most so many.
-        matches: as for `added_points`.
-        progress: as for `initial_points`.
-
+        views: Views with images, at least two.
+        seed: Seed of all random choices.
+        max_points: Number of points at most.
+        matches: Matches, as `added_points` takes them.
+        progress: Callback, as `initial_points` takes it.
     Returns:
         points (P,3) float64 and colors (P,3) float32: those triangulated, and where images have none of them, guesses
         as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are, before any
@@ -156,11 +154,10 @@ def added_points(
     """Points that the last view adds to what those before it show, without depth maps.
 
     Args:
-        views: at least one; nothing but these is read.
-        seed: of all random choices.
-        matches: what was found in the first ones of these views by earlier calls; is added to.
-        progress: as for `initial_points`.
-
+        views: Views, at least one; nothing but these is read.
+        seed: Seed of all random choices.
+        matches: What was found in the first ones of these views by earlier calls; is added to.
+        progress: Callback, as `initial_points` takes it.
     Returns:
         points (P,3) float64 and colors (P,3) float32: first those triangulated with the last view, whose number is the
         third value, then guesses: along rays of the last view as far away as what is triangulated near them, or, where
@@ -181,8 +178,8 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     colors.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no PLY with x, y, z, shorter than it claims, or not finite.
+        FileNotFoundError: No such file.
+        ValueError: No PLY with x, y, z, shorter than it claims, or not finite.
     """
     if not is_file(path):
         raise FileNotFoundError(f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path")

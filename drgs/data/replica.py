@@ -43,13 +43,12 @@ def load_replica(
     their names sort as they were taken: ``rgb_002`` for ``rgb_2.png`` of 900.
 
     Args:
-        path: the sequence's folder, as ``room_0/Sequence_1``.
-        background: color that images with alpha are composited on.
-        test_every, test_offset, lazy: see `drgs.data.load`. Lazily, all views get the size of the first training image.
-
+        path: The sequence's folder, as ``room_0/Sequence_1``.
+        background: Color that images with alpha are composited on.
+        test_every, test_offset, lazy: See `drgs.data.load`. Lazily, all views get the size of the first training image.
     Raises:
-        FileNotFoundError: no poses, no ``rgb`` folder, or no images in it.
-        ValueError: poses that are none, or an image beyond them.
+        FileNotFoundError: No poses, no ``rgb`` folder, or no images in it.
+        ValueError: Poses that are none, or an image beyond them.
     """
     poses = _poses(path / POSES)
     folder = path / "rgb"

@@ -24,8 +24,8 @@ def fit_to_image(camera: Camera, path: Path, where: str, lazy: bool = False) -> 
     must exist, but is not opened, and the camera stays as it is.
 
     Raises:
-        FileNotFoundError: no such image.
-        ValueError: not an image, or another shape.
+        FileNotFoundError: No such image.
+        ValueError: Not an image, or another shape.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{where}: the image {path} must exist, found none; restore it or drop the view")
@@ -38,7 +38,7 @@ def resized_to(camera: Camera, size: tuple[int, int], path: Path, where: str) ->
     """The camera at the size (width, height) that an image or video has.
 
     Raises:
-        ValueError: another shape, by more than 1 %.
+        ValueError: Another shape, by more than 1 %.
     """
     width, height = size
     if (width, height) == (camera.width, camera.height):
@@ -57,9 +57,8 @@ def nearest_resized(data: np.ndarray, size: tuple[int, int], path: Path) -> np.n
 
     Args:
         path: The file that it is of, for the message.
-
     Raises:
-        ValueError: another shape than the image's, by more than 1 %.
+        ValueError: Another shape than the image's, by more than 1 %.
     """
     import cv2
 

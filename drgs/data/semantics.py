@@ -134,8 +134,8 @@ class Semantics:
 
         Args:
             values: (C, h, w).
-            path: Of the map, for the message.
-            camera: Of the photograph, which may have been reduced since the map was made.
+            path: File of the map, for the message.
+            camera: Camera of the photograph, which may have been reduced since the map was made.
         """
         if values.shape[0] != self.channels:
             like = self.embedding_file or self.maps[0]
@@ -155,8 +155,7 @@ class Semantics:
 
         Args:
             raw: (H, W) uint8 or uint16.
-            path: Of the image, for the message.
-
+            path: File of the image, for the message.
         Raises:
             ValueError: Numbers that are no class.
         """

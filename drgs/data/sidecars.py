@@ -53,7 +53,6 @@ def attach(dataset: Dataset, lazy: bool) -> None:
     Args:
         dataset: Loaded; without maps or labels it stays as it is.
         lazy: Open none of the files; else headers of maps and the files of classes are read.
-
     Raises:
         FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
     """

@@ -44,12 +44,11 @@ def load_train_meta(
     """Load a data set of synchronous cameras. A camera is named by its ``cam_id``; frame k is the k-th of the lists.
 
     Args:
-        path: the folder, or the JSON file.
-        background, times, lazy, points, strict: see `drgs.data.load`.
-
+        path: The folder, or the JSON file.
+        background, times, lazy, points, strict: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file, or too few of the images.
-        ValueError: broken JSON, lists of different lengths, a pose that is not one, or camera-to-world matrices.
+        FileNotFoundError: No such file, or too few of the images.
+        ValueError: Broken JSON, lists of different lengths, a pose that is not one, or camera-to-world matrices.
     """
     file = path if path.is_file() else path / _META
     folder = file.parent

@@ -65,13 +65,12 @@ def load_transforms(
     ``.npy``).
 
     Args:
-        path: the folder, or one JSON file.
-        background: color that images with alpha are composited on.
-        test_every, test_offset, lazy, points, strict, test_cameras: see `drgs.data.load`.
-
+        path: The folder, or one JSON file.
+        background: Color that images with alpha are composited on.
+        test_every, test_offset, lazy, points, strict, test_cameras: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file, too few of the images that it names, or a mask or depth map is missing.
-        ValueError: broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
+        FileNotFoundError: No such file, too few of the images that it names, or a mask or depth map is missing.
+        ValueError: Broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
     """
     files = _files(path)
     if not files:

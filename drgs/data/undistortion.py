@@ -30,7 +30,7 @@ def lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None
     photo did not see.
 
     Raises:
-        ValueError: the photo saw next to nothing of its own undistorted image.
+        ValueError: The photo saw next to nothing of its own undistorted image.
     """
     *maps, lost = _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
     if lost > _LOST_MAX:
@@ -63,7 +63,7 @@ def undistorted_map(values: torch.Tensor, camera: Camera) -> torch.Tensor:
 def _cached_lens_maps(
     K: bytes, width: int, height: int, model: str, distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, float]:
-    """As `_lens_maps`, and the share of pixels that were not seen."""
+    """The tables of `lens_maps`, and the share of pixels that were not seen."""
     matrix = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
     lens = Camera(K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion)
     rays = lens.undistorted().pixel_directions().reshape(-1, 3)

@@ -34,7 +34,6 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
         missing: The images that are not there; nothing is done if there are none.
         left: How many are there.
         strict: Refuse whatever is left.
-
     Raises:
         FileNotFoundError: `strict`, or fewer than 3 are left.
     """
@@ -59,7 +58,7 @@ def check_parallax(views: list[View]) -> None:
     Views of one pose at several times are one place: a camera that stands still before something that moves.
 
     Raises:
-        ValueError: two views or more, all of one pose and of one time (or of none).
+        ValueError: Two views or more, all of one pose and of one time (or of none).
     """
     poses = np.stack([view.camera.c2w for view in views])
     spread = np.abs(poses - poses[0]).max(axis=(1, 2))
@@ -90,7 +89,7 @@ def check_cameras(views: list[View]) -> None:
     pictures by heart.
 
     Args:
-        views: For training, all that there will be. Those of one place alone are `check_parallax`'s.
+        views: All training views that there will be. Those of one place alone are `check_parallax`'s.
     """
     times = {view.camera.time for view in views} - {None}
     centers = np.stack([view.camera.center for view in views])
@@ -119,7 +118,7 @@ def check_times(dataset: Dataset) -> None:
     Times may be in any unit and order, and views may share one.
 
     Raises:
-        ValueError: training views of two times or more, and a view of none.
+        ValueError: Training views of two times or more, and a view of none.
     """
     if not dataset.is_dynamic:
         return

@@ -28,19 +28,19 @@ class View:
     """One photograph: its camera and where its files are. Nothing is decoded before a method asks.
 
     Attributes:
-        camera: the camera as calibrated, of the size of the image file, lens included.
-        name: unique in the data set; the image's path below the image folder without its suffix.
+        camera: The camera as calibrated, of the size of the image file, lens included.
+        name: Unique in the data set; the image's path below the image folder without its suffix.
         image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0
             is unknown.
-        depth_scale: scene units in one unit of the depth file.
-        background: color in [0,1] that images with an alpha channel are composited on.
+        depth_scale: Scene units in one unit of the depth file.
+        background: Color in [0,1] that images with an alpha channel are composited on.
         split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
-        label_path: image of the class of each pixel, or None.
-        teacher_path: feature map of a teacher, or None.
-        semantics: what their numbers mean, as in the data set; None without.
-        camera_name: of the camera that took it, where a data set has several synchronous cameras, as ``cam03``; else
-            empty.
-        frame: the frame of a video, where the photograph is one; `image_path` is None then.
+        label_path: Image of the class of each pixel, or None.
+        teacher_path: Feature map of a teacher, or None.
+        semantics: What their numbers mean, as in the data set; None without.
+        camera_name: Name of the camera that took it, as ``cam03``, where a data set has several synchronous cameras;
+            else empty.
+        frame: The frame of a video, where the photograph is one; `image_path` is None then.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
@@ -66,14 +66,14 @@ class View:
 
     @property
     def stem(self) -> str:
-        """What its maps and labels are called like: the image's name without its suffix, or the number of the frame."""
+        """Stem of the names of its maps and labels: the image's name without its suffix, or the number of the frame."""
         return self.name.rpartition("/")[2] if self.image_path is None else self.image_path.stem
 
     def checked(self) -> View:
         """The view with its camera at the size of its image file, whose header is read now if it has not been.
 
         Raises:
-            FileNotFoundError, ValueError: as `fit_to_image`.
+            FileNotFoundError, ValueError: As `fit_to_image`.
         """
         if self.is_checked or self.image_path is None:
             return self
@@ -87,10 +87,9 @@ class View:
         The result belongs to ``camera.undistorted().resized(width, height)``.
 
         Args:
-            width, height: pixels; the camera's own size if left out.
-
+            width, height: Pixels; the camera's own size if left out.
         Raises:
-            FileNotFoundError, ValueError: the file is missing, no image, or not of the camera's
+            FileNotFoundError, ValueError: The file is missing, no image, or not of the camera's
                 size.
         """
         import cv2
@@ -160,7 +159,7 @@ class View:
         nearest pixel; None if there is no label image.
 
         Raises:
-            FileNotFoundError, ValueError: no label image, another shape than the photo's, or numbers of no class.
+            FileNotFoundError, ValueError: No label image, another shape than the photo's, or numbers of no class.
         """
         import cv2
 
@@ -185,7 +184,7 @@ class View:
         a process looks through it for NaN.
 
         Raises:
-            FileNotFoundError, ValueError: no such map, of other channels than the data set's, or larger than the photo.
+            FileNotFoundError, ValueError: No such map, of other channels than the data set's, or larger than the photo.
         """
         from drgs.features.teacher import used_map
 

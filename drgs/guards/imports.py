@@ -35,7 +35,7 @@ def imported_function(option: str, text: str, or_else: str = "") -> Callable[...
     Only for what the caller of drgs typed: importing runs the module. Never for a name that a file holds.
 
     Args:
-        option: Where it was given, e.g. `--policy`.
+        option: Option that it was given with, e.g. `--policy`.
         text: The name.
         or_else: What else the option takes, for the message.
     Raises:

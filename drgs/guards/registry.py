@@ -30,7 +30,7 @@ class Registry(MutableMapping[str, T], Generic[T]):
 
     Args:
         kind: What a row is, for messages: "policy".
-        group: Of the entry points: "drgs.policies".
+        group: Group of the entry points: "drgs.policies".
         rows: Those of this package.
         row: Type that a row must have; None where any will do, as functions that are checked by what they return.
     """
