@@ -113,6 +113,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
     sh = arrays.pop("dc")[:, None, :]
     if rest:
+        # f_rest is stored channel by channel; ours are coefficient by coefficient.
         sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
     if features:
         arrays["features"] = described
@@ -186,6 +187,7 @@ def save_ply(
     fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
     means = fields["means"]
     if np.any(g.origin):
+        # In float64 before it is rounded once: float32 offsets would lose their digits to an origin far away.
         means = means.astype(np.float64) + g.origin
     rest = fields["sh"][:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (g.sh.shape[1] - 1))  # channel by channel
     columns = {

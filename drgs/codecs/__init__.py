@@ -179,8 +179,10 @@ def _plain(g: Gaussians) -> Gaussians:
     import numpy as np
     import torch
 
+    # A file holds values: nothing of it is differentiated.
     values = {name: x.detach().cpu() for name, x in g.parameters().items() if name != "features"}
     if np.any(g.origin):
+        # In float64 before it is rounded once: float32 offsets near 0 would lose their digits to an origin far away.
         values["means"] = values["means"].double() + torch.from_numpy(np.asarray(g.origin, np.float64))
     floats = {name: x.float() for name, x in values.items()}
     return g.replace(**floats, features=None, origin=np.zeros(3))

@@ -50,10 +50,12 @@ def encode_glb(g: Gaussians) -> bytes:
     quats = g.quats.numpy().astype(np.float64)
     quats /= np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    # float64, rounded once: exp and sigmoid of float32 are off by a last digit or two.
     opacities = g.logit_opacities.double().sigmoid().numpy()
     scales = g.log_scales.double().exp().numpy()
     sh = g.sh.numpy()
     colors = np.column_stack([sh[:, 0] * Y_00 + 0.5, opacities])
+    # A scale that float32 cannot hold becomes infinite, and is refused below.
     with np.errstate(over="ignore"):
         arrays = {
             "POSITION": g.means.numpy(),
@@ -246,6 +248,7 @@ class _Accessors:
         raw = np.ndarray((count, width), dtype, self._buffer, start + offset, (stride, dtype.itemsize))
         if not accessor.get("normalized"):
             return raw.astype(np.float32)
+        # -128 of a normalized byte, and -32768 of a short, are -1, as their neighbors are: the range of glTF is symmetric.
         return np.maximum(raw.astype(np.float32) / one, -1.0)
 
 

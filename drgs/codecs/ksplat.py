@@ -140,6 +140,7 @@ def _decoded(
     means = rows["mean"]
     if level:
         centers = _bucket_centers(path, data, section)
+        # float64: 16 bits less their middle wrap around in the type that they are stored in.
         means = (means.astype(np.float64) - section.steps) * (section.block / 2 / section.steps) + centers
     stored = rows["sh"].astype(np.float32)
     if level == 2:
@@ -149,6 +150,7 @@ def _decoded(
     for d in range(1, section.degree + 1):
         width = 2 * d + 1
         block = stored[:, 3 * at : 3 * (at + width)].reshape(-1, 3, width)
+        # Stored channel by channel; ours are coefficient by coefficient.
         sh[:, at : at + width] = block.transpose(0, 2, 1)
         at += width
     return means, rows["quat"].astype(np.float32), rows["scale"].astype(np.float32), rows["color"], sh

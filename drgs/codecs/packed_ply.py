@@ -54,6 +54,7 @@ def load_packed_ply(path: Path) -> Gaussians:
             raise ValueError(f"{path}: the {name} column {lists[0]} must be a number, is a list; {_ADVICE}")
     chunks, vertex = ply["chunk"].data, ply["vertex"].data
     chunk = np.arange(count) // _CHUNK
+    # In the order of this machine's bytes, and without a sign: the bits are shifted apart.
     position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
     rgba = np.stack([color >> shift & 255 for shift in (24, 16, 8, 0)], axis=1)
     colors = rgba[:, :3] / 255.0
@@ -122,6 +123,7 @@ def _higher(rows: np.ndarray, coefficients: int) -> np.ndarray:
     table = (np.arange(256, dtype=np.float32) + 0.5) / 256
     table[[0, 255]] = 0, 1
     values = (table - 0.5) * 8
+    # Stored channel by channel; ours are coefficient by coefficient.
     return values[stored].reshape(-1, 3, coefficients).transpose(0, 2, 1)
 
 

@@ -84,6 +84,7 @@ class _Reader:
         low, high = (self._image("means", i) for i in (0, 1))  # first: they are as large as the count says
         degree = self._degree()
         check_count(self.path, self.count, SH_COUNTS[degree])
+        # Two bytes make a whole number of 16 bits.
         code = low[:, :3].astype(np.float64) + 256.0 * high[:, :3]
         wide = self._lerped("means", code / 65535, 3)
         with np.errstate(over="ignore"):  # what float32 cannot hold is refused

@@ -286,6 +286,7 @@ def unit_range(data: np.ndarray, path: Path) -> np.ndarray:
     if data.dtype == np.uint16:
         return data.astype(np.float32) / np.float32(65535)
     if data.dtype.kind == "f":
+        # Images of floats may hold light beyond white, which no rendering is compared with.
         return np.clip(data.astype(np.float32), 0.0, 1.0)
     raise ValueError(f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it")
 

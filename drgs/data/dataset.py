@@ -165,6 +165,7 @@ class SplitRule:
 
     def parts(self, listed: Sequence[View]) -> tuple[list[View], list[View]]:
         """(train, test) views, both sorted by name; of a data set without a test split, `val` is the test split."""
+        # By name: the order of a data set may be that of its files, and the split must not change with it.
         listed = sorted(listed, key=lambda view: view.name)
         if self.cameras:
             train = [view for view in listed if view.camera_name not in self.cameras]

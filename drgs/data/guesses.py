@@ -77,6 +77,7 @@ def points_beside(
     shares = np.array(
         [len(pixels) / camera.width / camera.height for pixels, camera in zip(open_pixels, cameras, strict=True)]
     )
+    # Where no pixel is open all shares are 0, and so are the numbers, not NaN.
     numbers = np.floor(count * np.cumsum(np.append(0, shares)) / max(shares.sum(), 1e-12)).astype(int)
     found, colors = [], []
     for view, camera, (places, depths), allowed, number in zip(
@@ -111,6 +112,7 @@ def _open_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
     """Flat indices of the pixels inside the mask in whose cell none of the places (P,2) is."""
     across, down = (-(-size // _CELLS) for size in (camera.width, camera.height))
     taken = np.zeros((_CELLS, _CELLS), bool)
+    # Points that project outside count for the cell at the edge: the size need not be a multiple of the cells.
     columns, rows = (places // (across, down)).astype(int).clip(0, _CELLS - 1).T
     taken[rows, columns] = True
     is_open = ~np.kron(taken, np.ones((down, across), bool))[: camera.height, : camera.width]
@@ -185,6 +187,7 @@ def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.nd
     K = camera.K
     y = (pixels // camera.width + 0.5 - K[1, 2]) / K[1, 1]
     x = (pixels % camera.width + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    # Depth maps are float32; a world may be far from its origin, where that has no digits left.
     local = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[:, None].astype(np.float64)
     c2w = camera.c2w
     return local @ c2w[:3, :3].T + c2w[:3, 3]

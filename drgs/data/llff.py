@@ -79,6 +79,7 @@ def pose_rows(file: Path) -> np.ndarray:
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
         raise ValueError(f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image")
+    # Cameras are float64, whatever the file was saved as.
     return rows.astype(np.float64)
 
 

@@ -114,5 +114,6 @@ def masked_photo(photo: Path, kept: np.ndarray) -> np.ndarray:
     """
     pixels = read_image(photo)
     pixels = np.ascontiguousarray(pixels[..., :3]) if pixels.ndim == 3 else pixels
+    # The mean is a float64; the photograph keeps its own 8 or 16 bits.
     pixels[kept == 0] = pixels[kept > 0].mean(axis=0).astype(pixels.dtype)
     return pixels

@@ -202,5 +202,6 @@ def nearby_pairs(centers: np.ndarray, axes: np.ndarray, neighbors: int) -> list[
     # nothing.
     cost = distance / max(float(np.median(distance)), 1e-12) + 2.0 * (1.0 - axes @ axes.T)
     np.fill_diagonal(cost, np.inf)
+    # Stable: of equal costs, as on a regular circle, the lower index wins on every machine.
     nearest = np.argsort(cost, axis=1, kind="stable")[:, :neighbors]
     return sorted({(min(i, j), max(i, j)) for i in range(count) for j in nearest[i].tolist()})

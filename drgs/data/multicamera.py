@@ -203,6 +203,7 @@ def _images_of(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[s
         if number := _NUMBER.search(name):
             by_number[int(number[1])].append(name)
     images = {image_id: reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids()}
+    # By name: COLMAP numbers images in the order in which its threads finish them.
     for image_id, image in sorted(images.items(), key=lambda item: item[1].name):
         parts = PurePosixPath(image.name).with_suffix("").parts
         owner = next((part for part in reversed(parts) if part in names), None)

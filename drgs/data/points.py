@@ -116,6 +116,7 @@ def triangulated_points(
     # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
     # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
     share = empty_share(views, points, shown)
+    # Where all is empty, the share of what is not is 0.
     as_dense = found * min(1.0, share / max(1 - share, 1e-9))
     guesses = round(min(max(_ENOUGH - found, as_dense), share * max_points))
     keep = subset(found, max_points - guesses, rng)
@@ -142,6 +143,7 @@ def _at_first(views: list[View]) -> list[View]:
         return views
     first = [view for view in views if view.camera.time == times[0]]
     centers = np.array([view.camera.center for view in first])
+    # Poses that a file states in several ways differ by rounding: 1e-9 of the distance from the origin is one place.
     return first if np.ptp(centers, axis=0).max() > 1e-9 * max(1.0, float(np.abs(centers).max())) else views
 
 

@@ -212,6 +212,7 @@ class Semantics:
                 f"{self.embedding_file}: must be a row of floats a class, got shape {rows.shape} of {rows.dtype}; "
                 "save (classes, channels) floats"
             )
+        # float64: squares of float16 embeddings overflow from 256 on.
         lengths = np.linalg.norm(rows.astype(np.float64), axis=1)
         bad = np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0)))
         if len(bad):

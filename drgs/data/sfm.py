@@ -164,6 +164,7 @@ def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial:
         report("masks", done, len(names))
         kept = feature_mask(image_dir / name, mask)
         pixels = masked_photo(image_dir / name, kept)
+        # OpenCV writes blue first.
         pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
         for file, image in ((partial / "masks" / f"{name}.png", kept), (partial / "photos" / name, pixels)):
             suffix = file.suffix.lower()

@@ -146,6 +146,7 @@ def _points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     rows = rows[np.isfinite(rows[:, :6]).all(axis=1)]
     if not len(rows):
         raise ValueError(f"{file}: data must have a row of finite numbers, has none; remove the file")
+    # Colors of converted point clouds may leave [0, 1] by rounding.
     return rows[:, :3].astype(np.float64), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)
 
 

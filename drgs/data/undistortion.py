@@ -49,9 +49,11 @@ def undistorted_map(values: torch.Tensor, camera: Camera) -> torch.Tensor:
     h, w = values.shape[1:]
     columns, rows, _ = lens_maps(camera.resized(w, h))
     places = np.stack([(columns + 0.5) * (2 / w) - 1, (rows + 0.5) * (2 / h) - 1], axis=-1)
+    # grid_sample wants places of the type of what it samples, here float32: a map has at most thousands of cells.
     grid = torch.from_numpy(places.astype(np.float32))[None]
     moved = torch.empty(values.shape, dtype=values.dtype)
     for start in range(0, len(values), _CHANNELS):
+        # In float32: between cells of float16 a weighted sum would keep three digits.
         part = values[start : start + _CHANNELS].float()[None]
         moved[start : start + _CHANNELS] = torch.nn.functional.grid_sample(
             part, grid, mode="bilinear", padding_mode="border", align_corners=False

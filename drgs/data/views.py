@@ -146,6 +146,7 @@ class View:
             raw = raw[..., 0]
         if raw.ndim != 2:
             raise ValueError(f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; convert it")
+        # Depths are stored as integers, or as float64 that no picture has the digits of.
         data = raw.astype(np.float32) * np.float32(self.depth_scale)
         data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
         data = self._nearest(data, self.depth_path)
