@@ -297,7 +297,7 @@ def test_a_codec_of_a_script(tmp_path, rng, capsys):
     write_sample(tmp_path / "a.splat", "a.splat", rng)
     rows, ply = tmp_path / "a.rows", tmp_path / "b.ply"
     assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 2
-    assert "a.rows must end with .ply, .spz, .glb, got .rows; rename it" in capsys.readouterr().err
+    assert "a.rows must end with .ply, .spz, .glb, got .rows; choose one of these" in capsys.readouterr().err
     CODECS["rows"] = Codec(".rows", load_rows, lambda path, head: head.startswith(b"ROWS"), encode=encode_rows)
     try:
         assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 0

@@ -13,7 +13,7 @@ from test_architecture import modules
 TO_DO = {
     *("dynamics", "fitting", "information", "policies", "studies", "tracing"),
     *("cameras", "deform", "ellipsoids", "evaluation", "fisher", "integrator", "metrics", "oracle", "rasterize"),
-    *("reference", "select", "train", "viewing.uncertainty", "volume"),
+    *("gain", "reference", "select", "settings", "train", "viewing.uncertainty", "volume"),
     *("commands.compared_maps", "commands.fisher", "commands.moments", "commands.orbits", "commands.painters"),
     *("commands.render", "commands.scene_input", "commands.viewed", "commands.viewpoints"),
 }
@@ -65,6 +65,11 @@ def faults(lines: list[str]) -> Iterator[str]:
     for above, line in zip(lines[2:], lines[3:], strict=False):
         if SECTIONS.fullmatch(line) and not above and any(map(SECTIONS.fullmatch, lines[: lines.index(line)])):
             yield f"an empty line before {line}"
+    for line in lines:
+        if "``" in line:
+            yield f"two backticks, one is enough: {line.strip()}"
+        elif line in ("References:", "Parameters:", "Params:", "Return:", "Throws:", "Arguments:"):
+            yield f"another dialect's section: {line}"
 
 
 def room_of(module: str) -> str | None:
@@ -117,3 +122,4 @@ def test_a_fragment_is_found(text, count):
     assert len([*faults(lines)]) == count
     assert len([*faults([*lines, "Returns:", "    Of what is returned nothing is asked."])]) == count
     assert len([*faults([*lines, "", "Returns:", "    Something."])]) == count + 1
+    assert len([*faults([*lines, "References:", "    Somebody, ``Something``."])]) == count + 2

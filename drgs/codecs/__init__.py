@@ -105,8 +105,10 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
 
 def readable() -> str:
     """What `load_gaussians` reads, for messages."""
-    *suffixes, last = dict.fromkeys(codec.suffix for codec in CODECS.values())
-    return f"{', '.join(suffixes)} and {last}, a SOG folder or a model folder of INRIA's"
+    suffixes = dict.fromkeys(codec.suffix for codec in CODECS.values())
+    # Without .compressed.ply, which ends with .ply, too.
+    *others, last = [x for x in suffixes if not any(x != other and x.endswith(other) for other in suffixes)]
+    return f"{', '.join(others)} and {last}, a SOG folder or a model folder of INRIA's"
 
 
 def save_gaussians(
@@ -157,20 +159,23 @@ def check_suffix(where: str, path: Path) -> str:
     Raises:
         ValueError: If no such format is written; of those that are only read it says which program makes one.
     """
-    suffix = path.suffix.lower()
+    name = path.name.lower()
     written = [".ply", *(codec.suffix for codec in CODECS.values() if codec.encode)]
-    if suffix in written:
-        return suffix
-    known = f"{where}: {path.name} must end with {', '.join(written)}, got {suffix or 'no suffix'}"
-    if path.name.lower() == "meta.json":
-        suffix = ".sog"  # the index of the same, in a folder
-    made_by = next((codec.made_by for codec in CODECS.values() if codec.suffix == suffix), "")
-    if not made_by:
-        raise ValueError(f"{known}; rename it")
-    ply = path.with_name(("scene" if path.stem == "meta" else path.stem) + ".ply")
+    # The longest: a PLY as it is under SuperSplat's name for what it compresses would be taken for compressed.
+    found = [codec for codec in CODECS.values() if name.endswith(codec.suffix) and name != codec.suffix]
+    codec = max(found, key=lambda codec: len(codec.suffix), default=None)
+    if codec is not None and codec.suffix in written:
+        return codec.suffix
+    got = (codec.suffix if codec else path.suffix.lower()) or "no suffix"
+    known = f"{where}: {path.name} must end with {', '.join(written)}, got {got}"
+    if name == "meta.json":
+        codec = CODECS["sog"]  # the index of the same, in a folder
+    if codec is None or not codec.made_by:
+        raise ValueError(f"{known}; choose one of these")
+    ply = path.with_name(("scene" if name == "meta.json" else path.name[: -len(codec.suffix)]) + ".ply")
     raise ValueError(
         f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
-        f"{made_by.format(ply=ply, path=path)}"
+        f"{codec.made_by.format(ply=ply, path=path)}"
     )
 
 

@@ -248,7 +248,7 @@ class _Accessors:
         raw = np.ndarray((count, width), dtype, self._buffer, start + offset, (stride, dtype.itemsize))
         if not accessor.get("normalized"):
             return raw.astype(np.float32)
-        # -128 of a normalized byte, and -32768 of a short, are -1, as their neighbors are: the range of glTF is symmetric.
+        # -128 of a normalized byte, and -32768 of a short, are -1 as their neighbors are: ranges are symmetric.
         return np.maximum(raw.astype(np.float32) / one, -1.0)
 
 

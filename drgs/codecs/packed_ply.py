@@ -132,4 +132,10 @@ def _is_packed(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r")) and b" packed_position" in head.partition(b"\nend_header")[0]
 
 
-PACKED_PLY = Codec(".ply", load_packed_ply, _is_packed, by_suffix=False)
+PACKED_PLY = Codec(
+    ".compressed.ply",
+    load_packed_ply,
+    _is_packed,
+    by_suffix=False,
+    made_by="`npx @playcanvas/splat-transform {ply} {path}`, or SuperSplat (superspl.at/editor)",
+)

@@ -1,4 +1,4 @@
-"""Data sets: ``drgs.data.load(path)`` finds out which format a folder has and returns a
+"""Data sets: `drgs.data.load(path)` finds out which format a folder has and returns a
 `Dataset`.
 """
 
@@ -78,17 +78,17 @@ def load(
         train, test = dataset.split()
         photograph = test[0].image()  # (H, W, 3) float32 in [0, 1], of test[0].camera.undistorted()
 
-    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json`` (D-NeRF's too); videos
-    ``cam*.mp4`` beside ``poses_bounds.npy`` (Neural 3D Video); ``train_meta.json`` (Dynamic 3D Gaussians); folders of
-    frames ``cam00``, ``cam01``, ... beside a COLMAP model, also in ``sparse_``, or beside ``poses_bounds.npy``; a
-    COLMAP model in ``.``, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt``
+    Looked for, in this order: `transforms.json` or `transforms_{train,val,test}.json` (D-NeRF's too); videos
+    `cam*.mp4` beside `poses_bounds.npy` (Neural 3D Video); `train_meta.json` (Dynamic 3D Gaussians); folders of
+    frames `cam00`, `cam01`, ... beside a COLMAP model, also in `sparse_`, or beside `poses_bounds.npy`; a
+    COLMAP model in `.`, `sparse/0`, `sparse` or `colmap/sparse/0`; `poses_bounds.npy`; `traj_w_c.txt`
     (Replica, as Semantic-NeRF renders it). A JSON or npy file may be named itself.
 
     Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
-    (``cam03/0007``), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
+    (`cam03/0007`), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
     frame's number. A frame of a video is decoded when its image is asked for. The first camera is held out at all
-    times, unless ``test_meta.json`` says which are.
+    times, unless `test_meta.json` says which are.
 
     Args:
         path: Folder or file.

@@ -39,7 +39,7 @@ _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position":
 
 
 def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
-    """Write cameras in INRIA's ``cameras.json`` layout, with cx, cy and a camera's time, if any, added; atomically.
+    """Write cameras in INRIA's `cameras.json` layout, with cx, cy and a camera's time, if any, added; atomically.
 
     Raises:
         ValueError: a camera is distorted or skewed (the layout has no room for that).

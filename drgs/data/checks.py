@@ -27,6 +27,7 @@ from drgs.guards.foreign import refuse_foreign
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "check_last_row",
     "check_npz",
     "image_size",
     "file_inside",
@@ -107,7 +108,7 @@ def read_text(path: Path, what: str, largest: int) -> str:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read a plain numeric ``.npy`` array; the shape in its header is checked against the file
+    """Read a plain numeric `.npy` array; the shape in its header is checked against the file
     size first.
 
     Raises:
@@ -155,7 +156,7 @@ def _check_npy(where: str, file: IO[bytes], size: int) -> None:
 
 
 def check_npz(path: Path) -> list[str]:
-    """The names of the arrays of an ``.npz`` archive, none of which claims more bytes than the file can hold.
+    """The names of the arrays of an `.npz` archive, none of which claims more bytes than the file can hold.
 
     Raises:
         ValueError: Another archive, or one that lies.
@@ -174,7 +175,7 @@ def check_npz(path: Path) -> list[str]:
 
 
 def read_npz(path: Path, name: str) -> np.ndarray:
-    """Read one plain numeric array of an ``.npz`` archive.
+    """Read one plain numeric array of an `.npz` archive.
 
     Raises:
         FileNotFoundError: No such file.
@@ -328,16 +329,24 @@ def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
     `Camera` then refuses what is no rotation.
 
     Raises:
-        ValueError: a number is not finite or beyond reason.
+        ValueError: a number is not finite or beyond reason, or a fourth row is not 0 0 0 1.
     """
     c2w = np.asarray(c2w, np.float64)
     if not np.isfinite(c2w).all():
         raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; drop this view")
     check_distance(where, c2w)
+    check_last_row(f"{where}: the pose", c2w)
     w2c = np.eye(4)
     w2c[:3, :3] = c2w[:3, :3].T
     w2c[:3, 3] = -c2w[:3, :3].T @ c2w[:3, 3]
     return w2c
+
+
+def check_last_row(what: str, c2w: np.ndarray) -> None:
+    """Raise ValueError unless a pose of 4 rows ends in 0 0 0 1, which one that is written by columns does not."""
+    if not np.allclose(c2w[3:], (0, 0, 0, 1)):
+        last = " ".join(f"{x:g}" for x in c2w[3])
+        raise ValueError(f"{what} must be camera-to-world by rows and end in 0 0 0 1, got {last}; is it transposed?")
 
 
 def repaired_pose(pose: np.ndarray) -> np.ndarray:

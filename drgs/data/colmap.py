@@ -1,4 +1,4 @@
-"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have been checked."""
+"""COLMAP models, binary and text, read with `pycolmap.Reconstruction` after their sizes have been checked."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _REQUIRED = ("cameras", "images", "points3D")
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of a COLMAP model at or below ``path``, or None."""
+    """The folder of a COLMAP model at or below `path`, or None."""
     for folder in (path, *(path / name for name in MODEL_FOLDERS)):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
@@ -50,7 +50,7 @@ def load_colmap(
     points: bool = True,
     strict: bool = False,
 ) -> Dataset:
-    """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a
+    """Load a COLMAP data set: a model, and `images` beside it (`masks` too, if there is such a
     folder).
 
     Args:
@@ -58,7 +58,7 @@ def load_colmap(
         background: Color that images with alpha are composited on.
         lazy, points, strict: Open no image, read no points and observations, need every image, see `drgs.data.load`.
     Raises:
-        FileNotFoundError: No model, no ``images`` folder, or too few of the images that the model lists.
+        FileNotFoundError: No model, no `images` folder, or too few of the images that the model lists.
         ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
     """
     model = find_model(path)
@@ -110,7 +110,7 @@ COLMAP = Format(lambda path: find_model(path) is not None, load_colmap, MODEL_FO
 
 
 def _image_folder(path: Path, model: Path) -> Path:
-    """``images`` beside the model or above it."""
+    """`images` beside the model or above it."""
     tried = []
     for base in (path, model, *model.parents[:3]):
         folder = base / "images"

@@ -23,7 +23,7 @@ class Dataset:
 
     Attributes:
         path: What was loaded.
-        format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras``, ``train_meta``, or what a
+        format: `colmap`, `transforms`, `llff`, `replica`, `neu3d`, `cameras`, `train_meta`, or what a
             loader from elsewhere calls it.
         views: Views whose image is there, in the order of the data set.
         points: (P,3) float64 world points, or None.

@@ -194,5 +194,5 @@ def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.nd
 
 
 def subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of all, or of ``limit`` random ones in their order."""
+    """Indices of all, or of `limit` random ones in their order."""
     return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))

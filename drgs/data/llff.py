@@ -1,4 +1,4 @@
-"""LLFF data sets: ``poses_bounds.npy`` and the photos in ``images``, paired in the order of their
+"""LLFF data sets: `poses_bounds.npy` and the photos in `images`, paired in the order of their
 names.
 """
 
@@ -28,11 +28,11 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
     depth bounds.
 
     Args:
-        path: The folder, or the ``.npy`` file.
+        path: The folder, or the `.npy` file.
         background: Color that images with alpha are composited on.
         lazy: Open no image, see `drgs.data.load`.
     Raises:
-        FileNotFoundError: No such file, no ``images``, or videos in their place whose names do not say their order.
+        FileNotFoundError: No such file, no `images`, or videos in their place whose names do not say their order.
         ValueError: Not an (N,17) array, another number of images, or a pose that is not one.
     """
     file = path if path.is_file() else path / POSES_BOUNDS
@@ -72,7 +72,7 @@ LLFF = Format(lambda path: (path / POSES_BOUNDS).is_file(), load_llff, (POSES_BO
 
 
 def pose_rows(file: Path) -> np.ndarray:
-    """(N, 17) float64 rows of a ``poses_bounds.npy``; ValueError if it is none."""
+    """(N, 17) float64 rows of a `poses_bounds.npy`; ValueError if it is none."""
     rows = read_npy(file)
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
         raise ValueError(f"{file}: must have shape (N, 17), got {rows.shape}; this is no LLFF file")

@@ -22,7 +22,7 @@ _SHOWN = 3  # photographs without a mask that a message names
 
 
 def mask_file(masks: Path, name: str) -> Path | None:
-    """The mask of an image in a folder: COLMAP's own ``NAME.EXT.png``, or ``NAME.png``; None without one."""
+    """The mask of an image in a folder: COLMAP's own `NAME.EXT.png`, or `NAME.png`; None without one."""
     for candidate in (masks / f"{name}.png", (masks / name).with_suffix(".png")):
         if is_file(candidate):
             return candidate
@@ -39,7 +39,7 @@ def read_mask(path: Path) -> np.ndarray:
 
 
 def masks_of(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
-    """Where the mask of each photograph is: its mask in a folder, or, of ``"alpha"``, the photograph itself.
+    """Where the mask of each photograph is: its mask in a folder, or, of `"alpha"`, the photograph itself.
 
     No mask is decoded.
 

@@ -59,7 +59,7 @@ def extract(
         max_image_size: Pixels on the longer side above which images are shrunk; 0 for never.
         wide_baseline: Affine shapes and pooled scales: connects views further apart, at 2.5 times
             the cost.
-        masks: Folder with ``NAME.EXT.png`` of every image, of its size: no features where it is 0.
+        masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
         progress: Called with ("features", done, total).
     """
     from drgs.data.pycolmap import pycolmap
@@ -177,7 +177,7 @@ def _numbered(database: Path) -> Iterator[dict[str, str]]:
 
 
 def sequential_pairs(names: list[str], window: int) -> list[tuple[str, str]]:
-    """Each name with the ``window`` names after it, and with powers of two beyond, to bridge
+    """Each name with the `window` names after it, and with powers of two beyond, to bridge
     gaps.
     """
     steps = set(range(1, window + 1)) | {2**k for k in range(16) if 2**k > window}

@@ -1,7 +1,7 @@
-"""Synchronous cameras as folders of frames, ``cam00/frame_00000.png``, and a COLMAP model that has one image of each.
+"""Synchronous cameras as folders of frames, `cam00/frame_00000.png`, and a COLMAP model that has one image of each.
 
-That image is named by its camera: ``cam00.png``, ``cam00/frame_00000.png``, or as 4DGaussians makes them, with the
-camera's number, ``image0.jpg`` (its ``multipleview`` layout, with the model in ``sparse_``).
+That image is named by its camera: `cam00.png`, `cam00/frame_00000.png`, or as 4DGaussians makes them, with the
+camera's number, `image0.jpg` (its `multipleview` layout, with the model in `sparse_`).
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def frames_of(folders: Sequence[Path], times: int) -> tuple[tuple[int, ...], dic
 
 
 def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras: tuple[str, ...] | None) -> None:
-    """Take the points of a COLMAP model of the first frame, if there is one in ``frame0`` or in the data set's folder.
+    """Take the points of a COLMAP model of the first frame, if there is one in `frame0` or in the data set's folder.
 
     Its images are named by the cameras, and it must have their poses: else its world is another one.
 
@@ -192,7 +192,7 @@ def _model(path: Path) -> Path | None:
 
 
 def _frame_folder(camera: Path) -> Path:
-    """Where the frames of a camera are: in its folder, or in ``images`` there."""
+    """Where the frames of a camera are: in its folder, or in `images` there."""
     return camera / "images" if (camera / "images").is_dir() else camera
 
 

@@ -1,7 +1,7 @@
-"""Neural 3D Video (Li et al., CVPR 2022): a video a camera, ``cam00.mp4``, ..., and LLFF's ``poses_bounds.npy`` with a
-row for each, in the order of their names. ``cam00`` is the test view of that data set.
+"""Neural 3D Video (Li et al., CVPR 2022): a video a camera, `cam00.mp4`, ..., and LLFF's `poses_bounds.npy` with a
+row for each, in the order of their names. `cam00` is the test view of that data set.
 
-In place of videos there may be folders of their frames, ``cam00/images/0000.png``, ..., as 4DGaussians takes them out.
+In place of videos there may be folders of their frames, `cam00/images/0000.png`, ..., as 4DGaussians takes them out.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def load_neu3d(
     frame, if there is one (`add_model_points`).
 
     Args:
-        path: The folder, or its ``poses_bounds.npy``.
+        path: The folder, or its `poses_bounds.npy`.
         background, times, test_cameras, lazy, points, strict: See `drgs.data.load`.
     Raises:
         FileNotFoundError: No such file.

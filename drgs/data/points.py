@@ -246,7 +246,7 @@ def _check_ply_size(path: Path) -> None:
 
 
 def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Back-projected pixels, an even share a view, at most ``limit``.
+    """Back-projected pixels, an even share a view, at most `limit`.
 
     Not thinned in space: what is close to many cameras gets many points, and that is where pixels are to be explained.
     (Voxels of even size gave most points to the walls of a room and 4 dB less on the still life.)

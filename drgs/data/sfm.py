@@ -88,10 +88,10 @@ def run_sfm(
     masks: str | os.PathLike | None = None,
     doing: Callable[[str], None] | None = None,
 ) -> SfmSummary:
-    """Find camera poses and points from photos; afterwards ``drgs.data.load(out_dir)`` works.
+    """Find camera poses and points from photos; afterwards `drgs.data.load(out_dir)` works.
 
-    Writes ``out_dir/{database.db, sparse/0, images}``, and ``masks`` if there are any, where a fit finds them;
-    ``images`` and ``masks`` are links to the folders given where links work, copies elsewhere. An earlier result of
+    Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them;
+    `images` and `masks` are links to the folders given where links work, copies elsewhere. An earlier result of
     this function is replaced, and only once the new one is complete; nothing else ever is.
 
     Args:
@@ -101,17 +101,17 @@ def run_sfm(
             may begin anew, `done` is the number of photos with a pose so far; it is called from another thread, too.
         camera_model: COLMAP's name of the lens. Photos of one size share one camera.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photos' own.
-        matching: ``exhaustive``, ``sequential`` (photos in the order of a walk or video) or
-            ``auto`` (exhaustive up to 60 photos, 150 with masks).
+        matching: `exhaustive`, `sequential` (photos in the order of a walk or video) or
+            `auto` (exhaustive up to 60 photos, 150 with masks).
         seed: Seed of all random sampling.
         masks: What features are looked for in, where an object was turned or moved between photos: a folder with a mask
-            of every photo, ``NAME.EXT.png`` or ``NAME.png``, white where the object is, of the photo's shape; or
-            ``"alpha"``, the photos' own alpha channel. Weights below a half count as black.
+            of every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or
+            `"alpha"`, the photos' own alpha channel. Weights below a half count as black.
         doing: Called with what is being done within mapping, in words; from another thread, too.
     Raises:
         FileNotFoundError: No such folder, or no mask of a photo.
         ValueError: Fewer than 2 photos, an unknown option, photos that do not connect, or an
-            ``out_dir`` that holds a COLMAP project or photos that were not made here; a mask of another shape, one that
+            `out_dir` that holds a COLMAP project or photos that were not made here; a mask of another shape, one that
             keeps nothing, or a photo without alpha.
     """
     image_dir, out_dir = Path(image_dir), Path(out_dir)
@@ -153,8 +153,8 @@ def run_sfm(
 
 
 def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
-    """What COLMAP looks for features in: ``photos`` without their surroundings, and ``masks`` of their sizes, black or
-    white, ``NAME.EXT.png``.
+    """What COLMAP looks for features in: `photos` without their surroundings, and `masks` of their sizes, black or
+    white, `NAME.EXT.png`.
     """
     import cv2
 
@@ -200,7 +200,7 @@ def _reconstruct(
     seed: int,
     is_masked: bool,
 ) -> SfmSummary:
-    """Run the three stages; leaves ``database.db`` and ``sparse/0`` in ``partial``."""
+    """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
     from drgs.data.matching import extract, match, quiet, sequential_pairs, state_focal_lengths
     from drgs.data.pycolmap import pycolmap
 
@@ -294,8 +294,9 @@ def _install(partial: Path, output: Claim, linked: dict[str, Path], makes_masks:
 
 
 def _check_names(folder: Path, names: list[str], masked: bool = False) -> None:
-    """Refuse names that a COLMAP model cannot hold: several lines, or bytes that are not UTF-8; with masks, whose names
-    are those and `.png`, also too long ones. Say which photographs are hidden, and left out.
+    """Refuse names that a COLMAP model cannot hold: with line breaks or other control characters, or bytes that are not
+    UTF-8; with masks, whose names are those and `.png`, also too long ones. Say which photographs are hidden, and left
+    out.
 
     Raises:
         ValueError: There is one.
@@ -303,7 +304,8 @@ def _check_names(folder: Path, names: list[str], masked: bool = False) -> None:
     for name in names:
         if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
             raise ValueError(
-                f"{folder}: the name of a photo must be one line of UTF-8, got {name[:80]!r}; rename this photo"
+                f"{folder}: the name of a photo must be one line of UTF-8 without control characters, got "
+                f"{name[:80]!r}; rename this photo"
             )
         if masked and len(name.encode()) > _LONGEST:
             raise ValueError(

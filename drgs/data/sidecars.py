@@ -2,18 +2,18 @@
 
 Found by their names beside the folder of the images, in this order:
 
-- Teacher: ``rgb_feature_langseg/`` (LSeg), ``sam_embeddings/`` (SAM), as Feature 3DGS reads them.
-  ``NAME_fmap_CxHxW.pt`` belongs to the image of that name without its suffix, or up to the first dot of its name.
-- Labels: ``semantic_class/``, ``semantic/``, ``labels/``. ``NAME.png`` belongs to the image NAME, and as in Replica
-  ``semantic_class_7.png`` to the image ``rgb_7.png``. One channel of 8 or 16 bits, without loss (PNG, TIFF, BMP).
-- Numbers in the labels: ``classes.json``, ``classes.txt`` or ``info_semantic.json`` (`drgs.data.class_names`). 0 and
+- Teacher: `rgb_feature_langseg/` (LSeg), `sam_embeddings/` (SAM), as Feature 3DGS reads them.
+  `NAME_fmap_CxHxW.pt` belongs to the image of that name without its suffix, or up to the first dot of its name.
+- Labels: `semantic_class/`, `semantic/`, `labels/`. `NAME.png` belongs to the image NAME, and as in Replica
+  `semantic_class_7.png` to the image `rgb_7.png`. One channel of 8 or 16 bits, without loss (PNG, TIFF, BMP).
+- Numbers in the labels: `classes.json`, `classes.txt` or `info_semantic.json` (`drgs.data.class_names`). 0 and
   the largest number, 255 or 65535, are no label unless they are named there.
-- Classes in the teacher's space: ``text_embeddings.npy``, a row a class in the order of that file.
-- Classes of things that move: ``moving_classes.json``, a list of names.
+- Classes in the teacher's space: `text_embeddings.npy`, a row a class in the order of that file.
+- Classes of things that move: `moving_classes.json`, a list of names.
 
 Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ. Those
-of frame 7 of the synchronous camera cam03, be it a file or part of a video, are ``cam03/semantic_class_0007.png``,
-``cam03/0007.png`` or ``cam03_0007.png``, and maps alike. Dynamic 3D Gaussians' ``seg/`` are
+of frame 7 of the synchronous camera cam03, be it a file or part of a video, are `cam03/semantic_class_0007.png`,
+`cam03/0007.png` or `cam03_0007.png`, and maps alike. Dynamic 3D Gaussians' `seg/` are
 labels whose only class, 1, is what moves.
 """
 
@@ -176,8 +176,8 @@ def _of_photograph(view: View, folder: Path, files: dict[str, Path]) -> Path | N
 def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[tuple[str, int], Path]:
     """(camera, number of the frame) -> file, of those in the camera's folder or with its name in front.
 
-    Before the number there may be the folder's name, as ``semantic_class_0007``, ``frame_`` or ``rgb_``; others, as
-    ``vis_sem_class_0007``, are no labels.
+    Before the number there may be the folder's name, as `semantic_class_0007`, `frame_` or `rgb_`; others, as
+    `vis_sem_class_0007`, are no labels.
 
     Raises:
         ValueError: Two files of one frame.

@@ -1,8 +1,8 @@
-"""Dynamic 3D Gaussians' data sets (Luiten et al., 3DV 2024): ``train_meta.json`` and images in ``ims``.
+"""Dynamic 3D Gaussians' data sets (Luiten et al., 3DV 2024): `train_meta.json` and images in `ims`.
 
-Lists by time and camera: ``fn`` (an image below ``ims``), ``k`` (3x3), ``w2c`` (4x4, world to camera, OpenCV's axes)
-and ``cam_id``; ``w`` and ``h`` of all. Where there is a ``test_meta.json``, its cameras are for testing;
-``init_pt_cld.npz`` has points (x, y, z, r, g, b, whether they move).
+Lists by time and camera: `fn` (an image below `ims`), `k` (3x3), `w2c` (4x4, world to camera, OpenCV's axes)
+and `cam_id`; `w` and `h` of all. Where there is a `test_meta.json`, its cameras are for testing;
+`init_pt_cld.npz` has points (x, y, z, r, g, b, whether they move).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def load_train_meta(
     points: bool = True,
     strict: bool = False,
 ) -> Dataset:
-    """Load a data set of synchronous cameras. A camera is named by its ``cam_id``; frame k is the k-th of the lists.
+    """Load a data set of synchronous cameras. A camera is named by its `cam_id`; frame k is the k-th of the lists.
 
     Args:
         path: The folder, or the JSON file.

@@ -1,5 +1,5 @@
-"""Nerfstudio, instant-ngp and Blender data sets: ``transforms.json`` or
-``transforms_{train,val,test}.json``.
+"""Nerfstudio, instant-ngp and Blender data sets: `transforms.json` or
+`transforms_{train,val,test}.json`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, file_inside, image_size, inverse_pose, repaired_pose
+from drgs.data.checks import IMAGE_SUFFIXES, check_last_row, file_inside, image_size, inverse_pose, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.points import read_point_ply
@@ -57,12 +57,12 @@ def load_transforms(
     strict: bool = False,
     test_cameras: tuple[str, ...] | None = None,
 ) -> Dataset:
-    """Load a ``transforms.json`` data set (OpenGL camera axes).
+    """Load a `transforms.json` data set (OpenGL camera axes).
 
     Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
-    camera_model and k1, k2, k3, k4, p1, p2. Frames may state their ``time``, and name ``mask_path`` and
-    ``depth_file_path`` (z-depth; unit from ``depth_unit_scale_factor``, else millimeters for images and scene units for
-    ``.npy``).
+    camera_model and k1, k2, k3, k4, p1, p2. Frames may state their `time`, and name `mask_path` and
+    `depth_file_path` (z-depth; unit from `depth_unit_scale_factor`, else millimeters for images and scene units for
+    `.npy`).
 
     Args:
         path: The folder, or one JSON file.
@@ -294,6 +294,7 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
         raise ValueError(f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct it")
     if not np.isfinite(c2w).all():
         raise ValueError(f"{where}: transform_matrix must be finite, got NaN or Inf; drop this frame")
+    check_last_row(f"{where}: transform_matrix", c2w)
     pose = np.eye(4)
     pose[:3] = c2w[:3]
     check_handedness(where, pose[:3, :3], "(+x right, +y up, looking along -z)", "3 of transform_matrix")

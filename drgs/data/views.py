@@ -34,11 +34,11 @@ class View:
             is unknown.
         depth_scale: Scene units in one unit of the depth file.
         background: Color in [0,1] that images with an alpha channel are composited on.
-        split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
+        split: `train`, `val` or `test` where the data set itself says so, else empty.
         label_path: Image of the class of each pixel, or None.
         teacher_path: Feature map of a teacher, or None.
         semantics: What their numbers mean, as in the data set; None without.
-        camera_name: Name of the camera that took it, as ``cam03``, where a data set has several synchronous cameras;
+        camera_name: Name of the camera that took it, as `cam03`, where a data set has several synchronous cameras;
             else empty.
         frame: The frame of a video, where the photograph is one; `image_path` is None then.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
@@ -84,7 +84,7 @@ class View:
         """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted,
         area-resized.
 
-        The result belongs to ``camera.undistorted().resized(width, height)``.
+        The result belongs to `camera.undistorted().resized(width, height)`.
 
         Args:
             width, height: Pixels; the camera's own size if left out.
@@ -156,7 +156,7 @@ class View:
         return cv2.resize(data, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
     def labels(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """(H,W) int64 classes: 0 where there is no label, k for ``semantics.classes.names[k - 1]``; undistorted,
+        """(H,W) int64 classes: 0 where there is no label, k for `semantics.classes.names[k - 1]`; undistorted,
         nearest pixel; None if there is no label image.
 
         Raises:
