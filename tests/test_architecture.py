@@ -20,6 +20,7 @@ FLOORS: list[tuple[set[str], str]] = [
             "machine",
             "lenses",
             "information.choices",
+            "information.prior",
             "information.chain",
             "information.determinants",
         },

@@ -38,7 +38,7 @@ from drgs.cluster.wanted import check_address
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
 from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.information.pool import Scoring
+from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings

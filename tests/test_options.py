@@ -13,7 +13,7 @@ from drgs import cli, fisher, gain, runtime, select
 from drgs.commands import making_options, options, orbits
 from drgs.data import sfm
 from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.information.choices import POLICY_NAMES, Policy
+from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Policy
 from drgs.settings import PRESETS, RenderSettings
 
 
@@ -60,7 +60,7 @@ def test_choices_are_what_there_is():
     for command in (options.Fit, options.Select):
         named, _ = _choices(command, "policy")
         assert typing.get_args(named) == tuple(select.POLICIES) == POLICY_NAMES
-        assert _choices(command, "criterion") == gain.CRITERIA
+        assert _choices(command, "criterion") == CRITERION_NAMES == gain.CRITERIA
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
     assert _choices(options.Render, "up") == ("auto", *orbits.UP)

@@ -300,7 +300,7 @@ class ActiveConfig:
     measure: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        from drgs.gain import Prior
+        from drgs.information.prior import Prior
 
         if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
             known = ", ".join(POLICY_NAMES)
@@ -322,7 +322,7 @@ class ActiveConfig:
 
     def scoring(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
         """As `drgs.select` takes it, for views that are rendered with these settings."""
-        from drgs.gain import Prior
+        from drgs.information.prior import Prior
         from drgs.select import Scoring
 
         return Scoring(
