@@ -13,7 +13,7 @@ from drgs import cli, fisher, gain, runtime, select
 from drgs.commands import making_options, options, orbits
 from drgs.data import sfm
 from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Policy
+from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Criterion, Policy
 from drgs.settings import PRESETS, RenderSettings
 
 
@@ -32,8 +32,9 @@ def test_fit_options_are_those_of_its_configs(config):
     assert len(shared) >= 10
     for name in shared:
         assert getattr(options.Fit, name) == getattr(config, name), name
-        # Help shows the names of policies; a config may hold the name of somebody's own.
-        assert offered[name] == (Policy | str if name == "policy" else fields[name]), name
+        # Help shows the names of policies and criteria; a config may hold the name of somebody's own.
+        own = {"policy": Policy | str, "criterion": Criterion | str}
+        assert offered[name] == own.get(name, fields[name]), name
     if config is ActiveConfig:
         assert shared == set(fields)
     assert {name for name in fields if "feature" in name or "decoder" in name} <= shared
@@ -60,7 +61,8 @@ def test_choices_are_what_there_is():
     for command in (options.Fit, options.Select):
         named, _ = _choices(command, "policy")
         assert typing.get_args(named) == tuple(select.POLICIES) == POLICY_NAMES
-        assert _choices(command, "criterion") == CRITERION_NAMES == gain.CRITERIA
+        named, _ = _choices(command, "criterion")
+        assert typing.get_args(named) == tuple(gain.CRITERIA) == CRITERION_NAMES
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
     assert _choices(options.Render, "up") == ("auto", *orbits.UP)

@@ -203,8 +203,9 @@ class Choosing(Informed):
 
     policy: Policy | str = ActiveConfig.policy
     """How the next view is chosen (docs/information.md), or a function of your own: package.module:function."""
-    criterion: Criterion = ActiveConfig.criterion
-    """Score of policy fisher; v_opt chose the best views from six on, level below (docs/active-static.md)."""
+    criterion: Criterion | str = ActiveConfig.criterion
+    """Score of policy fisher, or a function of your own: package.module:function. v_opt chose the best views from six
+    on, level below (docs/active-static.md)."""
     network: NetworkScore = ActiveConfig.network
     """How the block deformation scores: against what known views say of the field (ratio), or alone (trace, paper)."""
     combine: Combine | None = ActiveConfig.combine

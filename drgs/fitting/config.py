@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from drgs.guards.arguments import check_fields, must_be
 from drgs.information.choices import (
-    POLICY_NAMES,
+    POLICIES,
     Block,
     Combine,
-    Criterion,
     Method,
     NetworkScore,
     check_combined,
+    check_named,
     checked_blocks,
 )
+from drgs.information.criteria import CRITERIA
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -252,7 +253,7 @@ class ActiveConfig:
 
     Attributes:
         policy: A name in `drgs.select.POLICIES`, or `package.module:function` of one's own.
-        criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
+        criterion: Of policy `fisher`, a name in `drgs.gain.CRITERIA`, or `package.module:function` of one's own.
         method: Of the diagonal, see `drgs.fisher.diagonal`.
         schedule: `views`: `initial` views, then one after the other. `times`: the static stage on all cameras at the
             first time, then one camera at each later time, in order. `pairs`: the same start, then any (camera, time).
@@ -281,7 +282,7 @@ class ActiveConfig:
     """
 
     policy: str = "fisher"
-    criterion: Criterion = "v_opt"
+    criterion: str = "v_opt"
     method: Method = "exact"
     schedule: Schedule = "auto"
     initial: int = 2
@@ -302,9 +303,8 @@ class ActiveConfig:
     def __post_init__(self) -> None:
         from drgs.information.prior import Prior
 
-        if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
-            known = ", ".join(POLICY_NAMES)
-            raise ValueError(f"active: policy must be one of {known}, or package.module:function, got {self.policy!r}")
+        check_named("active", POLICIES, self.policy)
+        check_named("active", CRITERIA, self.criterion)
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         if self.blocks is not None:

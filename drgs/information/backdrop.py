@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
 
 __all__ = [
+    "BACKDROP",
     "CELLS",
     "Sphere",
     "backdrop_cells",
@@ -40,6 +41,7 @@ __all__ = [
     "painted_opacity",
 ]
 
+BACKDROP = "backdrop"  # the group of its information
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
 _PIXELS = 1200  # of a view as its depth is looked at

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from drgs.guards.arguments import must_be
 from drgs.information.choices import (
     BLOCK_NAMES,
+    BLOCKS,
     COMBINES,
     CRITERION_NAMES,
     METHODS,
@@ -19,8 +20,10 @@ from drgs.information.choices import (
     Method,
     NetworkScore,
     check_combined,
+    check_named,
     checked_blocks,
 )
+from drgs.information.criteria import CRITERIA, criterion_named
 from drgs.information.prior import Prior
 from drgs.settings import RenderSettings
 
@@ -29,8 +32,6 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
 
 __all__ = ["Scoring"]
-
-_KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Scoring:
             the wrong kind.
     """
 
-    criterion: Criterion = CRITERION_NAMES[0]
+    criterion: Criterion | str = CRITERION_NAMES[0]
     settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("exact"))
     method: Method = METHODS[0]
     prior: Prior | None = None
@@ -77,8 +78,8 @@ class Scoring:
     probes: int = 16
 
     def __post_init__(self) -> None:
+        check_named("select", CRITERIA, self.criterion)
         choices: dict[str, tuple[str, ...]] = {
-            "criterion": CRITERION_NAMES,
             "method": METHODS,
             "network": NETWORK_SCORES,
         }
@@ -112,18 +113,11 @@ class Scoring:
         Raises:
             ValueError: If one is wanted that the scene does not have.
         """
-        from drgs.information.network_groups import network_groups
-
-        missing = {
-            "semantic": "for Gaussians without features; fit them to a data set with teacher maps"
-            if gaussians.features is None
-            else "",
-            "deformation": "" if scene and network_groups(scene) else "for a scene that no network moves",
-        }
+        missing = {block: BLOCKS[block].lack(gaussians, scene) for block in self.blocks or BLOCK_NAMES}
         if self.blocks is None:
             if self.method == "fisherrf":
                 return ("geometry",)
-            if self.criterion == "block_logdet":  # which only Gaussians have
+            if criterion_named(self.criterion, "select").of_blocks:  # which only Gaussians have
                 return ("geometry", *(("semantic",) if not missing["semantic"] else ()))
             return tuple(block for block in BLOCK_NAMES if not missing.get(block))
         for block in self.blocks:
@@ -137,7 +131,7 @@ class Scoring:
         """lambda of a policy by this scoring."""
         if self.prior is not None:
             return self.prior
-        return Prior(_KNOWN) if policy == "fisher" and self.criterion == "v_opt" else Prior()
+        return Prior(criterion_named(self.criterion, "select").prior) if policy == "fisher" else Prior()
 
     def combined_of(self, blocks: tuple[Block, ...]) -> Combine:
         """How the scores of these blocks become one."""
