@@ -138,12 +138,16 @@ class Camera:
         return self.model == "opencv_fisheye" or (self.model == "opencv" and any(self.distortion))
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera with an image of another size; K is scaled exactly."""
+        """The same camera with an image of another size; K is scaled exactly. Itself if it has that size."""
+        if (width, height) == (self.width, self.height):
+            return self
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return dataclasses.replace(self, K=scale @ self.K, width=width, height=height)
 
     def undistorted(self) -> Camera:
-        """The pinhole camera of the same K, size and pose."""
+        """The pinhole camera of the same K, size and pose. Itself if it is one."""
+        if self.model == "pinhole":
+            return self
         return dataclasses.replace(self, model="pinhole", distortion=())
 
     def pixel_directions(self) -> np.ndarray:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -38,12 +39,13 @@ class FieldConfig:
     """Sizes of a `DeformationField`.
 
     Attributes:
-        channels: C, of a plane.
+        channels: Features of a plane at each of its nodes.
         resolution: Nodes along an axis of space at level 1.
         time_resolution: Nodes along the time, at all levels.
-        levels: By which the resolution in space is multiplied.
-        width: Of the MLP's layers.
-        depth: Layers before the heads; 0 and 1 are the same, one that mixes the features.
+        levels: Factors that the resolution in space is multiplied by, one a level.
+        width: Width of the MLP's layers.
+        depth: Layers of the trunk, which stands before the heads: at least the one that mixes the features. (The code
+            of 4DGS makes this network of 0 and of 1.)
         last_std: Standard deviation of the heads' last weights at the start. 0 is the identity, where only these
             weights have gradients and information.
     """
@@ -53,11 +55,14 @@ class FieldConfig:
     time_resolution: int = 150
     levels: tuple[int, ...] = (1, 2)
     width: int = 128
-    depth: int = 0
+    depth: int = 1
     last_std: float = 0.0
 
     def __post_init__(self) -> None:
-        least = {"channels": 1, "resolution": 2, "time_resolution": 2, "width": 1, "depth": 0}
+        if type(self.depth) is int and self.depth == 0:
+            warnings.warn("FieldConfig: depth must be >= 1, got 0, which is read as 1; say 1", FutureWarning, 3)
+            object.__setattr__(self, "depth", 1)
+        least = {"channels": 1, "resolution": 2, "time_resolution": 2, "width": 1, "depth": 1}
         for name, low in least.items():
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
@@ -78,7 +83,7 @@ class FieldConfig:
             name: Of the preset.
             times: How many distinct times there are; there is a node in time for every two of them, as in 4DGS. None
                 for those of its own data sets: 300 (`neu3d`) and 100 (`dnerf`).
-            fields: Of the config that shall differ.
+            **fields: Fields that replace the preset's.
         """
         presets = {
             "neu3d": {"channels": 16, "resolution": 64, "levels": (1, 2), "width": 128},
@@ -102,12 +107,12 @@ class DeformationField(torch.nn.Module):
     """(N, 3) canonical means and a time -> `Deltas`.
 
     Args:
-        config: Sizes.
+        config: Sizes of its planes and layers.
         bounds: (2, 3) lowest and highest corner of the canonical means, in world units; means outside see the border.
             A side shorter than 1e-3 of the longest is widened to that, and a single point to sides of 1.
         span: First and last time that will ever be asked for; others are refused, for nothing is known of them. They
             may be one, at which the field is as at the first node.
-        seed: Of the weights at the start.
+        seed: Seed that the weights at the start are drawn by.
     Attributes:
         grid: The `HexPlane`; its parameters are `grid.0`, ..., its buffers `grid.bounds` and `grid.span`.
         mlp: `mlp.trunk`, and the heads `mlp.means`, `mlp.quats` and `mlp.log_scales`.
@@ -138,7 +143,7 @@ class DeformationField(torch.nn.Module):
             time: A number, or a scalar tensor, which the deltas are then differentiated by.
             origin: (3,) world units, or None for 0.
         Returns:
-            Of the dtype of the weights, differentiable in both modes by weights, means and time. By the time the
+            Deltas in the dtype of the weights, differentiable in both modes by weights, means and time. By the time the
             derivative is that of the cell above, at a node of the grid too: one-sided there, from the right (from the
             left at the last one).
         Raises:

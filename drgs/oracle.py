@@ -5,9 +5,9 @@ Torch in float64; autograd gives the gradients of whatever is built on it.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,16 +18,108 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
 __all__ = [
+    "Footprints",
+    "OracleRays",
+    "OracleScene",
     "activate",
     "cull_near",
     "float64",
     "scale_and_shift",
     "sh_basis",
     "sh_colors",
-    "take",
     "view_rays",
     "within",
 ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Footprints:
+    """Gaussians on the image plane, for `ewa`; N of them.
+
+    Attributes:
+        means: (N, 2) projected means, pixels.
+        rows: (N, 2, 3) rows of J W R S, pixels: the semi-axes as the local affine approximation projects them.
+        diagonal: (N, 2) diagonal of Sigma', dilation included, px^2.
+        tiles: Three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by the tolerance, exact,
+            grown by it. None without tile culling.
+    """
+
+    means: torch.Tensor
+    rows: torch.Tensor
+    diagonal: torch.Tensor
+    tiles: list[tuple[torch.Tensor, torch.Tensor]] | None
+
+    def take(self, keep: torch.Tensor) -> Footprints:
+        """Those at `keep`, a mask or an index."""
+        tiles = None if self.tiles is None else [(first[keep], last[keep]) for first, last in self.tiles]
+        return Footprints(self.means[keep], self.rows[keep], self.diagonal[keep], tiles)
+
+
+@dataclasses.dataclass(frozen=True)
+class OracleScene:
+    """Activated Gaussians in float64, in a world whose 0 is their origin; N of them are left.
+
+    Attributes:
+        means: (N, 3) world units.
+        axes: (N, 3, 3), columns are the semi-axes R S.
+        whiten: (N, 3, 3) S^-1 R^T, from world axes to the local frame.
+        logits: (N,) raw opacities.
+        softplus: (N,) softplus(logit), the optical depth of a full pass through the center.
+        sh: (N, K, 3) coefficients.
+        features: (N, D), or None.
+        middle: (3,) about where world coordinates are rounded: the mean of float64 means, 0 of float32 ones.
+        extent: (N,) cut-off radius in standard deviations.
+        index: (N,) places among the Gaussians that were passed in.
+        colors: (N, 3) where they are those towards the means; None where they depend on the ray.
+        near_margin: (N,) z / near - 1, where means behind `near` were culled; else None.
+        screen: Where Gaussians are of the image plane (`ewa`); else None.
+    """
+
+    means: torch.Tensor
+    axes: torch.Tensor
+    whiten: torch.Tensor
+    logits: torch.Tensor
+    softplus: torch.Tensor
+    sh: torch.Tensor
+    features: torch.Tensor | None
+    middle: list[float]
+    extent: torch.Tensor
+    index: torch.Tensor
+    colors: torch.Tensor | None = None
+    near_margin: torch.Tensor | None = None
+    screen: Footprints | None = None
+
+    def take(self, keep: torch.Tensor) -> OracleScene:
+        """The Gaussians at `keep`, a mask or an index."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        taken = {name: x[keep] for name, x in fields.items() if isinstance(x, torch.Tensor)}
+        screen = None if self.screen is None else self.screen.take(keep)
+        return dataclasses.replace(self, **taken, screen=screen)
+
+    def colored(self, center: torch.Tensor) -> OracleScene:
+        """With the colors towards the means from a camera's center (3,)."""
+        return dataclasses.replace(self, colors=sh_colors(self.sh, self.means - center))
+
+
+@dataclasses.dataclass(frozen=True)
+class OracleRays:
+    """The rays to render, in the frame that the Gaussians' origin is 0 of; P of them.
+
+    Attributes:
+        rotation: (3, 3) of w2c, and
+        center: (3,) of the camera; None without a camera, and then nobody reads them.
+        origins: (P, 3) world units.
+        directions: (P, 3) unit length.
+        pixels: (P, 2) pixel centers; 0 for rays of no camera.
+        shape: Shape of the image or of the rays.
+    """
+
+    rotation: torch.Tensor | Any
+    center: torch.Tensor | Any
+    origins: torch.Tensor
+    directions: torch.Tensor
+    pixels: torch.Tensor
+    shape: tuple[int, ...]
 
 
 def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
@@ -60,7 +152,7 @@ def float64(x: Any) -> torch.Tensor:
     return torch.tensor(x, dtype=torch.float64)
 
 
-def activate(g: Any, s: RenderSettings) -> SimpleNamespace:
+def activate(g: Any, s: RenderSettings) -> OracleScene:
     """Activated parameters in float64, relative to the Gaussians' origin; `view_rays` says where that is."""
     raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
     means, quats, log_scales, logits, sh = map(float64, raw)
@@ -76,20 +168,18 @@ def activate(g: Any, s: RenderSettings) -> SimpleNamespace:
     if s.extent is None:
         # The N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5. No derivative: a cut-off.
         extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
-    return SimpleNamespace(
+    return OracleScene(
         means=means,
-        axes=rotation * log_scales.exp()[:, None, :],  # columns are the semi-axes
+        axes=rotation * log_scales.exp()[:, None, :],
         whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
         logits=logits,
+        softplus=torch.logaddexp(logits, torch.zeros_like(logits)),
         sh=sh,
         features=None if g.features is None else float64(g.features),
-        # World coordinates of float64 means are rounded about here, those of float32 means about 0.
+        # Float64 means are moved to their middle before they are rounded to float32; a number, no derivative.
         middle=means.detach().mean(0).tolist() if n and g.means.dtype == torch.float64 else [0.0, 0.0, 0.0],
         extent=extent,
         index=torch.arange(n),
-        colors=None,  # (N, 3), or None where the color depends on the ray
-        near_margin=None,  # (N,), set by `cull_near`
-        screen=None,  # `_project`, for `ewa`
     )
 
 
@@ -120,18 +210,13 @@ def camera_rays(cam: Any, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.T
 
 
 def cull_near(
-    scene: SimpleNamespace, rotation: torch.Tensor, center: torch.Tensor, s: RenderSettings, tolerance: float
-) -> SimpleNamespace:
-    """Drops means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
+    scene: OracleScene, rotation: torch.Tensor, center: torch.Tensor, s: RenderSettings, tolerance: float
+) -> OracleScene:
+    """Without the means with camera z <= near; those within the tolerance stay, for `ambiguous`."""
     z = ((scene.means - center) @ rotation[2]).detach()  # culling has no derivative
     if s.near > 0:
-        keep = z > s.near * (1 - tolerance)
-        scene.near_margin = z / s.near - 1
-    elif s.planar:
-        keep = z > 0
-    else:
-        return scene
-    return take(scene, keep)
+        return dataclasses.replace(scene, near_margin=z / s.near - 1).take(z > s.near * (1 - tolerance))
+    return scene.take(z > 0) if s.planar else scene
 
 
 def screen_rows(
@@ -147,8 +232,10 @@ def screen_rows(
 
     Args:
         x, y, z: (N,) means in the camera's frame.
-        fov_clamp: Of `RenderSettings`.
+        cam: Camera that has `K`, `width` and `height`.
+        fov_clamp: As in `RenderSettings`.
         rotation: (3, 3) of w2c.
+        axes: (N, 3, 3) semi-axes in its columns, world axes.
     """
     scale, shift = scale_and_shift(cam)
     slopes = []
@@ -174,16 +261,13 @@ def sh_colors(sh: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
     return (0.5 + (basis[..., None] * sh).sum(-2)).clamp(min=0)
 
 
-def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | None = None) -> SimpleNamespace:
-    """The rays to render, in the frame that the Gaussians' origin is 0 of.
+def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | None = None) -> OracleRays:
+    """The rays of a camera, or those that are given.
 
     Args:
-        g: For its origin.
-        cam, rays: As of `reference.render`.
+        g: Gaussians, whose origin is read.
+        cam, rays: The arguments of `reference.render`.
         window: (x, y, width, height) in pixels: only these pixels of the camera's image.
-    Returns:
-        rotation (3, 3) and center (3,) of the camera or None, origins and directions (P, 3), unit length, pixels
-        (P, 2), and the shape of the image.
     """
     offset = float64(getattr(g, "origin", (0, 0, 0)))
     rotation: torch.Tensor | Any = None  # Any: no camera, no pose, and then nobody reads it
@@ -215,14 +299,10 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
         directions = pair[1].reshape(-1, 3)
         pixels = torch.zeros(len(directions), 2, dtype=torch.float64)
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    return SimpleNamespace(
-        rotation=rotation, center=center, origins=origins, directions=directions, pixels=pixels, shape=tuple(shape)
-    )
+    return OracleRays(rotation, center, origins, directions, pixels, tuple(shape))
 
 
-def within(
-    scene: SimpleNamespace, reach: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor
-) -> torch.Tensor:
+def within(scene: OracleScene, reach: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """(N,) bool, False only where no ray, extended to both sides, comes within `reach` (N,) sigma of a mean.
 
     Compares each bounding sphere with the cone around the rays; rays without a common origin keep all.
@@ -243,8 +323,3 @@ def within(
     radius = reach * scene.axes.detach().norm(dim=1).amax(1)
     spread = torch.asin((radius / away.norm(dim=1).clamp(min=1e-300)).clamp(max=1))
     return (angle - spread <= half + 1e-9) | (half > 1.5)
-
-
-def take(scene: SimpleNamespace, keep: torch.Tensor) -> SimpleNamespace:
-    """The Gaussians at `keep`, a mask or an index."""
-    return SimpleNamespace(**{k: x[keep] if isinstance(x, torch.Tensor) else x for k, x in vars(scene).items()})

@@ -19,12 +19,11 @@ import drjit as dr
 
 from drgs import runtime
 from drgs.settings import RenderSettings
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.bvh import BvhTraversal
-from drgs.tracing.composite import Compositor
-from drgs.tracing.harmonics import sh_basis
+from drgs.tracing.composite import arranged
 from drgs.tracing.operation import Composite
 from drgs.tracing.projection import project_world
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
 
 mi = runtime.mitsuba()
 
@@ -85,20 +84,13 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[nam
         o, d = (list(dr.detach(v)) for v in (ray.o, dr.normalize(ray.d)))
         n = dr.width(ray)
         o, d = ([lib.Float(x) + dr.zeros(lib.Float, n) for x in v] for v in (o, d))
-        along_ray = s.sh_direction == "ray"
         w2c = [v for row in _camera_axes(lib, self.pose, o) for v in row]
         pose = dr.zeros(lib.Float64, 12)
         for k, v in enumerate(w2c):
             dr.scatter(pose, v, lib.UInt32(k))
-        projected = project_world(lib, p, pose, s, 0 if along_ray else coefficients)
-        carried = []
-        if along_ray:
-            carried = sh_basis(d, coefficients)
-            carried[0] = carried[0] + dr.zeros(lib.Float, n)
-        compositor = Compositor(lib, s, BvhTraversal(lib, s, projected, n), frozenset(), basis=len(carried))
-        sh = p["sh"] if along_ray else None
-        keep = dr.grad_enabled(p)
-        out = dr.custom(Composite, compositor, projected.record, sh, None, [*carried, *o, *d], keep)
+        traversal = BvhTraversal(lib, s, project_world(lib, p, pose, s, coefficients), n)
+        compositor, arguments = arranged(lib, s, traversal, p, coefficients, o, d)
+        out = dr.custom(Composite, compositor, *arguments, dr.grad_enabled(p))
         i = dr.arange(lib.UInt32, n)
         return mi.Color3f(*[dr.gather(lib.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
 

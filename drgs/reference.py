@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,6 +19,9 @@ from torch.utils.checkpoint import checkpoint
 
 from drgs.guards.inputs import check_oracle
 from drgs.oracle import (
+    Footprints,
+    OracleRays,
+    OracleScene,
     activate,
     cull_near,
     float64,
@@ -27,7 +29,6 @@ from drgs.oracle import (
     screen_rows,
     sh_basis,
     sh_colors,
-    take,
     view_rays,
     within,
 )
@@ -112,6 +113,11 @@ def render(
     """
     check_oracle("reference.render", g, cam, settings)
     s = settings
+    if s.response not in _FORMS:
+        raise ValueError(
+            f"reference.render: response must be one of {', '.join(_FORMS)}, got {s.response!r}; add its equations to "
+            "reference._FORMS"
+        )
     if s.planar and (rays is not None or getattr(cam, "model", "pinhole") != "pinhole"):
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
@@ -122,11 +128,11 @@ def render(
     if cam is not None:
         scene = cull_near(scene, rotation, center, s, tolerance)
     if s.planar:
-        scene.screen = _project(scene, cam, rotation, center, s, tolerance)
+        scene = dataclasses.replace(scene, screen=_project(scene, cam, rotation, center, s, tolerance))
     if window is not None:
         scene = _in_window(scene, s, view, window, tolerance)
     if s.sh_direction == "gaussian" and center is not None:
-        scene.colors = sh_colors(scene.sh, scene.means - center)
+        scene = scene.colored(center)
 
     step = max(1, _PAIRS // max(len(scene.index), 1))
     parts = []
@@ -148,20 +154,16 @@ def render(
 
 
 def _project(
-    scene: SimpleNamespace, cam: Any, rotation: Tensor, center: Tensor, s: RenderSettings, tolerance: float
-) -> tuple:
-    """Projected means (N, 2), rows of J W R S (N, 2, 3), diagonal of Sigma' (N, 2), tile bounds.
-
-    Tile bounds: three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by
-    the tolerance, exact, grown by it. None without tile culling.
-    """
+    scene: OracleScene, cam: Any, rotation: Tensor, center: Tensor, s: RenderSettings, tolerance: float
+) -> Footprints:
+    """Gaussians on the image plane, and the tiles that each is culled to."""
     scale, shift = scale_and_shift(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
     mean2d = torch.stack([x / z, y / z], dim=-1) @ scale.T + shift
     rows = screen_rows(x, y, z, cam, s.fov_clamp, rotation, scene.axes)
     diagonal = rows.square().sum(-1) + s.dilation
     if s.culling == "extent":
-        return mean2d, rows, diagonal, None
+        return Footprints(mean2d, rows, diagonal, None)
     # Culling has no derivative.
     m = mean2d.detach()
     cov = diagonal.detach()
@@ -184,37 +186,34 @@ def _project(
             last = torch.ceil((m + radius) / _TILE + slack)
             last = torch.where((255 * alpha < 1 - slack)[:, None], first, last)
         bounds.append((first, last))
-    return mean2d, rows, diagonal, bounds
+    return Footprints(mean2d, rows, diagonal, bounds)
 
 
 def _in_window(
-    scene: SimpleNamespace,
+    scene: OracleScene,
     s: RenderSettings,
-    view: SimpleNamespace,
+    view: OracleRays,
     window: tuple[int, int, int, int],
     tolerance: float,
-) -> SimpleNamespace:
-    """Without the Gaussians that are cut off on every ray of the window, near misses kept."""
+) -> OracleScene:
+    """The Gaussians without those that are cut off on every ray of the window; near misses are kept."""
     if not s.planar:
-        return take(scene, within(scene, scene.extent * (1 + 2 * tolerance), view.origins, view.directions))
-    mean2d, rows, diagonal, bounds = scene.screen
+        return scene.take(within(scene, scene.extent * (1 + 2 * tolerance), view.origins, view.directions))
+    screen = scene.screen
+    assert screen is not None  # of a planar response
     low = torch.tensor(window[:2], dtype=torch.float64) + 0.5
     high = low + torch.tensor(window[2:], dtype=torch.float64) - 1
-    if bounds is None:
+    if screen.tiles is None:
         # What is left out has no derivative.
-        reach = (scene.extent[:, None] * diagonal.detach().sqrt()) * (1 + 2 * tolerance)
-        keep = ((mean2d.detach() + reach >= low) & (mean2d.detach() - reach <= high)).all(1)
-    else:
-        first, last = bounds[-1]
-        keep = ((last > torch.floor(low / _TILE)) & (first <= torch.floor(high / _TILE))).all(1)
-        bounds = [(first[keep], last[keep]) for first, last in bounds]
-    screen = (mean2d[keep], rows[keep], diagonal[keep], bounds)
-    scene.screen = None
-    return SimpleNamespace(**{**vars(take(scene, keep)), "screen": screen})
+        middle = screen.means.detach()
+        reach = (scene.extent[:, None] * screen.diagonal.detach().sqrt()) * (1 + 2 * tolerance)
+        return scene.take(((middle + reach >= low) & (middle - reach <= high)).all(1))
+    first, last = screen.tiles[-1]
+    return scene.take(((last > torch.floor(low / _TILE)) & (first <= torch.floor(high / _TILE))).all(1))
 
 
 def _responses(
-    scene: SimpleNamespace,
+    scene: OracleScene,
     s: RenderSettings,
     rotation: Tensor,
     center: Tensor | None,
@@ -255,7 +254,9 @@ def _responses(
             cut(rho <= scene.extent, (scene.extent - rho) / scene.extent.clamp(min=1e-300))  # no 0 / 0
         else:
             tile = torch.floor(pixels / _TILE)[:, None, :]
-            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.screen[-1])
+            assert scene.screen is not None  # tiles cull where the response is planar
+            assert scene.screen.tiles is not None
+            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.screen.tiles)
             cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
         if form.front_only:
             cut(t > 0, t / torch.maximum(distance, _sway(scene, o, d) / tolerance).clamp(min=1e-300))  # no 0 / 0
@@ -273,7 +274,7 @@ def _responses(
     return a, rest, t, key.detach().expand_as(a), exists, margin, to_max, distance
 
 
-def _sway(scene: SimpleNamespace, o: Tensor, d: Tensor) -> Tensor:
+def _sway(scene: OracleScene, o: Tensor, d: Tensor) -> Tensor:
     """(P, N) by how much a peak moves along its ray if means and origins are rounded: to float32 where they are world
     coordinates, to float64 where they become those of the camera.
     """
@@ -292,7 +293,7 @@ class _Peak:
     front_only = True
 
     def meet(
-        self, scene: SimpleNamespace, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
+        self, scene: OracleScene, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
     ) -> tuple:
         """rho^2, t* and |d'| of (P, N) pairs, from the equations at the top of this page."""
         local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
@@ -301,7 +302,7 @@ class _Peak:
         t = -(local * slope).sum(-1) / length2
         return torch.linalg.cross(local, slope).square().sum(-1) / length2, t, length2.sqrt()
 
-    def opacity(self, scene: SimpleNamespace, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
+    def opacity(self, scene: OracleScene, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a, neither by a difference that cancels."""
         alpha = torch.sigmoid(scene.logits)
         return alpha * torch.exp(-rho2 / 2), torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
@@ -316,11 +317,10 @@ class _Integral(_Peak):
 
     front_only = False
 
-    def opacity(self, scene: SimpleNamespace, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
+    def opacity(self, scene: OracleScene, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a."""
-        softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
         behind = torch.special.erfc(-t * length / math.sqrt(2)) / 2
-        tau = softplus * torch.exp(-rho2 / 2) * behind
+        tau = scene.softplus * torch.exp(-rho2 / 2) * behind
         return -torch.expm1(-tau), torch.exp(-tau)
 
     def key(self, t: Tensor) -> Tensor:
@@ -334,15 +334,15 @@ class _Ewa(_Peak):
     front_only = False
 
     def meet(
-        self, scene: SimpleNamespace, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
+        self, scene: OracleScene, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
     ) -> tuple:
         """rho^2 and the Gaussian's own depth; there is no d'."""
-        mean2d, rows, diagonal, _ = scene.screen
-        dx, dy = (pixels[:, None, :] - mean2d).unbind(-1)
-        b1, b2 = rows.unbind(1)
+        assert scene.screen is not None  # `render` has projected them
+        dx, dy = (pixels[:, None, :] - scene.screen.means).unbind(-1)
+        b1, b2 = scene.screen.rows.unbind(1)
         # det(B B^T + eps I) and the adjugate form as sums of squares: no cancellation when thin.
         det = torch.linalg.cross(b1, b2).square().sum(-1)
-        det = det + s.dilation * (diagonal.sum(-1) - s.dilation)
+        det = det + s.dilation * (scene.screen.diagonal.sum(-1) - s.dilation)
         form = (dx[..., None] * b2 - dy[..., None] * b1).square().sum(-1)
         t = away @ rotation[2] if s.depth_key == "z" else away.norm(dim=-1)
         return (form + s.dilation * (dx * dx + dy * dy)) / det, t, None
@@ -353,7 +353,7 @@ _FORMS = {"peak": _Peak(), "integral": _Integral(), "ewa": _Ewa()}
 
 
 def _composite(
-    scene: SimpleNamespace,
+    scene: OracleScene,
     s: RenderSettings,
     rotation: Tensor,
     center: Tensor | None,

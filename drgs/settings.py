@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Iterable
 from typing import Any, Literal
 
 from drgs.guards.arguments import check_fields, must_be
+from drgs.guards.registry import Registry
 
-__all__ = ["EPS_ALPHA", "PRESETS", "Preset", "RenderSettings", "legal"]
+__all__ = ["EPS_ALPHA", "PRESETS", "RESPONSES", "Preset", "RenderSettings", "legal"]
 
 Preset = Literal["exact", "fast", "inria", "gsplat", "mitsuba"]
 PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
@@ -21,9 +23,21 @@ PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
 # Depth is divided by max(alpha, EPS_ALPHA): what no ray meets has a finite one.
 EPS_ALPHA = 1e-10
 
-# Responses that are models of the image plane, not of rays: pinhole cameras only, one depth a Gaussian. Dilation, the
-# clamp of the field of view and the culling by radius are theirs.
-_PLANAR = ("ewa",)
+RESPONSES: Registry[Any] = Registry(
+    "response",
+    "drgs.responses",
+    {
+        "peak": "drgs.tracing.responses.peak:PEAK",
+        "integral": "drgs.tracing.responses.integral:INTEGRAL",
+        "ewa": "drgs.tracing.responses.ewa:EWA",
+    },
+)
+"""Name -> `drgs.tracing.responses.Response`. The table stands here, below the engine, so that settings know its names
+without loading Dr.Jit.
+"""
+
+# `Response.planar` of this package's own, for the same reason.
+_PLANAR = {"peak": False, "integral": False, "ewa": True}
 
 _RANGES = {
     "extent": (0.0, 1e3),
@@ -43,7 +57,7 @@ class RenderSettings:
 
     Attributes:
         response: `peak` (a = alpha exp(-rho^2/2) at the ray's peak), `integral` (a = 1 - exp(-optical depth from the
-            camera on)) or `ewa` (the rasterizers' projected covariance).
+            camera on)), `ewa` (the rasterizers' projected covariance), or a name that was added to `RESPONSES`.
         order: `center` (one depth per Gaussian and view), `ray` (exact order of (t*, index) on each ray) or `entry`
             (Mitsuba's order of entry points, `bvh` only).
         traversal: `tiles` (pinhole cameras, the fast path) or `bvh` (Mitsuba's acceleration structure, any ray).
@@ -67,7 +81,7 @@ class RenderSettings:
         background: RGB composited behind everything.
     """
 
-    response: Literal["peak", "integral", "ewa"] = "peak"
+    response: str = "peak"
     order: Literal["center", "ray", "entry"] = "center"
     traversal: Literal["tiles", "bvh"] = "tiles"
     depth_key: Literal["distance", "z"] = "distance"
@@ -86,6 +100,8 @@ class RenderSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.response, str) or self.response not in RESPONSES:
+            raise ValueError(f"RenderSettings: response must be one of {', '.join(RESPONSES)}, got {self.response!r}")
         check_fields("RenderSettings", self, _RANGES)
         for name in ("extent", "alpha_max"):
             if getattr(self, name) == 0:
@@ -96,8 +112,12 @@ class RenderSettings:
 
     @property
     def planar(self) -> bool:
-        """Whether the response is a model of the image plane (`ewa`), not of rays."""
-        return self.response in _PLANAR
+        """Whether the response is a model of the image plane (`ewa`), not of rays: pinhole cameras only, one depth a
+        Gaussian. Dilation, the clamp of the field of view and the culling by radius are of such models only.
+        """
+        if self.response in _PLANAR:
+            return _PLANAR[self.response]
+        return bool(RESPONSES[self.response].planar)
 
     @classmethod
     def preset(cls, name: str, **overrides: Any) -> RenderSettings:
@@ -155,7 +175,8 @@ class RenderSettings:
         must_be("RenderSettings.preset", "name", name, str, 'e.g. RenderSettings.preset("fast", extent=4.0)')
         if name not in table:
             raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
-        return cls().replace(**{**table[name], **overrides})
+        _refuse_unknown(overrides)
+        return cls(**{**table[name], **overrides})
 
     def nearest_preset(self) -> tuple[str, dict[str, Any]]:
         """Name of the preset from which, whatever the background, the fewest fields differ, `fast` among equals, and
@@ -170,11 +191,15 @@ class RenderSettings:
 
     def replace(self, **fields: Any) -> RenderSettings:
         """A copy with the given fields replaced; unknown names raise ValueError."""
-        known = {f.name for f in dataclasses.fields(self)}
-        unknown = sorted(set(fields) - known)
-        if unknown:
-            raise ValueError(f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}")
+        _refuse_unknown(fields)
         return dataclasses.replace(self, **fields)
+
+
+def _refuse_unknown(fields: Iterable[str]) -> None:
+    known = {field.name for field in dataclasses.fields(RenderSettings)}
+    unknown = sorted(set(fields) - known)
+    if unknown:
+        raise ValueError(f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}")
 
 
 def legal(s: RenderSettings) -> str | None:

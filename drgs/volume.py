@@ -13,18 +13,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from drgs.guards.inputs import check_oracle
-from drgs.oracle import activate, cull_near, float64, sh_colors, take, view_rays, within
+from drgs.oracle import OracleScene, activate, cull_near, float64, sh_colors, view_rays, within
 from drgs.settings import EPS_ALPHA, RenderSettings
-
-if TYPE_CHECKING:
-    from types import SimpleNamespace
 
 __all__ = ["Volume", "render_volume"]
 
@@ -153,18 +150,18 @@ def render_volume(
         )
     scene = activate(g, s)
     view = view_rays(g, cam, rays, window)
-    scene.softplus = torch.logaddexp(scene.logits, torch.zeros_like(scene.logits))
     if cam is not None:
         scene = cull_near(scene, view.rotation, view.center, s, 0.0)
         if s.near > 0:
-            scene = take(scene, scene.near_margin > 0)
+            assert scene.near_margin is not None  # `cull_near` has set it
+            scene = scene.take(scene.near_margin > 0)
     # What can be left out, and where to sum, are choices without a derivative.
     reach = (2 * torch.log((scene.softplus.detach() / _CUT).clamp(min=1))).sqrt()
     keep = within(scene, reach, view.origins, view.directions)
-    scene = take(scene, keep)
+    scene = scene.take(keep)
     reach = reach[keep]
     if s.sh_direction == "gaussian" and view.center is not None:
-        scene.colors = sh_colors(scene.sh, scene.means - view.center)
+        scene = scene.colored(view.center)
     parts = [
         _chunk(scene, reach, s, view.origins[i : i + _RAYS], view.directions[i : i + _RAYS], tolerance, split)
         for i in range(0, max(len(view.directions), 1), _RAYS)
@@ -177,7 +174,7 @@ def render_volume(
 
 
 def _chunk(
-    scene: SimpleNamespace, reach: Tensor, s: RenderSettings, o: Tensor, d: Tensor, tolerance: float, split: int
+    scene: OracleScene, reach: Tensor, s: RenderSettings, o: Tensor, d: Tensor, tolerance: float, split: int
 ) -> dict[str, Tensor]:
     """The fields of `Volume` for a few rays."""
     keep = within(scene, reach, o, d)
@@ -243,7 +240,7 @@ def _phi(u: Tensor) -> Tensor:
     return torch.special.erfc(-u / math.sqrt(2)) / 2
 
 
-def _meet(scene: SimpleNamespace, index: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _meet(scene: OracleScene, index: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """tau, t*, |d'| of (P, M) pairs of ray and Gaussian."""
     whiten = scene.whiten[index]
     local = torch.einsum("pnij,pnj->pni", whiten, o[:, None, :] - scene.means[index])

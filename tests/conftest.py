@@ -127,3 +127,20 @@ def _nothing_is_ignored():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Name of a class -> how many `Camera`s and `RenderSettings` the test has made so far, each validated."""
+    from drgs.cameras import Camera
+    from drgs.settings import RenderSettings
+
+    counts = {"Camera": 0, "RenderSettings": 0}
+    for kind in (Camera, RenderSettings):
+
+        def counted(self, check=kind.__post_init__, name=kind.__name__):
+            counts[name] += 1
+            check(self)
+
+        monkeypatch.setattr(kind, "__post_init__", counted)
+    return counts

@@ -67,7 +67,7 @@ def test_commands_read_what_commands_write(place, tmp_path, monkeypatch, line, f
 
 def test_an_active_fit_says_where_it_looked_from(place, tmp_path, monkeypatch):
     """The views it was fitted to, from its start on, as its data set has them; `--train` takes the file for the run."""
-    fit(lazily(place / "data"), tmp_path / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(place / "data"), tmp_path / "run", config(max_steps=12, selection=plan()), progress=False)
     record = json.loads((tmp_path / "run/selection.json").read_text())
     names = [view["name"] for view in (*record["start"], *record["picks"])]
     cameras = load_cameras_json(tmp_path / "run/selection.json")

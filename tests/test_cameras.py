@@ -4,6 +4,7 @@ input.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -264,3 +265,15 @@ def test_refuses_bad_cameras_in_one_line(changes, message):
         make(name="c7", **changes)
     assert "\n" not in str(error.value)
     assert "'c7'" in str(error.value)
+
+
+def test_what_is_so_already_is_the_same_camera():
+    """A pinhole camera without its lens, or at its own size, is itself: nothing is checked anew."""
+    pinhole = orbit((0, 0, 0), 3.0, 1, width=32, height=24)[0]
+    assert pinhole.undistorted() is pinhole
+    assert pinhole.resized(32, 24) is pinhole
+    bent = dataclasses.replace(pinhole, model="opencv", distortion=(0.1, 0.0, 0.0, 0.0))
+    assert bent.resized(32, 24) is bent
+    plain = bent.undistorted()
+    assert (plain.model, plain.distortion) == ("pinhole", ())
+    assert pinhole.resized(64, 24).width == 64

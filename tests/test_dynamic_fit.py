@@ -8,6 +8,7 @@ import math
 import shutil
 import signal
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def config(**fields) -> FitConfig:
     """Short, with rates for few steps."""
     short = {"max_steps": 12, "max_gaussians": 16, "sh_degree": 0, "save_every": 2, "means_rate": (1e-3, 1e-4)}
     rates = {"dc_rate": 0.03, "field_rate": (3e-3, 3e-4), "grid_rate": (3e-2, 3e-3), "static_share": 1 / 3}
-    return FitConfig(**{**short, **rates, **fields})
+    return FitConfig.of(**{**short, **rates, **fields})
 
 
 def test_two_cameras_are_told_of_before_the_first_step(dataset, tmp_path, caplog, monkeypatch):
@@ -280,6 +281,20 @@ def test_claims_of_a_header_are_not_believed(dataset, tmp_path):
     save_state(run.state, {**tensors, "parameter.motion": tensors["parameter.motion"] * math.nan}, header)
     with pytest.raises(ValueError, match="motion must be 16 finite numbers|parameter.motion must be"):
         load_run(run)
+
+
+def test_depth_of_older_files(dataset, tmp_path):
+    """A checkpoint whose header counts one layer as a depth of 0 loads as the same network, without a warning."""
+    run = fit(dataset, tmp_path / "run", config(max_steps=6), progress=False).run
+    tensors, header = load_state(run.state)
+    assert header["field"]["depth"] == 1
+    new = load_run(run).scene.parameters()
+    save_state(run.state, tensors, {**header, "field": {**header["field"], "depth": 0}})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        old = load_run(run).scene.parameters()
+    assert list(old) == list(new)
+    assert all(torch.equal(x, new[name]) for name, x in old.items())
 
 
 def test_times_of_views(dataset):

@@ -4,28 +4,75 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import typing
+import subprocess
+import sys
 
+import pytest
 import torch
 from scenes_random import camera, gaussians
 
 from drgs import fisher, reference, settings
+from drgs.guards import registry
 from drgs.integrator import render, render_jvp
-from drgs.tracing.responses import RESPONSES
+from drgs.tracing.responses import RESPONSES, response_of
 from drgs.tracing.responses.peak import Peak
 
 
 def test_responses_are_known_by_the_same_names():
     """Settings, engine and oracle have the same responses."""
-    names = typing.get_args(typing.get_type_hints(settings.RenderSettings)["response"])
-    assert tuple(RESPONSES) == names == tuple(reference._FORMS)
-    assert {name for name in names if settings.RenderSettings(response=name).planar} == set(settings._PLANAR)
+    assert tuple(RESPONSES) == tuple(settings._PLANAR) == tuple(reference._FORMS)
+    # Settings say it without loading the engine.
+    assert {name: response.planar for name, response in RESPONSES.items()} == settings._PLANAR
+
+
+def test_names_of_responses_load_nothing():
+    """Settings are made, and a name that there is not is refused with those that there are, without Dr.Jit."""
+    code = """
+import sys
+from drgs.settings import PRESETS, RenderSettings
+[RenderSettings.preset(name) for name in PRESETS]
+try:
+    RenderSettings(response="narrow")
+except ValueError as error:
+    print(error)
+print({"drjit", "torch"} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    error = "RenderSettings: response must be one of peak, integral, ewa, got 'narrow'"
+    assert done.stdout.splitlines() == [error, "set()"]
+
+
+@pytest.mark.parametrize("got", [None, 5, ["peak"], "Peak"])
+def test_what_is_no_name_of_a_response(got):
+    with pytest.raises(ValueError, match=r"^RenderSettings: response must be one of peak, integral, ewa, got "):
+        settings.RenderSettings(response=got)
+
+
+def test_a_response_of_another_package(tmp_path, monkeypatch):
+    """An entry point of an installed package is a name for settings; what it can be combined with it says itself."""
+    (tmp_path / "flat.py").write_text(
+        "from drgs.tracing.responses.ewa import Ewa\nclass Flat(Ewa): pass\nFLAT = Flat()\n"
+    )
+    info = tmp_path / "flat-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: flat\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[drgs.responses]\nflat = flat:FLAT\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(RESPONSES, "_rows", dict(RESPONSES._rows))
+    registry._entry_points.cache_clear()
+    try:
+        flat = settings.RenderSettings(response="flat", dilation=0.3)
+        assert flat.planar
+        assert response_of(flat) is sys.modules["flat"].FLAT
+        with pytest.raises(NotImplementedError, match="response='flat' has one depth per Gaussian, use order='center'"):
+            flat.replace(order="ray")
+    finally:
+        registry._entry_points.cache_clear()
+        sys.modules.pop("flat", None)
 
 
 class Narrow(Peak):
     """a = alpha exp(-rho^2): that of `peak` for Gaussians thinner by sqrt(2)."""
-
-    name = "narrow"
 
     def along(self, r, ray, world):
         rho2, key, u = super().along(r, ray, world)
@@ -40,8 +87,7 @@ def test_a_response_is_one_class(rng, monkeypatch):
     """A new one renders, and has gradients, tangents and information, with nothing else told of it."""
     monkeypatch.setitem(RESPONSES, "narrow", Narrow())
     plain = settings.RenderSettings(order="ray", extent=5.0)
-    narrow = dataclasses.replace(plain)
-    object.__setattr__(narrow, "response", "narrow")  # the settings' own list of names is not part of this test
+    narrow = plain.replace(response="narrow")
     g, cam = gaussians(rng, 12, 4).detach(), camera(rng, (17, 13))
     cam = dataclasses.replace(cam, w2c=cam.w2c.detach())
     thin = g.replace(log_scales=g.log_scales - 0.5 * math.log(2))

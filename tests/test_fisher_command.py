@@ -26,7 +26,7 @@ def place(tmp_path_factory):
     """`data`, an active run `run` on it, `scene.ply`, `cameras.json`."""
     folder = tmp_path_factory.mktemp("fisher")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
-    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12, selection=plan()), progress=False)
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 5, width=SIZE, height=20))
     return folder
 

@@ -71,7 +71,7 @@ def test_tables_of_few_tiles(rng, monkeypatch, width):
 
     def noted(view, *args):
         made = list(bands(view, *args))
-        parts.append((len(made), max(part.slots.size for part, _ in made)))
+        parts.append((len(made), max(band.slots for band in made)))
         return iter(made)
 
     monkeypatch.setattr(tiles.TileTraversal, "_bands", noted)

@@ -43,6 +43,17 @@ def camera():
     return Camera(K=intrinsics_from_fov(60, 24, 16), w2c=w2c, width=24, height=16, name="a/b c")
 
 
+def test_what_is_made_once(scene, camera, tmp_path, made):
+    """Of a file of Gaussians the settings are made once, and each camera as it is read; once more at another size."""
+    save_cameras_json(tmp_path / "cameras.json", [camera, camera, camera])
+    line = f"render {scene} --cameras {tmp_path / 'cameras.json'} --preset fast --quiet"
+    made["Camera"] = 0
+    assert cli.main([*line.split(), "-o", str(tmp_path / "out")]) == 0
+    assert made == {"Camera": 3, "RenderSettings": 1}
+    assert cli.main([*line.split(), "--width", "12", "-o", str(tmp_path / "small")]) == 0
+    assert made == {"Camera": 9, "RenderSettings": 2}
+
+
 def _read_exr(path) -> dict[str, np.ndarray]:
     import drjit as dr
 

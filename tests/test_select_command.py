@@ -25,7 +25,7 @@ def place(tmp_path_factory):
     """`data`, an active run `run` on it (views 1, 5 and two more), `scene.ply`, `cameras.json`."""
     folder = tmp_path_factory.mktemp("select")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
-    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12, selection=plan()), progress=False)
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=SIZE))
     return folder
 
@@ -57,6 +57,16 @@ def test_unused_views_of_a_run(place, monkeypatch, capsys):
     np.testing.assert_allclose(np.linalg.inv(first["camera"]["c2w"]), views[first["name"]].w2c, atol=1e-9)
     assert "fisher (eig): 2 of 5 views" in text
     assert all(word in text for word in ("means", "rot.", "scales", "opac.", "sh", "margin"))
+
+
+def test_what_is_made_once(place, monkeypatch, capsys, made):
+    """Settings of the command are made once, and those of the run's record; of a view no more than two cameras: as it
+    is read, and under its name, at its size or without its lens."""
+    report, _ = select("run --candidates cameras.json --preset fast", place, monkeypatch, capsys)
+    views = len(load(place / "data").views) + len(report["candidates"])
+    assert made["RenderSettings"] <= 3
+    assert len(report["known"]["names"]) == len(report["candidates"]) == 4
+    assert made["Camera"] <= 2 * views
 
 
 def test_commands_know_the_backdrop(place, monkeypatch, capsys):

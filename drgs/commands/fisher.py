@@ -49,12 +49,12 @@ KINDS = ("variance", "share")  # of maps
 def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
     check_counts(args)
-    args.settings()  # refuses what cannot be, before anything is read
-    prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
+    settings = args.settings()  # refuses what cannot be, before anything is read
+    prior = args.given_prior() or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)
-    settings = given.settings(args.preset)
+    settings = given.over_background(settings)
     text = args.train
     if text is None and given.run is None:
         if args.cameras in (None, "orbit", "dome"):

@@ -38,7 +38,7 @@ __all__ = ["read_embeddings", "run"]
 def run(args: Query) -> None:
     """`drgs query SCENE`."""
     check_counts(args)
-    args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()  # refuses what cannot be, before anything is read
     if bool(args.classes) == (args.text_embedding is not None):
         got = "both" if args.classes else "neither"
         raise ValueError(f"one of --class and --text-embedding must be given, got {got}; say what to look for")
@@ -46,6 +46,7 @@ def run(args: Query) -> None:
     inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
     output = claim(args.output, "query", ["query.json", ply], inputs)
     given = SceneInput.of(args)
+    settings = given.over_background(settings)
     g = given.gaussians
     decoder = _decoder(args, given)
     query = _query(args, given)
@@ -56,7 +57,7 @@ def run(args: Query) -> None:
     largest = float(score.max()) if len(g) else 0.0
     _refuse_nothing(len(g), count, largest, query, args.remove, _too_short(given))
     cameras, source = seen_views(args, given)
-    pixels = args.max_pixels or (given.record.config.max_pixels if given.record else None)
+    pixels = args.max_pixels or (given.record.config.data.max_pixels if given.record else None)
     if pixels is not None:
         cameras = [at_most(camera, pixels) for camera in cameras]
     names = pictures.file_names([camera.name for camera in cameras])
@@ -64,7 +65,7 @@ def run(args: Query) -> None:
     views = []
     with Bar("query", len(cameras), not args.quiet) as bar:
         for camera, name in zip(cameras, names, strict=True):
-            views.append(_view(g, camera, given.settings(args.preset), query, decoder, args.output, name))
+            views.append(_view(g, camera, settings, query, decoder, args.output, name))
             bar.advance()
     save_ply(kept, args.output / ply)
     report = {
@@ -79,7 +80,7 @@ def run(args: Query) -> None:
         "gaussians": {"all": len(g), "selected": count, "written": len(kept)},
         "file": ply,
         "source": source,
-        "settings": dataclasses.asdict(given.settings(args.preset)),
+        "settings": dataclasses.asdict(settings),
         "views": views,
     }
     write_json(args.output / "query.json", report)
@@ -143,7 +144,7 @@ def _too_short(given: SceneInput) -> str:
     if given.record is None:
         return ""
     done = given.record.config.max_steps if given.step is None else given.step
-    rate = given.record.config.feature_rate
+    rate = given.record.config.features.feature_rate
     if rate <= 0 or done >= (needed := math.ceil(1 / rate)):
         return ""
     return (
@@ -176,7 +177,7 @@ def _view(
     name: str,
 ) -> dict:
     """Mask and picture of a view, and its row of query.json."""
-    with torch.no_grad():  # a picture
+    with torch.no_grad():  # a picture is looked at only
         out = render(g, camera, settings, ())
     _, selected = query.score(out.features, decoder)
     mask = (selected & (out.alpha.cpu() >= OPAQUE)).numpy()

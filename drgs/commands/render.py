@@ -51,7 +51,7 @@ _FORMATS = ("png", "exr", "webm", "ply")
 
 def run(args: Render) -> None:
     """`drgs render SCENE`."""
-    args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()  # refuses what cannot be, before anything is read
     formats = _formats(args.format)
     _check_numbers(args)
     if args.moving and "ply" not in formats:
@@ -65,7 +65,7 @@ def run(args: Render) -> None:
     given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors
-    settings = given.settings(args.preset)
+    settings = given.over_background(settings)
     size = args.width, args.height
     cameras, source = drawn_views(args, views, given, args.frames, size, returns=True)
     cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)

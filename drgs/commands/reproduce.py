@@ -25,7 +25,7 @@ from drgs.studies.rows import Cell, cell_of, read_study
 from drgs.studies.sheets import comparison_sheet
 
 if TYPE_CHECKING:
-    from drgs.cluster.connect import Cluster
+    from drgs.cluster.workers import Cluster
     from drgs.commands.making_options import Reproduce
 
 __all__ = ["run"]

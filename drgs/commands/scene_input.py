@@ -86,6 +86,10 @@ class SceneInput:
         """How a command renders it with a preset."""
         return RenderSettings.preset(preset, **self.fields)
 
+    def over_background(self, settings: RenderSettings) -> RenderSettings:
+        """What --preset and --set say (`args.settings()`), over the background of the fit unless --set names one."""
+        return settings if settings.background == self.background else settings.replace(background=self.background)
+
     def semantics(self) -> SemanticMetric | None:
         """The metric of its decoder, in which features tell about the geometry; None without a decoder."""
         from drgs.information.semantics import SemanticMetric  # not for those that ask for no information

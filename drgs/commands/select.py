@@ -15,9 +15,9 @@ from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
-from drgs.gain import Prior, criterion_named
 from drgs.guards.outputs import check_file
-from drgs.select import Scoring, Selection, policy_named, select
+from drgs.information.criteria import criterion_named
+from drgs.select import Selection, policy_named, select
 
 if TYPE_CHECKING:
     from drgs.commands.options import Select
@@ -35,25 +35,14 @@ _SHORT = {
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
     check_counts(args)
-    args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()  # refuses what cannot be, before anything is read
+    check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
+    wanted = args.scoring()  # before files are read, too
     policy_named(args.policy)
     criterion_named(args.criterion, "--criterion")
-    check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
-    prior = Prior.given(args.prior, args.relative_prior)
     given = SceneInput.of(args)
-    settings = given.settings(args.preset)
-    semantics = given.semantics()
-    scoring = Scoring(
-        args.criterion,
-        settings,
-        args.method,
-        prior,
-        blocks=args.blocks,
-        semantics=semantics,
-        network=args.network,
-        combine=args.combine,
-        probes=args.probes,
-    )
+    settings = given.over_background(settings)
+    scoring = dataclasses.replace(wanted, settings=settings, semantics=given.semantics())
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     candidates = timed(candidates, args, given)

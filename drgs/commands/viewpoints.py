@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Literal
 
 from drgs import data
 from drgs.codecs.folders import cameras_of_model
+from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_distance
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.files import Run
@@ -62,30 +63,47 @@ class Source:
         option: Its name, for messages.
         text: Its value.
         kind: `orbit`, `dome`, `list` (of cameras, in JSON), `run` or `data`.
+        given: What the command looks at: the record of a run is read once.
     """
 
     option: str
     text: str
     kind: Literal["orbit", "dome", "list", "run", "data"]
+    given: SceneInput | None = None
 
     @classmethod
-    def of(cls, option: str, text: str, made: tuple[str, ...] = ()) -> Source:
+    def of(cls, option: str, text: str, made: tuple[str, ...] = (), given: SceneInput | None = None) -> Source:
         """The meaning of a text.
 
         Args:
             option, text: Name and value of the option.
             made: Which of `orbit` and `dome` it may be.
+            given: What the command looks at.
         """
         if text in made:
             return cls(option, text, text)
         path = cameras_of_model(Path(text)) or Path(text)
         text = str(path)
-        return cls(option, text, "list" if is_camera_list(path) else "run" if is_run(path) else "data")
+        return cls(option, text, "list" if is_camera_list(path) else "run" if is_run(path) else "data", given)
+
+    @classmethod
+    def known(cls, text: str | None, given: SceneInput) -> Source:
+        """What `--train` names, else the run that is looked at."""
+        return cls("--train", str(given.run.path), "run", given) if text is None else cls.of("--train", text, (), given)
 
     @functools.cached_property
     def record(self) -> FitRecord | None:
         """How it was fitted, if it is a run."""
-        return fit_record(Run(Path(self.text))) if self.kind == "run" else None
+        if self.kind != "run":
+            return None
+        run = Run(Path(self.text))
+        if (
+            self.given is not None
+            and self.given.run is not None
+            and self.given.run.path.resolve() == run.path.resolve()
+        ):
+            return self.given.record
+        return fit_record(run)
 
     def check_split(self, split: str) -> None:
         """Raise ValueError if `--split` asks for a part of what has none."""
@@ -115,8 +133,8 @@ class Source:
             points=False,
             strict=args.strict,
             semantics=False,
-            times=config.times if args.times is None else args.times,
-            test_cameras=config.test_cameras if args.test_cameras is None else args.test_cameras,
+            times=config.data.times if args.times is None else args.times,
+            test_cameras=config.data.test_cameras if args.test_cameras is None else args.test_cameras,
         )
 
     def split(self, dataset: Dataset, part: str, given: SceneInput) -> list[View]:
@@ -127,7 +145,7 @@ class Source:
             ValueError: If there is none.
         """
         record = self.record or given.record
-        held_out = (record.config.test_every, record.config.test_offset) if record else ()
+        held_out = (record.config.data.test_every, record.config.data.test_offset) if record else ()
         train, test = dataset.split(*held_out)
         views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[part]
         if not views:
@@ -160,14 +178,14 @@ def drawn_views(
         FileNotFoundError: If there is no such file.
         ValueError: If an option is out of range or a file damaged, or a split has no view.
     """
-    source = Source.of("--cameras", text, made=("orbit",))
+    source = Source.of("--cameras", text, ("orbit",), given)
     source.check_split(args.split)
     if source.kind == "orbit":
         return _drawn_orbit(args, given, frames, size, returns)
     if source.kind == "list":
         return source.listed(), str(Path(text))
     views = source.split(source.dataset(args, given, lazy=False), args.split, given)
-    return [dataclasses.replace(view.camera, name=view.name) for view in views], f"{Path(text)} ({args.split})"
+    return [_named(view) for view in views], f"{Path(text)} ({args.split})"
 
 
 def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput) -> tuple[list[Camera], str]:
@@ -192,14 +210,15 @@ def _drawn_orbit(
     captured = _captured(given)
     shape = captured[0].height / captured[0].width if captured else 0.75
     width, height = _size(*size, shape)
-    how = {"width": width, "height": height, "wish": Wish.of(args), "returns": returns}
+    wish = Wish.of(args)
+    how = {"width": width, "height": height, "wish": wish, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
     if cameras:
         _say(args, source)
         return cameras, source
-    up = "minus-y" if args.up == "auto" else args.up
-    if args.up == "auto":
-        _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
+    if wish.up is None:
+        _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
+    up = next(name for name, direction in UP.items() if direction == (wish.up or UP["minus-y"]))
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
 
@@ -208,7 +227,7 @@ def _captured(given: SceneInput) -> list[Camera]:
     if given.run is None:
         return []
     try:
-        names = set(fitted_views(given.run))
+        names = set(fitted_views(given.run, given.record))
         dataset = load_dataset(given.record.data, given.record.config, lazy=True, points=False, semantics=False)
     except (ValueError, OSError, KeyError):
         return []
@@ -259,8 +278,8 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
         raise ValueError(
             "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json"
         )
-    source = Source("--train", str(given.run.path), "run") if text is None else Source.of("--train", text)
-    pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.max_pixels)
+    source = Source.known(text, given)
+    pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
         return Known([at_most(camera.undistorted(), pixels) for camera in source.listed()], where, pixels)
@@ -269,7 +288,7 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
         cameras = [_camera(view, {}, pixels) for view in views]
         return Known(cameras, where, pixels, Path(source.text).resolve())
     place = source.record.data
-    names = fitted_views(Run(Path(source.text)))
+    names = fitted_views(Run(Path(source.text)), source.record)
     named = {view.name: view for view in views}
     if missing := [name for name in names if name not in named]:
         raise ValueError(
@@ -298,14 +317,15 @@ def other_views(
         FileNotFoundError: If there is no such file.
         ValueError: If an option is out of range or a file damaged, or no view is left.
     """
-    source = Source.of(option, text, made=("orbit", "dome"))
+    source = Source.of(option, text, ("orbit", "dome"), given)
     source.check_split(args.split)
     if source.kind == "orbit":
         return _compared_orbit(Wish.of(args), given, known, args.count), f"orbit of {args.count}"
     if source.kind == "dome":
-        if args.span is not None:
-            raise ValueError(f"--span must have {option} orbit, a dome goes all the way round; drop it")
-        circle = dataclasses.replace(Wish.of(args), elevation=0.0, span=360.0)
+        wish = Wish.of(args)
+        if wish.span is not None:
+            raise ValueError(f"--orbit span must have {option} orbit, a dome goes all the way round; drop it")
+        circle = dataclasses.replace(wish, elevation=0.0, span=360.0)
         return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
     if source.kind == "list":
         return [at_most(camera.undistorted(), known.pixels) for camera in source.listed()], text
@@ -356,8 +376,12 @@ def _compared_orbit(wish: Wish, given: SceneInput, known: Known, count: int) -> 
 
 def _camera(view: View, sizes: dict[tuple[int, int], tuple[int, int]], pixels: int) -> Camera:
     """A view's camera: pinhole, of the size that its image probably has, then reduced."""
-    camera = dataclasses.replace(view.camera.undistorted(), name=view.name)
-    return at_most(resized_alike(camera, sizes), pixels)
+    return at_most(resized_alike(_named(view).undistorted(), sizes), pixels)
+
+
+def _named(view: View) -> Camera:
+    """A view's camera under the view's name."""
+    return view.camera if view.camera.name == view.name else dataclasses.replace(view.camera, name=view.name)
 
 
 # ------------------------------------------------------------------------------------------ both

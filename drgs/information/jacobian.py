@@ -10,20 +10,19 @@ derivatives da of a hit's opacity by the geometry of its Gaussian are closed for
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 
 from drgs.ellipsoids import Y_00
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import if_any_hit
 from drgs.tracing.hit_table import Table, passed
-from drgs.tracing.kernels import Channels, HitModel, Ray
-from drgs.tracing.protocols import Float, Lib, Mask, Sink, UInt32
+from drgs.tracing.kernels import Channels, HitModel
+from drgs.tracing.primitives import Projected, Ray
+from drgs.tracing.protocols import Sink
 from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
-
-if TYPE_CHECKING:
-    from drgs.tracing.projection import Projected
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
 

@@ -142,7 +142,7 @@ class ViewQuestion:
 
 
 class Workers(Protocol):
-    """Other processes that views are asked about in; `drgs.cluster.connect.Cluster` is some."""
+    """Other processes that views are asked about in; `drgs.cluster.workers.Cluster` is some."""
 
     def each(
         self, scene: Scene, views: Sequence[tuple[Question, Camera, torch.Tensor | None]]

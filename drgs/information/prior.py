@@ -18,10 +18,12 @@ __all__ = ["Prior"]
 class Prior:
     """lambda: how precisely each parameter is known before any view, added to H once.
 
+    A relative one makes `eig` and `logdet` independent of the unit of a group. A group that no view sees has no median:
+    its lambda is 0.
+
     Attributes:
         value: lambda of every group, >= 0. With 0, parameters that no training view sees are left out of every score.
-        relative: Multiply lambda by the median of the group's positive entries of H, which makes `eig` and `logdet`
-            independent of the group's unit. A group that no view sees has no median: its lambda is 0.
+        relative: lambda is its value (--prior) times the median information of a parameter's group, where it is not 0.
         groups: Group -> lambda in place of `value`.
     Raises:
         ValueError: If a lambda is negative, infinite or NaN.

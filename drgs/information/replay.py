@@ -11,12 +11,13 @@ import torch
 
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
+from drgs.tracing.arrays import Float
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
-from drgs.tracing.harmonics import sh_basis, sh_color
+from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.hit_table import Table, by_lists
 from drgs.tracing.pose import quaternion_product
-from drgs.tracing.protocols import Float
+from drgs.tracing.primitives import Activated
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -86,9 +87,8 @@ class Replay:
         lib = self.lib
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         self.compositor, arguments = call.prepare(self.inputs)
-        self.compositor.beside = call.width
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
-            images = self.compositor.forward(*arguments, keep=True)
+            images = self.compositor.forward(*arguments, keep=True, joint=call.width)
         self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
         p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
@@ -116,19 +116,10 @@ class Replay:
     def _colors(self, p: dict) -> tuple[list[Float], list[Float], list[list[Float]] | None]:
         """Per channel where the color is not clamped, the SH basis, and dc/dmu (None for degree 0)."""
         lib, K = self.lib, self.call.coefficients
-        i = dr.arange(lib.UInt32, self.count)
-        v = [[dr.gather(lib.Float64, p["w2c"], lib.UInt32(4 * r + c)) for c in range(4)] for r in range(3)]
-        mean = [lib.Float64(dr.gather(type(p["means"]), p["means"], 3 * i + k)) for k in range(3)]
-        # c - o in world axes, through the camera's, as the colors are computed.
-        local = [v[r][0] * mean[0] + v[r][1] * mean[1] + v[r][2] * mean[2] + v[r][3] for r in range(3)]
-        away = [v[0][k] * local[0] + v[1][k] * local[1] + v[2][k] * local[2] for k in range(3)]
-        squared = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
-        inverse = lib.Float(dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0))
-        d = [lib.Float(x * lib.Float64(inverse)) for x in away]
-        basis = sh_basis(d, K)
-        sh = lib.Float(p["sh"])  # may be float64
-        coefficient = lambda k, c: dr.gather(lib.Float, sh, 3 * K * i + (3 * k + c))  # noqa: E731
-        rgb = sh_color(basis, coefficient)
+        response = self.compositor.model.response
+        g = Activated(lib, p, p["w2c"], self.settings, self.count, response.at_most_alpha)
+        d, inverse, basis, rgb = g.color(K)
+        coefficient = lambda k, c: lib.Float(g.column("sh", 3 * k + c, 3 * K))  # noqa: E731
         lit = [dr.select(x > 0, lib.Float(1), 0) for x in rgb]
         zero = dr.zeros(lib.Float, self.count)
         basis_width = [x + zero for x in basis]

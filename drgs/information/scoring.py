@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
-from drgs.guards.arguments import must_be
+from drgs.guards.arguments import kind_of, must_be
+from drgs.guards.records import TRANSIENT, Record
 from drgs.information.choices import (
     BLOCK_NAMES,
     BLOCKS,
@@ -16,7 +18,6 @@ from drgs.information.choices import (
     NETWORK_SCORES,
     Block,
     Combine,
-    Criterion,
     Method,
     NetworkScore,
     check_combined,
@@ -35,54 +36,67 @@ __all__ = ["Scoring"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Scoring:
+class Scoring(Record):
     """How much a view counts: what is computed of it, and how that becomes a number.
 
+    `prior`: None is 1e-2 of criterion `v_opt`, for colors that are known to 0.3 beforehand and photographs to 0.03;
+    else 1e-6, as in FisherRF. Policy `coverage` takes its `value`, not its `groups`.
+
+    `blocks`: `geometry` is what the colors of an image tell about all but the features; `semantic`, what its decoded
+    features tell about the features and, coupled, about the geometry; `deformation`, what both tell, as far as the
+    other two blocks are named, else the colors, about the network that moves the Gaussians, groups `grid` and `mlp`;
+    `backdrop`, what its opacity tells about what is behind all Gaussians. None is all that the scene has (method
+    `fisherrf` knows colors of Gaussians only, `block_logdet` these and features).
+
+    `network`: `ratio` scores the diagonal of the block `deformation` by `criterion` against that of the known views,
+    like all other groups; `trace` and `paper` go by what a candidate says itself, whatever is known.
+
+    `combine`: `sum` adds up all groups' parts. With `zscore` each block alone is scored by its own information, less
+    the mean and divided by the standard deviation of the candidates (one that is the same for all counts 0), and these
+    are added up. None is `sum`, but `zscore` where a trace stands beside another block, for their units differ.
+
+    Criterion, method, groups and blocks are of policy `fisher`, method and groups not of `block_logdet`; weights are of
+    `fisher` and `fisherrf`. Groups of a scene's network need method `columns` or `probes`.
+
     Attributes:
-        criterion: One of `drgs.gain.CRITERIA`; of policy `fisher` only.
-        settings: Of the renderer.
-        method: Of `drgs.fisher.diagonal`; of `fisher` only, not of `block_logdet`.
-        prior: lambda. `coverage` takes its `value`, not its `groups`. None: 1e-2 of criterion `v_opt`, for colors that
-            are known to 0.3 beforehand and photographs to 0.03; else 1e-6, as in FisherRF.
-        weights: Group -> factor, 1 where none is given; of `fisher` and `fisherrf` only.
-        groups: Of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that Gaussians have. Of
-            `fisher` only, not of `block_logdet`. Those of a scene's network need method `columns` or `probes`.
-        blocks: What of an image tells about what: `geometry`, its colors, about all but the features; `semantic`, its
-            decoded features, about the features and, coupled, about the geometry; `deformation`, both as far as the
-            other two blocks are named, else its colors, about the network that moves the Gaussians, groups `grid` and
-            `mlp`; `backdrop`, its opacity, about what is behind all Gaussians. None: all that the scene has (method
-            `fisherrf` knows colors of Gaussians only, `block_logdet` these and features). Of `fisher` only.
-        semantics: The metric of the block `semantic`; None: that of features as they are stored, all channels alike.
-        network: How the block `deformation` scores: `ratio`, its diagonal by `criterion` against that of the known
-            views, like all other groups; `trace` and `paper`, by what a candidate says itself, whatever is known.
-        combine: How scores of several blocks become one: `sum`, of all groups' parts; `zscore`, each block alone is
-            scored by its own information, less the mean and divided by the standard deviation of the candidates (one
-            that is the same for all counts 0), and these are added up. None: `sum`, but `zscore` where a trace stands
-            beside another block, for their units differ.
-        probes: Random images, or tangents, of each view: of the block `deformation`, and of method `probes`.
+        criterion: Score of policy fisher, or package.module:function of one's own; v_opt chose the best views from six
+            on, level below (docs/active-static.md).
+        settings: What `drgs.render` computes of a view.
+        method: How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does.
+        prior: How firmly every parameter counts as known beforehand (lambda): 1e-2 with v_opt, 1 in drgs fisher, else
+            1e-6.
+        weights: Group -> factor of its part of the score; 1 where none is given.
+        groups: Groups of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that there are.
+        blocks: What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop
+            (gaps).
+        semantics: Metric of the block semantic; None: that of features as they are stored, all channels alike.
+        network: How the block deformation scores: against what known views say of the field (ratio), or alone (trace,
+            paper).
+        combine: Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace.
+        probes: Random probes of each view, for what it tells about a deformation field, and for --method probes.
     Raises:
         ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
             the wrong kind.
     """
 
-    criterion: Criterion | str = CRITERION_NAMES[0]
-    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("exact"))
+    criterion: str = CRITERION_NAMES[0]
+    settings: RenderSettings = dataclasses.field(
+        default_factory=lambda: RenderSettings.preset("exact"), metadata=TRANSIENT
+    )
     method: Method = METHODS[0]
     prior: Prior | None = None
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
     groups: tuple[str, ...] | None = None
     blocks: tuple[Block, ...] | None = None
-    semantics: SemanticMetric | None = None
+    semantics: SemanticMetric | None = dataclasses.field(default=None, metadata=TRANSIENT)
     network: NetworkScore = NETWORK_SCORES[0]
     combine: Combine | None = None
     probes: int = 16
+    where: ClassVar[str] = "select"
 
     def __post_init__(self) -> None:
         check_named("select", CRITERIA, self.criterion)
-        choices: dict[str, tuple[str, ...]] = {
-            "method": METHODS,
-            "network": NETWORK_SCORES,
-        }
+        choices: dict[str, tuple[str, ...]] = {"method": METHODS, "network": NETWORK_SCORES}
         for name, known in (choices | ({} if self.combine is None else {"combine": COMBINES})).items():
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
@@ -90,8 +104,12 @@ class Scoring:
         if self.prior is not None:
             must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
         must_be("select", "weights", self.weights, Mapping, 'e.g. {"means": 0.5}')
+        for group, weight in self.weights.items():
+            must_be("select", f"weights of {group}", weight, numbers.Real, 'e.g. {"means": 0.5}')
         if self.groups is not None:
             must_be("select", "groups", self.groups, (tuple, list), 'e.g. ("means", "sh")')
+            if odd := [group for group in self.groups if not isinstance(group, str)]:
+                raise ValueError(f"select: groups must be names of groups, got {kind_of(odd[0])}; correct it")
             object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
         if self.blocks is not None:
             object.__setattr__(self, "blocks", checked_blocks("select", self.blocks, self.method))

@@ -81,13 +81,13 @@ def plan_of(
         raise ValueError("reproduce: --data must be folders of different names, got one twice; rename or link one")
     study = study_of(experiment.study, scale, made, scenes, lpips=lpips)
     study = dataclasses.replace(study, policies={label: study.policies[label] for label in wanted})
-    dataclasses.replace(study.fit, test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
+    study.fit.replace(test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
     units = []
     notes = list[str]()
     lacking = set[tuple[str, str]]()
     for scene, path in scenes.items():
         dataset = data.load(
-            path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.times
+            path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.data.times
         )
         found = _units_of(study, scene, dataset, moves, split, seeds, protocol)
         units += found

@@ -30,12 +30,12 @@ import numpy as np
 
 from drgs import runtime
 from drgs.settings import RenderSettings
-from drgs.tracing.kernels import HitModel, Ray
-from drgs.tracing.projection import Projected
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
+from drgs.tracing.kernels import HitModel
+from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.sort_keys import EMPTY, positive
 from drgs.tracing.tiles import depth_order
-from drgs.tracing.walk import Part
+from drgs.tracing.walk import BUFFER, Part
 
 __all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 
@@ -87,9 +87,18 @@ class BvhTraversal:
         ray = self._ray(self.order)
         inside = lib.Bool(bool(self.rays))
         stream = _ProxyStream(lib, self.proxies, ray, s.order)
-        part = Part(lib, self.model, self.records, [ray], [self.order], [inside], stream, True, self.center_key)
-        if s.order == "entry":
-            part.buffer = _NEARLY
+        part = Part(
+            lib,
+            self.model,
+            self.records,
+            [ray],
+            [self.order],
+            [inside],
+            stream,
+            ordered=True,
+            center_key=self.center_key,
+            buffer=_NEARLY if s.order == "entry" else BUFFER,
+        )
         return [part]
 
     def weighed(self, share: int, size: int) -> list[Part]:

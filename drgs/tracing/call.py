@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -17,13 +16,13 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
-from drgs.tracing.composite import Compositor
-from drgs.tracing.harmonics import sh_basis
+from drgs.tracing.composite import Arguments, Compositor, arranged
 from drgs.tracing.operation import Composite
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.tiles import TileTraversal
+from drgs.tracing.walk import Traversal
 
-__all__ = ["OF_VIEW", "Call", "Arguments", "Output", "numbers"]
+__all__ = ["OF_VIEW", "Call", "Output", "numbers"]
 
 OF_VIEW = ("w2c", "ray_origins", "ray_directions")  # inputs that follow from the pose
 
@@ -52,15 +51,6 @@ class Output:
     visibility: torch.Tensor | None = None
     features: torch.Tensor | None = None
     certificate: dict | list[dict] = dataclasses.field(default_factory=dict)
-
-
-class Arguments(NamedTuple):
-    """What a `Compositor` composites: the arguments of its `forward`, attached to the graph of a call's inputs."""
-
-    record: list
-    sh: Any
-    features: Any
-    carried: list
 
 
 class Call:
@@ -191,26 +181,23 @@ class Call:
         """The `Compositor` of the view, and what it composites."""
         lib, s = self.lib, self.settings
         p = {name: x.array for name, x in self.fields(inputs).items()}
-        along_ray = s.sh_direction == "ray"
-        coefficients = 0 if along_ray else self.coefficients
         if s.traversal == "bvh":
             from drgs.tracing.bvh import BvhTraversal  # the only one that needs Mitsuba
 
-            projected = projection.project_world(lib, p, p["w2c"], s, coefficients)
-            traversal = BvhTraversal(lib, s, projected, self.pixels)
+            projected = projection.project_world(lib, p, p["w2c"], s, self.coefficients)
+            traversal: Traversal = BvhTraversal(lib, s, projected, self.pixels)
         else:
             K = self.camera.K
             size = (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
-            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, coefficients)
+            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients)
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
             trimmed = not self.want & {"depth", "count"}
             traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed)
-        basis, carried = self._carried(p, along_ray, traversal.world)
-        compositor = Compositor(lib, s, traversal, self.want, self.width, basis, self.couple)
-        sh = lib.Float(p["sh"]) if along_ray else None
-        features = lib.Float(p["features"]) if self.width else None
-        return compositor, Arguments(projected.record, sh, features, carried)
+        rays = self._column(p, "ray_origins"), self._column(p, "ray_directions")
+        return arranged(
+            lib, s, traversal, p, self.coefficients, *rays, want=self.want, width=self.width, couple=self.couple
+        )
 
     def fields(self, inputs: dict) -> dict:
         """Raw fields of the Gaussians by name, and what is known of the view: the inputs, through the field if any."""
@@ -219,22 +206,14 @@ class Call:
         view = {name: x for name, x in inputs.items() if name in OF_VIEW}
         return self.field({name: x for name, x in inputs.items() if name not in OF_VIEW}) | view
 
-    def _carried(self, p: dict, along_ray: bool, world: bool) -> tuple[int, list]:
-        """What rays carry: the SH basis where colors are evaluated along them, then o and d of world rays."""
+    def _column(self, p: dict, name: str) -> list | None:
+        """Three (P,) float32 columns of origins or directions of rays; None where there are none among the inputs."""
+        if name not in p:
+            return None
         lib = self.lib
-        basis = 0
-        carried = []
-        if along_ray or world:
-            i = dr.arange(lib.UInt32, self.pixels)
-            direction = [lib.Float(dr.gather(lib.Float64, p["ray_directions"], 3 * i + k)) for k in range(3)]
-            if along_ray:
-                carried += sh_basis(direction, self.coefficients)
-                carried[0] = carried[0] + dr.zeros(lib.Float, self.pixels)
-                basis = self.coefficients
-            if world:
-                origin = [lib.Float(dr.gather(lib.Float64, p["ray_origins"], 3 * i + k)) for k in range(3)]
-                carried += origin + direction
-        return basis, carried
+        i = dr.arange(lib.UInt32, self.pixels)
+        # Hits are found in float32; the world of float64 means was re-centered before.
+        return [lib.Float(dr.gather(lib.Float64, p[name], 3 * i + k)) for k in range(3)]
 
     # -- torch side -------------------------------------------------------------------------------------------------
 

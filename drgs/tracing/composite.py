@@ -9,22 +9,73 @@ traversal writes down (weights.py) where rays walk along lists of tiles; elsewhe
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, NamedTuple
 
 import drjit as dr
 import torch
 
 from drgs.settings import RenderSettings
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import Adjoint, Tangent
+from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.hit_table import Table, by_lists
-from drgs.tracing.kernels import Channels, HitModel, Primal
-from drgs.tracing.protocols import Float, Lib, Mask, Traversal, UInt32
+from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
-from drgs.tracing.walk import Part
-from drgs.tracing.weights import MATRIX, PIXELS, Weights, emit_weights, in_rows, without_graph
+from drgs.tracing.walk import Part, Traversal
+from drgs.tracing.weights import MATRIX, PIXELS, Weights, in_rows, without_graph
 
-__all__ = ["CHUNK", "Compositor"]
+__all__ = ["CHUNK", "Arguments", "Compositor", "arranged"]
 
 CHUNK = 32  # feature channels of one traversal
+
+
+class Arguments(NamedTuple):
+    """What a `Compositor` composites: the arguments of its `forward`, attached to the graph of a call's inputs."""
+
+    record: list
+    sh: Any
+    features: Any
+    carried: list
+
+
+def arranged(
+    lib: Lib,
+    settings: RenderSettings,
+    traversal: Traversal,
+    p: dict,
+    coefficients: int,
+    origins: list[Float] | None = None,
+    directions: list[Float] | None = None,
+    want: frozenset = frozenset(),
+    width: int = 0,
+    couple: bool = True,
+) -> tuple[Compositor, Arguments]:
+    """The compositor of a view, and what it composites.
+
+    Args:
+        lib, settings, traversal, want, width, couple: As `Compositor` takes them.
+        p: Flat raw parameters by name, of which `sh` and `features` are read.
+        coefficients: SH coefficients in `p["sh"]`.
+        origins, directions: Three (P,) columns each, unit directions, both in the world of the means. Needed where rays
+            carry something: themselves through a world, an SH basis where colors are evaluated along them.
+    """
+    along_ray = settings.sh_direction == "ray"
+    basis: list[Float] = []
+    if along_ray:
+        assert directions is not None
+        basis = sh_basis(directions, coefficients)
+        # The first harmonic is a constant of width 1, but rays carry an entry each.
+        basis[0] = basis[0] + dr.zeros(lib.Float, traversal.rays)
+    carried = list(basis)
+    if traversal.world:
+        assert origins is not None
+        assert directions is not None
+        carried += [*origins, *directions]
+    compositor = Compositor(lib, settings, traversal, want, width, len(basis), couple)
+    # Casts: parameters may be float64, where means are; hits are composited in float32.
+    sh = lib.Float(p["sh"]) if along_ray else None
+    features = lib.Float(p["features"]) if width else None
+    return compositor, Arguments(traversal.projected.record, sh, features, carried)
 
 
 class Compositor:
@@ -33,22 +84,19 @@ class Compositor:
     No dataclass on purpose: Dr.Jit would take it for a tree of arrays and copy it.
 
     Args:
-        lib: Dr.Jit types.
-        settings: RenderSettings.
-        traversal: Of this view.
+        lib: Dr.Jit types of the backend.
+        settings: Settings of the render.
+        traversal: Rays of this view, and where they look for Gaussians.
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.
-        width: Feature channels.
-        basis: Of the arrays that rays carry, how many are SH basis values.
+        width: Number of feature channels.
+        basis: How many of the arrays that rays carry are SH basis values.
         couple: Derivatives of the feature image reach all that it depends on; else only the features.
     Attributes:
         certificate: After `forward`: rays, redone rays, entries listed.
         extra: After `forward`: outputs without a derivative.
+        passes: After `forward`: what each traversal composited.
         finals: After `forward`: per traversal, (part, final states) pairs.
-        beside: Feature channels that the first traversal composites beside the colors, none or all; set it before
-            `forward`.
     """
-
-    beside = 0
 
     def __init__(
         self,
@@ -83,6 +131,7 @@ class Compositor:
         carried: list[Float],
         keep: bool,
         columns: int = 0,
+        joint: int = 0,
     ) -> dict:
         """Flat images rgb, alpha, and where there are any depth and features.
 
@@ -93,6 +142,8 @@ class Compositor:
             carried: Per-ray floats: SH basis values, then o and d of world rays.
             keep: The adjoint may follow.
             columns: So many tangents may follow.
+            joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
+                its hits knows all that it composites (`information.replay`).
         """
         view = self.traversal
         self.entries = len(record)
@@ -105,12 +156,12 @@ class Compositor:
         dr.eval(self.buffers, carried)
         view.start(self.model, self.buffers["record"], carried, self.basis, keep)
         self.certificate.update(view.certificate)
-        self.passes = [self._channels(0, self.beside, color=True)]
-        chunks = range(self.beside, self.width, CHUNK)
+        self.passes = [self._channels(0, joint, color=True)]
+        chunks = range(joint, self.width, CHUNK)
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
         # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
         share = 4 if self.settings.order == "center" and not view.world and not self.basis else 1
-        weighed = self.width > self.beside
+        weighed = self.width > joint
         self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
         out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))
         for name in ("visibility", "median", "count"):
@@ -193,7 +244,7 @@ class Compositor:
             self.parts += self._redo(part)
             check = False
         buffer = part.weights.zeros() if part.weights is not None else None
-        kernel = Primal(self.model, channels, want - {"visibility"}, emit_weights(part, buffer, visibility))
+        kernel = Primal(self.model, channels, want - {"visibility"}, _emit_weights(part, buffer, visibility))
         states = part.run(kernel, check=check)
         dr.eval(states, part.failed if check else None, buffer)  # together: one kernel
         if check:
@@ -202,10 +253,7 @@ class Compositor:
 
     def _redo(self, part: Part) -> list[Part]:
         """Take the rays that the certificate rejects out of `part`, into parts of their own."""
-        failed = part.failed & part.inside[0]
-        again = dr.compress(failed)
-        part.inside = [part.inside[0] & ~failed]
-        dr.eval(part.inside)
+        again = part.reject()
         self.certificate["rays"] = self.rays
         if part.first:  # those walked a third time are among them
             self.certificate["redone"] = self.certificate.get("redone", 0) + dr.width(again)
@@ -246,9 +294,9 @@ class Compositor:
         dr.eval(g)
         slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
-            for walked in done:
+            for part, states in done:
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
-                    self._adjoint(g, channels, walked, grads, carried, slopes)
+                    self._adjoint(g, channels, part, states, grads, carried, slopes)
         if slopes is not None:
             grads["features"] += lib.Float(slopes.view(-1))
         i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
@@ -261,15 +309,23 @@ class Compositor:
         return grads | ({"carried": carried} if carried else {})
 
     def _adjoint(
-        self, g: dict, channels: Channels, walked: tuple, grads: dict, carried: list[Float], slopes: torch.Tensor | None
+        self,
+        g: dict,
+        channels: Channels,
+        part: Part,
+        finals: list[dict],
+        grads: dict,
+        carried: list[Float],
+        slopes: torch.Tensor | None,
     ) -> None:
-        """Of a part with its final states: add to `grads`, `carried` and the `slopes` of features."""
-        (part, finals) = walked
+        """Add what a part with its final states gives to `grads`, `carried` and the `slopes` of features."""
         depth = "depth" in self.want and channels.color
-        shared = None
+        scalars = None
         cotangents = self._cotangents(g, channels, part)
         if part.weights is not None and slopes is not None:
-            shared = self._products(part, part.weights, in_rows(g["features"], self.width), slopes, cotangents)
+            scalars, sums = self._products(part, part.weights, in_rows(g["features"], self.width), slopes)
+            if scalars is not None:
+                cotangents = [{**own, "rest": rest} for own, rest in zip(cotangents, sums, strict=True)]
         if channels.channels and not self.couple:
             self._feature_gradient(grads["features"], channels, part, cotangents)
             return
@@ -277,8 +333,8 @@ class Compositor:
         def kernel(part: Part, finals: list[dict], table: Table | None = None) -> Adjoint:
             own = cotangents if table is None else self._cotangents(g, channels, part)
             scalar = None
-            if shared is not None:
-                scalar = lambda k, place, ok: dr.gather(self.lib.Float, shared, part.slot(k, place), ok)  # noqa: E731
+            if scalars is not None:
+                scalar = lambda k, place, ok: dr.gather(self.lib.Float, scalars, part.slot(k, place), ok)  # noqa: E731
             return Adjoint(self.model, channels, grads, finals, own, depth, part.reduction, scalar, table)
 
         part, finals, table = by_lists(self.lib, part, finals, 1, kernel)
@@ -289,24 +345,28 @@ class Compositor:
         dr.eval(grads, carried)
 
     def _products(
-        self, part: Part, weights: Weights, g: torch.Tensor, slopes: torch.Tensor, cotangents: list[dict]
-    ) -> Float | None:
-        """Add the gradient of the features in a part to `slopes`; if coupled, a table of what they add to s."""
+        self, part: Part, weights: Weights, g: torch.Tensor, slopes: torch.Tensor
+    ) -> tuple[Float | None, list[Float]]:
+        """Add the gradient of the features in a part to `slopes`; if coupled, a table of what they add to s.
+
+        Returns:
+            The table, and per shared ray the sum of it over the ray's weights, in float64; or None and nothing.
+        """
         lib, buffer = self.lib, weights.kept
+        slots = part.slots
+        assert slots is not None  # weights are held of rays through tiles
         if not bool(g.any()):
-            return None
+            return None, []
         if buffer is None:
             buffer = weights.zeros()
-            dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), emit_weights(part, buffer))), buffer)
+            dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), _emit_weights(part, buffer))), buffer)
         weights.gradient(buffer, g, slopes)
         if not self.couple:
-            return None
+            return None, []
         scalars = weights.scalars(in_rows(self.buffers["features"], self.width), g)
         totals = weights.totals(buffer, scalars)
-        tile = dr.arange(lib.UInt32, dr.width(part.columns[0])) // (PIXELS // len(part.columns))
-        for cotangent, column in zip(cotangents, part.columns, strict=True):
-            cotangent["rest"] = dr.gather(lib.Float64, totals, tile * PIXELS + column)
-        return scalars
+        tile = dr.arange(lib.UInt32, dr.width(slots.columns[0])) // (PIXELS // len(slots.columns))
+        return scalars, [dr.gather(lib.Float64, totals, tile * PIXELS + column) for column in slots.columns]
 
     def _feature_gradient(self, grad: Float, channels: Channels, part: Part, cotangents: list[dict]) -> None:
         """Add w times the cotangents of a feature pass to the gradient of its features: dL/df_i = sum w_i dL/dF."""
@@ -319,11 +379,11 @@ class Compositor:
         dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), emit)), grad)
 
     def _cotangents(self, g: dict, channels: Channels, part: Part) -> list[dict]:
-        """What `Adjoint` needs of the images' cotangents at the pixels of rays."""
+        """What `Adjoint` needs of the images' cotangents, per shared ray of a part."""
         return [self._cotangent(g, channels, *at) for at in zip(part.flat, part.inside, strict=True)]
 
     def _cotangent(self, g: dict, channels: Channels, at: UInt32, inside: Mask) -> dict:
-        """At one."""
+        """The cotangents at the pixels `at` of one shared ray; 0 where they are not inside."""
         lib = self.lib
         gathered = lambda name, i: dr.gather(lib.Float, g[name], i, inside)  # noqa: E731
         sums = [gathered("rgb", 3 * at + c) for c in range(3)] if channels.color else []
@@ -344,8 +404,8 @@ class Compositor:
         """Images of K tangents: dicts like the output of `forward`.
 
         Args:
-            buffers: Per tangent, that of the arguments `record` (a list), `sh` and `features`.
-            carried: Per tangent, that of the argument `carried`.
+            buffers: Per tangent, how the arguments `record` (a list), `sh` and `features` change.
+            carried: Per tangent, how the argument `carried` changes.
         """
         lib = self.lib
         slots = self.model.slots("depth" in self.want)
@@ -375,8 +435,8 @@ class Compositor:
                 if part.weights is not None:
                     buffer = part.weights.zeros()
                     moved = [part.weights.zeros() for _ in rest] if self.couple else []
-                primal = Primal(self.model, channels, depth, emit_weights(part, buffer))
-                states = part.run(Tangent(primal, records, slots, rest, own, [emit_weights(part, x) for x in moved]))
+                primal = Primal(self.model, channels, depth, _emit_weights(part, buffer))
+                states = part.run(Tangent(primal, records, slots, rest, own, [_emit_weights(part, x) for x in moved]))
                 dr.eval(states, buffer, moved)
                 if part.weights is not None:
                     f, *slopes = (in_rows(x, self.width) for x in features)
@@ -390,7 +450,7 @@ class Compositor:
         return results
 
     def _feature_tangent(self, out: dict, channels: Channels, features: Float) -> None:
-        """A feature pass of what the image says of the features alone: it is linear in them, sum w_i df_i."""
+        """Composite the tangent of the features alone: the image is linear in them, sum w_i df_i."""
         moved = dataclasses.replace(channels, buffers=self.buffers | {"features": features})
         for part in self._parts(channels):
             states = part.run(Primal(self.model, moved, frozenset()))
@@ -408,3 +468,17 @@ class Compositor:
         first = 3 if channels.color else 0
         for k in range(channels.channels):
             dr.scatter(out["features"], d["sum"][first + k], at * self.width + channels.first + k, inside)
+
+
+def _emit_weights(part: Part, buffer: Float | None, visibility: Float | None = None) -> Emit | None:
+    """Writes the weights of a part into a buffer, and sums up those of each Gaussian; None if nothing is to be done."""
+    if buffer is None and visibility is None:
+        return None
+
+    def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
+        if buffer is not None:
+            dr.scatter(buffer, w, part.slot(k, place), ok)
+        if visibility is not None:
+            dr.scatter_add(visibility, w, index, ok)
+
+    return emit

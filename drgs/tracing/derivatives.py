@@ -23,10 +23,11 @@ from collections.abc import Callable
 
 import drjit as dr
 
+from drgs.tracing.arrays import Float, Mask, UInt32
 from drgs.tracing.harmonics import sh_color
 from drgs.tracing.hit_table import Table, passed
-from drgs.tracing.kernels import Channels, Emit, HitModel, Primal, Ray
-from drgs.tracing.protocols import Float, Mask, UInt32
+from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
+from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_packed, packed_size
 
 __all__ = ["Adjoint", "Tangent", "if_any_hit"]

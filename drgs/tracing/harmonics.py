@@ -7,7 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 
 from drgs.ellipsoids import Y_00
-from drgs.tracing.protocols import Float
+from drgs.tracing.arrays import Float
 
 __all__ = ["sh_basis", "sh_color"]
 

@@ -10,15 +10,14 @@ one Gaussian at a time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
-
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Channels, HitModel, Ray
-    from drgs.tracing.walk import Part
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
+from drgs.tracing.kernels import Channels, HitModel
+from drgs.tracing.primitives import Ray
+from drgs.tracing.walk import Part
 
 __all__ = ["Replayed", "Table", "by_lists", "passed"]
 

@@ -18,32 +18,15 @@ import drjit as dr
 
 from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.harmonics import sh_color
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.primitives import Ray
 from drgs.tracing.records import RECORD, load_record
-from drgs.tracing.responses import RESPONSES
+from drgs.tracing.responses import response_of
 
-__all__ = ["Channels", "Emit", "HitModel", "Primal", "Ray"]
+__all__ = ["Channels", "Emit", "HitModel", "Primal"]
 
 Emit = Callable[[UInt32, int, list, Float, Mask], None]
-
-
-@dataclasses.dataclass
-class Ray:
-    """One ray a lane.
-
-    Attributes:
-        x, y: Pixel position, of a pinhole ray.
-        length: |d| of that ray's direction with d_z = 1.
-        carried: What a ray carries that is differentiated: SH basis values (`basis` of them), then o and d of a world
-            ray.
-    """
-
-    x: Float = None
-    y: Float = None
-    length: Float = None
-    carried: list[Float] = dataclasses.field(default_factory=list)
-    basis: int = 0
 
 
 class HitModel:
@@ -58,7 +41,7 @@ class HitModel:
         self.lib = lib
         self.s = settings
         self.world = world
-        self.response = RESPONSES[settings.response]
+        self.response = response_of(settings)
         # Opaque: another value is no other kernel.
         self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
         self.alpha_max = dr.opaque(lib.Float, settings.alpha_max)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import drjit as dr
 
+from drgs.tracing.arrays import Float
 from drgs.tracing.composite import Compositor
-from drgs.tracing.protocols import Float
 
 __all__ = ["Composite"]
 

@@ -1,78 +1,30 @@
-"""What the parts of the engine ask of each other: traversal, stream, kernel and sink.
+"""What the parts of the engine ask of each other: stream, kernel and sink.
 
-A traversal hands out parts (walk.py). A part walks its rays along a stream of candidate Gaussians and calls a kernel
-at each hit. Kernels composite (kernels.py) or differentiate what was composited (derivatives.py, jacobian.py); the one
-of the Jacobian passes its rows on to a sink. Where a *lane* is spoken of, it is one of Dr.Jit's: a lane carries one or
-four rays. `Response` (responses/) is what all of them evaluate. The names
-of arrays in signatures are defined here, too.
+A part (walk.py) walks its rays along a stream of candidate Gaussians and calls a kernel at each hit. Kernels composite
+(kernels.py) or differentiate what was composited (derivatives.py, jacobian.py); the one of the Jacobian passes its rows
+on to a sink. Where a *lane* is spoken of, it is one of Dr.Jit's: a lane carries one or four rays. What hands out parts
+is a `Traversal` (walk.py); what all of them evaluate is a `Response` (responses/).
 """
 
 from __future__ import annotations
 
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import HitModel, Ray
-    from drgs.tracing.projection import Projected
-    from drgs.tracing.walk import Part
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
+from drgs.tracing.primitives import Ray
 
-__all__ = [
-    "DividedStream",
-    "Float",
-    "Int32",
-    "Kernel",
-    "Lib",
-    "Mask",
-    "Sink",
-    "Stream",
-    "Traversal",
-    "UInt32",
-    "UInt64",
-]
-
-Lib = ModuleType  # the module of Dr.Jit's array types of the backend (runtime.dr_types)
-
-# For signatures: what an array holds. Its class depends on the backend, so type checkers see `Any`.
-Float = Any  # Float, or Float64 where a Gaussian is projected
-UInt32 = Any
-UInt64 = Any
-Int32 = Any
-Mask = Any  # Bool
+__all__ = ["Candidates", "DividedStream", "Kernel", "Sink", "Stream"]
 
 
-class Traversal(Protocol):
-    """The rays of a view, and where they look for Gaussians.
-
-    Attributes:
-        projected: The Gaussians of the view.
-        world: Their records are world records.
-        rays: How many there are, in the order of the pixels.
-        certificate: After `start`: what it says of lists.
-    """
-
-    projected: Projected
-    world: bool
-    rays: int
-    certificate: dict
-
-    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
-        """Build lists or proxies from the record buffer; `carried`: per-ray floats, `basis` of them an SH basis;
-        `replayed`: derivatives follow, what they need again may be held.
-        """
-
-    def parts(self, share: int) -> list[Part]:
-        """All rays, `share` (1 or 4) a lane."""
-
-    def weighed(self, share: int, size: int) -> list[Part]:
-        """All rays, in parts whose weights are held, `size` bytes each; where there are no lists, as `parts`."""
-
-
-class Stream(Protocol):
-    """Candidate Gaussians of every lane, one after the other; its state is part of that of Dr.Jit's loop."""
+class Candidates(Protocol):
+    """Where the stream of a part comes from: the stream itself, or what is only made when it is walked along."""
 
     def opened(self) -> Stream:
-        """What is walked along: itself, or what is made now."""
+        """The stream to walk along."""
+
+
+class Stream(Candidates, Protocol):
+    """Candidate Gaussians of every lane, one after the other; its state is part of that of Dr.Jit's loop."""
 
     def begin(self) -> Any:
         """State before the first candidate."""
@@ -89,10 +41,10 @@ class Stream(Protocol):
 
 
 class DividedStream(Stream, Protocol):
-    """One of which some lanes can be taken."""
+    """A stream of which some lanes can be taken."""
 
     def of(self, lanes: UInt32) -> DividedStream:
-        """The same for these lanes."""
+        """The stream of these lanes alone."""
 
 
 class Kernel(Protocol):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import drjit as dr
 
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 
 __all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "load_record", "pack", "pack_records", "packed_size"]
 

@@ -9,21 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import torch
 
 from drgs import runtime
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
+from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_record
 from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, word_of
-from drgs.tracing.walk import ListStream
+from drgs.tracing.walk import ListStream, Part
 from drgs.tracing.weights import PIXELS, signed
-
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.walk import Part
 
 __all__ = ["Room", "SortedHits", "SortedRows"]
 
@@ -95,19 +92,20 @@ class SortedHits:
         part = self.in_lists()
         tiles = len(self.lengths)
         lists: ListStream | Any = part.stream
-        assert part.slots is not None  # of a part along lists
-        share = len(part.columns)
-        first = lists.start - part.slots.first
+        slots = part.slots
+        assert slots is not None  # of a part along lists
+        share = len(slots.columns)
+        first = lists.start - slots.first
         own = lists.end - lists.start
-        starts = [first * PIXELS + column * own for column in part.columns]
-        words = dr.full(lib.Float64, BEYOND, part.slots.size)
+        starts = [first * PIXELS + column * own for column in slots.columns]
+        words = dr.full(lib.Float64, BEYOND, slots.size)
         lane = dr.arange(lib.UInt32, tiles * PIXELS // share)
         cut = lib.Float(0) if self.cut is None else dr.gather(lib.Float, self.cut, lane // (PIXELS // share))
         dr.eval(words, starts, cut)
         found = part.run(_Finder(part, words, starts, cut))
         dr.eval(found, words)  # together: one kernel
         start, count = (dr.zeros(lib.UInt32, tiles * PIXELS) for _ in range(2))
-        for column, at, state in zip(part.columns, starts, found, strict=True):
+        for column, at, state in zip(slots.columns, starts, found, strict=True):
             pixel = lane // (PIXELS // share) * PIXELS + column
             dr.scatter(start, at, pixel)
             dr.scatter(count, state["count"], pixel)

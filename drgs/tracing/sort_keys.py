@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 
 from drgs import runtime
-from drgs.tracing.protocols import Float, Lib, UInt32, UInt64
+from drgs.tracing.arrays import Float, Lib, UInt32, UInt64
 
 __all__ = ["BEYOND", "EMPTY", "ascending", "name_of", "positive", "push", "word_of"]
 

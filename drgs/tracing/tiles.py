@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import drjit as dr
 import torch
@@ -19,11 +20,11 @@ from drgs import runtime
 from drgs.guards import memory
 from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
-from drgs.tracing.kernels import HitModel, Ray
-from drgs.tracing.projection import Projected
-from drgs.tracing.protocols import Float, Int32, Lib, Mask, UInt32, UInt64
+from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
+from drgs.tracing.kernels import HitModel
+from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.records import load_record
-from drgs.tracing.responses import RESPONSES
+from drgs.tracing.responses import response_of
 from drgs.tracing.rows import Room, SortedHits
 from drgs.tracing.sort_keys import ascending
 from drgs.tracing.walk import ListStream, Part, Slots
@@ -66,7 +67,7 @@ class TileTraversal:
         self.settings = settings
         self.projected = projected
         # Its bound is of tails of at most alpha exp(-rho^2 / 2), and a ray that ends behind so many hits counts them.
-        bounded = settings.extent is None and settings.max_hits is None and RESPONSES[settings.response].at_most_alpha
+        bounded = settings.extent is None and settings.max_hits is None and response_of(settings).at_most_alpha
         self.trimmed = trimmed and settings.order == "ray" and bounded
         self.width = width
         self.height = height
@@ -91,7 +92,7 @@ class TileTraversal:
     def parts(self, share: int) -> list[Part]:
         """All pixels as one part; in `ray` order as `weighed`, for tables of two numbers."""
         if self.settings.order == "ray":
-            return [part for part, _ in self._bands(share, TABLES // 2)]
+            return [self._band_part(share, band) for band in self._bands(TABLES // 2)]
         count = self.lists.columns * self.lists.rows
         per_tile = TILE * TILE // share
         return [self._part(share, dr.arange(self.lib.UInt32, count * per_tile) // per_tile)]
@@ -99,55 +100,60 @@ class TileTraversal:
     def weighed(self, share: int, size: int) -> list[Part]:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
         index = signed(self.lists.index)
-        made = []
         size = min(size, TABLES // 2) if self.settings.order == "ray" else size
-        for part, (begin, end, first, lengths) in self._bands(share, size):
-            pixels = self._pixels(torch.arange(begin, end, device=lengths.device))
-            part.weights = Weights(self.lib, index[first : first + int(lengths.sum())], lengths, pixels)
-            made.append(part)
+        made = []
+        for band in self._bands(size):
+            pixels = self._pixels(torch.arange(band.begin, band.end, device=band.lengths.device))
+            weights = Weights(self.lib, index[band.first : band.last], band.lengths, pixels)
+            made.append(self._band_part(share, band, weights))
         return made
 
-    def _bands(self, share: int, size: int) -> Iterator[tuple[Part, tuple]]:
-        """Parts of consecutive tiles whose entries, a float in each pixel, take `size` bytes, or a tile's more; and of
-        each its first tile, that behind it, its first entry and the (tiles,) lengths of its lists.
-        """
-        lib = self.lib
-        pixels = PIXELS
-        begin = 0
-        first = 0
-        per_tile = pixels // share
+    def _bands(self, size: int) -> Iterator[_Band]:
+        """Consecutive tiles whose entries, a float in each pixel, take `size` bytes, or a tile's more."""
         lengths = signed(self.lists.end - self.lists.start).long()
         ends = lengths.cumsum(0)
+        begin = 0
+        first = 0
         while begin < len(lengths):
-            end = int(torch.searchsorted(ends, first + size // (4 * pixels), right=True))
+            end = int(torch.searchsorted(ends, first + size // (4 * PIXELS), right=True))
             end = min(max(end, begin + 1), len(lengths))
             last = int(ends[end - 1])
-            lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
-            tile = lane // per_tile + dr.opaque(lib.UInt32, begin)
-            part = self._part(share, tile)
-            part.slots = Slots(dr.opaque(lib.UInt32, first), (last - first + 1) * pixels)
-            part.columns = [lane % per_tile + 16 * k for k in range(share)]
-            if self.settings.order == "ray":
-                what = f"rows of the hits in {end - begin} tiles of {last - first} entries"
-                memory.require("render", 8 * part.slots.size, what, "lower extent", runtime.backend().name == "cuda")
-                own = lengths[begin:end]
-                in_lists = functools.partial(self._in_lists, begin, end, part.slots)
-                part.in_lists = functools.partial(in_lists, 1 if self.basis else 4)
-                tiles = dr.arange(lib.UInt32, end - begin) + dr.opaque(lib.UInt32, begin)
-                cut = None if self.lists.cut is None else dr.gather(lib.Float, self.lists.cut, tiles)
-                part.stream = SortedHits(lib, functools.partial(in_lists, 4), self.lists.index, own, cut, self.room)
-            yield part, (begin, end, first, lengths[begin:end])
+            yield _Band(begin, end, first, last, lengths[begin:end])
             begin, first = end, last
 
-    def _in_lists(self, begin: int, end: int, slots: Slots, share: int) -> Part:
-        """The pixels of tiles in the order of the tiles' lists."""
+    def _band_part(self, share: int, band: _Band, weights: Weights | None = None) -> Part:
+        """The pixels of a band: along the lists of their tiles, in `ray` order along rows of their own hits."""
+        lib = self.lib
+        if self.settings.order != "ray":
+            return self._band_in_lists(band, share, weights=weights)
+        size = band.slots
+        what = f"rows of the hits in {band.end - band.begin} tiles of {band.last - band.first} entries"
+        memory.require("render", 8 * size, what, "lower extent", runtime.backend().name == "cuda")
+        tiles = dr.arange(lib.UInt32, band.end - band.begin) + dr.opaque(lib.UInt32, band.begin)
+        cut = None if self.lists.cut is None else dr.gather(lib.Float, self.lists.cut, tiles)
+        # Hits are found four pixels a lane; derivatives that carry an SH basis of each pixel would not fit registers.
+        found_by = functools.partial(self._band_in_lists, band, 4)
+        hits = SortedHits(lib, found_by, self.lists.index, band.lengths, cut, self.room)
+        in_lists = functools.partial(self._band_in_lists, band, 1 if self.basis else 4)
+        return self._band_in_lists(band, share, hits, in_lists, weights)
+
+    def _band_in_lists(
+        self,
+        band: _Band,
+        share: int,
+        hits: SortedHits | None = None,
+        in_lists: Callable[[], Part] | None = None,
+        weights: Weights | None = None,
+    ) -> Part:
+        """The pixels of a band in the order of its tiles' lists, or along their own `hits`."""
         lib = self.lib
         per_tile = PIXELS // share
-        lane = dr.arange(lib.UInt32, (end - begin) * per_tile)
-        part = self._part(share, lane // per_tile + dr.opaque(lib.UInt32, begin))
-        part.slots = slots
-        part.columns = [lane % per_tile + 16 * k for k in range(share)]
-        return part
+        lane = dr.arange(lib.UInt32, (band.end - band.begin) * per_tile)
+        columns = [lane % per_tile + 16 * k for k in range(share)]
+        # Opaque: another band is no other kernel.
+        slots = Slots(dr.opaque(lib.UInt32, band.first), band.slots, columns)
+        tile = lane // per_tile + dr.opaque(lib.UInt32, band.begin)
+        return self._part(share, tile, hits, slots, in_lists, weights)
 
     def _pixels(self, tiles: torch.Tensor) -> torch.Tensor:
         """(tiles, pixels) row-major pixels in the order of lanes, -1 outside of the image."""
@@ -156,8 +162,16 @@ class TileTraversal:
         y = (tiles // self.lists.columns)[:, None] * TILE + k // 32 * 4 + k % 16 // 4
         return torch.where((x < self.width) & (y < self.height), y * self.width + x, -1)
 
-    def _part(self, share: int, tile: UInt32) -> Part:
-        """The pixels of tiles, one a lane, `share` a lane, along the tiles' lists."""
+    def _part(
+        self,
+        share: int,
+        tile: UInt32,
+        hits: SortedHits | None = None,
+        slots: Slots | None = None,
+        in_lists: Callable[[], Part] | None = None,
+        weights: Weights | None = None,
+    ) -> Part:
+        """The pixels of tiles, given per lane, `share` a lane, along the tiles' lists or their own `hits`."""
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
         inner = dr.arange(lib.UInt32, dr.width(tile)) % per_tile
@@ -179,8 +193,19 @@ class TileTraversal:
             some = some | other
         start = dr.gather(lib.UInt32, lists.start, tile)
         end = dr.select(some, dr.gather(lib.UInt32, lists.end, tile), start)
-        stream = ListStream(lib, lists.index, start, end)
-        return Part(lib, self.model, self.records, rays, flat, inside, stream, False)
+        return Part(
+            lib,
+            self.model,
+            self.records,
+            rays,
+            flat,
+            inside,
+            hits or ListStream(lib, lists.index, start, end),
+            ordered=False,
+            slots=slots,
+            in_lists=in_lists,
+            weights=weights,
+        )
 
     def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
@@ -190,6 +215,27 @@ class TileTraversal:
         length = dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
         carried = [dr.gather(self.lib.Float, c, flat, inside) for c in self.carried]
         return Ray(x, y, length, carried, self.basis)
+
+
+class _Band(NamedTuple):
+    """Consecutive tiles that are looked at together.
+
+    Attributes:
+        begin, end: First tile, and that behind the last one.
+        first, last: First entry of their lists, and that behind the last one.
+        lengths: (tiles,) int64 lengths of the lists.
+    """
+
+    begin: int
+    end: int
+    first: int
+    last: int
+    lengths: torch.Tensor
+
+    @property
+    def slots(self) -> int:
+        """Size of a table of these entries in each pixel; one entry more than there are, so that it is never empty."""
+        return (self.last - self.first + 1) * PIXELS
 
 
 @dataclasses.dataclass
@@ -348,7 +394,7 @@ class _Tiles:
     def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], cut: Float | int = 0) -> None:
         self.lib = lib
         self.r = loaded
-        self.response = RESPONSES[settings.response]
+        self.response = response_of(settings)
         self.limit = loaded[layout.EXT2] - cut
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))

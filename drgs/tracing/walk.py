@@ -15,21 +15,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import drjit as dr
 
-from drgs.tracing.kernels import HitModel, Ray
-from drgs.tracing.protocols import DividedStream, Float, Kernel, Lib, Mask, Stream, UInt32
+from drgs.tracing.arrays import Float, Lib, Mask, UInt32
+from drgs.tracing.kernels import HitModel
+from drgs.tracing.primitives import Projected, Ray
+from drgs.tracing.protocols import Candidates, DividedStream, Kernel
 from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.responses.peak import entry
 from drgs.tracing.sort_keys import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 from drgs.tracing.weights import PIXELS, Weights
 
-if TYPE_CHECKING:
-    from drgs.tracing.rows import SortedHits
-
-__all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots"]
+__all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots", "Traversal"]
 
 BUFFER = 20  # hits that a ray is sorted among
 _DEEP = 48  # of rays for which these were too few
@@ -70,36 +69,43 @@ class ListStream:
         return dr.gather(self.lib.UInt32, self.index, i, active), active, [i], EMPTY, i + 1
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Slots:
     """Where tables have the entries of some tiles' lists in each pixel of these tiles.
 
     Attributes:
-        first: The first entry, of the lists of the whole view.
-        size: Of all of them.
+        first: First entry of these lists among those of the whole view.
+        size: Number of slots: entries times pixels of a tile, one entry to spare.
+        columns: Per shared ray, its pixel of the tile.
     """
 
     first: UInt32
     size: int
+    columns: list[UInt32]
 
 
 class Part:
     """Lanes, their rays and pixels, and the stream of candidates.
 
-    Attributes:
+    Args:
+        lib: Dr.Jit types of the backend.
+        model: Says what a hit is.
+        records: Flat record buffer of the view.
         rays: One or four a lane, all of which walk along the same stream.
         flat: Per shared ray, the pixel (row-major index) it belongs to.
         inside: Per shared ray, whether there is such a pixel and this part decides it.
+        stream: Candidate Gaussians of every lane.
         ordered: Rays sort their candidates on the way; else these come in the order in which they are composited.
-        failed: After a primal pass of such rays: lanes whose buffer was too short.
-        first: It was not walked before, with a shorter buffer.
-        weights: Where the weights of these rays are held; None where they are not.
-        columns: Per shared ray, its pixel of the tile.
-        slots: Of rays through tiles, where an entry and a pixel stand in tables; None for others. A hit's place is then
+        center_key: (N,) order keys of Gaussians that are sorted by their centers; None where a ray's own order counts.
+        buffer: Number of hits that a ray is sorted among.
+        first: These rays were not walked before, with a shorter buffer.
+        slots: Where an entry and a pixel stand in tables, of rays through tiles; None for others. A hit's place is then
             where it stands in the ray's row and in the tile's list.
         in_lists: Makes a part with the same rays along the lists of their tiles; of rays that walk along rows of
             their own hits.
-        buffer: Hits that its rays are sorted among.
+        weights: Where the weights of these rays are held; None where they are not.
+    Attributes:
+        failed: After a primal pass of rays that sort: lanes whose buffer was too short.
     """
 
     def __init__(
@@ -110,9 +116,15 @@ class Part:
         rays: list[Ray],
         flat: list[UInt32],
         inside: list[Mask],
-        stream: Stream | SortedHits,
+        stream: Candidates,
+        *,
         ordered: bool,
         center_key: Float | None = None,
+        buffer: int = BUFFER,
+        first: bool = True,
+        slots: Slots | None = None,
+        in_lists: Callable[[], Part] | None = None,
+        weights: Weights | None = None,
     ) -> None:
         self.lib = lib
         self.model = model
@@ -123,13 +135,12 @@ class Part:
         self.stream = stream
         self.ordered = ordered
         self.center_key = center_key
-        self.failed = None
-        self.weights: Weights | None = None
-        self.columns: list[UInt32] = []
-        self.slots: Slots | None = None
-        self.first = True
-        self.in_lists: Callable[[], Part] | Any = None
-        self.buffer = BUFFER
+        self.buffer = buffer
+        self.first = first
+        self.slots = slots
+        self.in_lists = in_lists
+        self.weights = weights
+        self.failed: Mask = None
 
     @property
     def reduction(self) -> dr.ReduceMode:
@@ -139,7 +150,15 @@ class Part:
     def slot(self, k: int, place: list) -> UInt32:
         """Where a table has shared ray k at a place in its order, which ends with that in the list."""
         assert self.slots is not None
-        return (place[-1] - self.slots.first) * PIXELS + self.columns[k]
+        return (place[-1] - self.slots.first) * PIXELS + self.slots.columns[k]
+
+    def reject(self) -> UInt32:
+        """Take the rays that the certificate has found wrong (`run` with `check`) out of this part: their lanes."""
+        failed = self.failed & self.inside[0]
+        lanes = dr.compress(failed)
+        self.inside = [self.inside[0] & ~failed]
+        dr.eval(self.inside)
+        return lanes
 
     def again(self, lanes: UInt32) -> list[Part]:
         """Parts that walk some of the rays again, given by their lanes: many with a deeper buffer, where some may fail
@@ -154,10 +173,19 @@ class Part:
         flat = [pick(f) for f in self.flat]
         stream = divided.of(lanes)
         dr.eval(rays, flat)
-        inside = [self.lib.Bool(True)]
-        part = Part(self.lib, self.model, self.records, rays, flat, inside, stream, True, self.center_key)
-        part.first = False
-        part.buffer = _DEEP
+        part = Part(
+            self.lib,
+            self.model,
+            self.records,
+            rays,
+            flat,
+            [self.lib.Bool(True)],
+            stream,
+            ordered=True,
+            center_key=self.center_key,
+            buffer=_DEEP,
+            first=False,
+        )
         return [part] if count >= _MANY and self.buffer < _DEEP else part._listed(count)
 
     def _listed(self, count: int) -> list[Part]:
@@ -176,9 +204,9 @@ class Part:
             start = dr.cumsum(hits) - hits
             index = self._sorted_hits(start, total, bits)
         stream = ListStream(lib, index, start, start + hits)
-        part = Part(lib, self.model, self.records, self.rays, self.flat, self.inside, stream, False)
-        part.first = False
-        return [part]
+        return [
+            Part(lib, self.model, self.records, self.rays, self.flat, self.inside, stream, ordered=False, first=False)
+        ]
 
     def _sorted_hits(self, start: UInt32, total: int, bits: int) -> UInt32:
         """The hits of each ray, from its `start` on, by (key, Gaussian); indices of Gaussians have so many bits."""
@@ -290,3 +318,36 @@ class Part:
         *_, failed, state = dr.while_loop(loop, lambda s, go, *_: go != 0, body)
         self.failed = failed != 0
         return [state]
+
+
+class Traversal(Protocol):
+    """The rays of a view, and where they look for Gaussians.
+
+    Attributes:
+        projected: The Gaussians of the view.
+        world: Their records are world records.
+        rays: How many there are, in the order of the pixels.
+        certificate: After `start`: what it says of lists.
+    """
+
+    projected: Projected
+    world: bool
+    rays: int
+    certificate: dict
+
+    def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
+        """Build lists or proxies from the record buffer.
+
+        Args:
+            model: Says what a hit is.
+            records: Flat record buffer.
+            carried: Per-ray floats, `basis` of them an SH basis.
+            basis: Number of SH basis values.
+            replayed: Derivatives follow: what they need again may be held.
+        """
+
+    def parts(self, share: int) -> list[Part]:
+        """All rays, `share` (1 or 4) a lane."""
+
+    def weighed(self, share: int, size: int) -> list[Part]:
+        """All rays, in parts whose weights are held, `size` bytes each; where there are no lists, as `parts`."""

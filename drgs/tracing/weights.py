@@ -18,18 +18,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import torch
 
-from drgs.tracing.protocols import Float, Lib, Mask, UInt32
+from drgs.tracing.arrays import Float, Lib, UInt32
 
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Emit
-    from drgs.tracing.walk import Part
-
-__all__ = ["MATRIX", "PIXELS", "Weights", "emit_weights", "in_rows", "signed", "without_graph"]
+__all__ = ["MATRIX", "PIXELS", "Weights", "in_rows", "signed", "without_graph"]
 
 PIXELS = 64  # of a tile
 MATRIX = 128 << 20
@@ -202,20 +198,6 @@ def _gathered(cotangent: torch.Tensor, group: _Group) -> torch.Tensor:
     if not bool(group.inside.all()):
         g[~group.inside] = 0
     return g.view(len(group.rows), PIXELS, -1)
-
-
-def emit_weights(part: Part, buffer: Float | None, visibility: Float | None = None) -> Emit | None:
-    """Writes the weights of a part into a buffer, and sums up those of each Gaussian; None if nothing is to be done."""
-    if buffer is None and visibility is None:
-        return None
-
-    def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
-        if buffer is not None:
-            dr.scatter(buffer, w, part.slot(k, place), ok)
-        if visibility is not None:
-            dr.scatter_add(visibility, w, index, ok)
-
-    return emit
 
 
 def without_graph(method: Callable) -> Callable:

@@ -1,37 +1,32 @@
 """Responses: what opacity a Gaussian has for a ray. One file each, which says all that the engine asks of it.
 
-A new one is a class here that keeps the `Response` protocol, its name in `RenderSettings`, and its equations in the
-float64 oracle (reference.py), written independently of this.
+A new one is a class that keeps the `Response` protocol and an instance of it in `RESPONSES`, here or from another
+package. What is to be checked has its equations in the float64 oracle (reference.py), written independently of this.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from drgs.tracing.protocols import Float, Lib, Mask
-from drgs.tracing.responses.ewa import Ewa
-from drgs.tracing.responses.integral import Integral
-from drgs.tracing.responses.peak import Peak
+from drgs.settings import RESPONSES, RenderSettings
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated, Projected, Ray, Screen
 
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.projection import Activated, Projected, Screen
-
-__all__ = ["RESPONSES", "Response"]
+__all__ = ["RESPONSES", "Response", "response_of"]
 
 
 class Response(Protocol):
     """One formula of the opacity of a hit, with all that follows from it.
 
     Attributes:
-        name: As in `RenderSettings.response`.
+        planar: The response is a model of the image plane: tiles, order `center` and pinhole cameras only.
         front_only: Peaks behind the origin of a ray do not count.
         at_most_alpha: Where rho^2 is, the opacity of a hit is at most alpha exp(-rho^2 / 2).
         extra: Floats a Gaussian that `slopes` needs besides the record (`extras`).
         by_tangents: These floats are tangents of the record, not closed forms.
     """
 
-    name: str
+    planar: bool
     front_only: bool
     at_most_alpha: bool
     extra: int
@@ -74,4 +69,6 @@ class Response(Protocol):
         """False only where no ray within `half` pixels of (dx, dy), from the anchor, hits with rho^2 <= limit."""
 
 
-RESPONSES: dict[str, Response] = {response.name: response for response in (Peak(), Integral(), Ewa())}
+def response_of(settings: RenderSettings) -> Response:
+    """The response that settings name."""
+    return RESPONSES[settings.response]

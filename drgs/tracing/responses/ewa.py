@@ -7,20 +7,17 @@ its triangular factor. Of `tiles` and `order="center"` only: the model is one of
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 
 from drgs.tracing import records as layout
-from drgs.tracing.protocols import Float, Lib, Mask
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
 from drgs.tracing.responses.peak import AlphaStrength, deviation
 
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.projection import Activated, Projected, Screen
-
-__all__ = ["Ewa"]
+__all__ = ["EWA", "Ewa"]
 
 _SHAPE = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
 
@@ -28,7 +25,7 @@ _SHAPE = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
 class Ewa(AlphaStrength):
     """A Gaussian of the image plane; t* is the Gaussian's own depth."""
 
-    name = "ewa"
+    planar = True
     front_only = False  # of rays; means behind the camera plane are culled
     at_most_alpha = True
     extra = 9 * len(_SHAPE)
@@ -106,6 +103,10 @@ class Ewa(AlphaStrength):
     def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution; 1.0001 is more than float32 rounds."""
         return ~(deviation(r, dx, dy, half) > 1.0001 * limit)
+
+
+EWA = Ewa()
+"""The row of `RESPONSES`."""
 
 
 def _offset(r: list[Float], ray: Ray) -> tuple[Float, Float, Float, Float]:

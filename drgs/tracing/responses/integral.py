@@ -11,19 +11,16 @@ notation are those of peak.py. With e = d' / |d'|,
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from drgs.tracing import records as layout
-from drgs.tracing.protocols import Float
+from drgs.tracing.arrays import Float
+from drgs.tracing.primitives import Ray
 from drgs.tracing.records import dot
 from drgs.tracing.responses.peak import Peak, approach, times
 
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-
-__all__ = ["Integral"]
+__all__ = ["INTEGRAL", "Integral"]
 
 _ROOT_HALF = 0.7071067811865476
 _BELL = 0.3989422804014327  # 1 / sqrt(2 pi)
@@ -32,7 +29,6 @@ _BELL = 0.3989422804014327  # 1 / sqrt(2 pi)
 class Integral(Peak):
     """a = 1 - exp(-optical depth from the origin of the ray on)."""
 
-    name = "integral"
     front_only = False
     at_most_alpha = False
 
@@ -84,3 +80,7 @@ class Integral(Peak):
     def least_strength(self, alpha_min: float) -> float:
         """At most all of the density lies in front: W <= 1."""
         return -math.log1p(-alpha_min)
+
+
+INTEGRAL = Integral()
+"""The row of `RESPONSES`."""

@@ -24,19 +24,14 @@ cross product in float32, the rotation of a sphere, which changes nothing, would
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 
 from drgs.tracing import records as layout
-from drgs.tracing.protocols import Float, Lib, Mask
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
 
-if TYPE_CHECKING:
-    from drgs.tracing.kernels import Ray
-    from drgs.tracing.projection import Activated, Projected, Screen
-
-__all__ = ["AlphaStrength", "Peak", "approach", "deviation", "entry", "times"]
+__all__ = ["PEAK", "AlphaStrength", "Peak", "approach", "deviation", "entry", "times"]
 
 
 class AlphaStrength:
@@ -62,7 +57,7 @@ class AlphaStrength:
 class Peak(AlphaStrength):
     """a = alpha exp(-rho^2 / 2); peaks behind the origin of the ray do not count."""
 
-    name = "peak"
+    planar = False
     front_only = True
     at_most_alpha = True
     # The plane (u, v) of o' x d' in the axes that directions are stored along (6), R S^-1 and those axes (18), R times
@@ -190,6 +185,10 @@ class Peak(AlphaStrength):
             rounding = 1e-6 * sum(abs(x) for x in along)
             met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
         return met
+
+
+PEAK = Peak()
+"""The row of `RESPONSES`."""
 
 
 def entry(r: list[Float], ray: Ray) -> Float:

@@ -1,0 +1,205 @@
+"""What a response is a function of: the rays and the Gaussians of one view, in Dr.Jit.
+
+Everything about Gaussians is per-Gaussian work, done once a view in float64 and differentiated by Dr.Jit's AD.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import drjit as dr
+
+from drgs.settings import RenderSettings
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.harmonics import sh_basis, sh_color
+from drgs.tracing.records import dot
+
+__all__ = ["Activated", "Projected", "Ray", "Screen", "SeenColor"]
+
+
+@dataclasses.dataclass
+class Ray:
+    """One ray a lane.
+
+    Attributes:
+        x, y: Pixel position, of a pinhole ray.
+        length: |d| of that ray's direction with d_z = 1.
+        carried: What a ray carries that is differentiated: SH basis values (`basis` of them), then o and d of a world
+            ray.
+        basis: Number of SH basis values; 0 where colors are evaluated towards the means.
+    """
+
+    x: Float = None
+    y: Float = None
+    length: Float = None
+    carried: list[Float] = dataclasses.field(default_factory=list)
+    basis: int = 0
+
+
+class Screen(NamedTuple):
+    """The image that Gaussians are projected to.
+
+    Attributes:
+        pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
+        width, height: Size of the image, in pixels.
+        x, y: (N,) each Gaussian's anchor: the pixel center that its record is expanded around.
+    """
+
+    pinhole: list[Float]
+    width: int
+    height: int
+    x: Float
+    y: Float
+
+
+class SeenColor(NamedTuple):
+    """The color of each Gaussian in a view, evaluated towards its mean, in float32.
+
+    Attributes:
+        direction: From the camera to the mean, unit length, world axes.
+        inverse: 1 / distance of the mean; 0 for a mean at the camera center, which has no direction.
+        basis: SH basis at the direction.
+        rgb: max(0.5 + SH, 0); differentiated by the coefficients and, through the direction, by mean and pose.
+    """
+
+    direction: list[Float]
+    inverse: Float
+    basis: list[Float]
+    rgb: list[Float]
+
+
+class Activated:
+    """Activated parameters of every Gaussian in float64, and their camera-frame geometry.
+
+    Args:
+        lib: Dr.Jit types of the backend.
+        p: Flat raw parameters by name: means, quats, log_scales, logit_opacities, sh.
+        w2c: Float64 of width 12, the upper rows of the world-to-camera matrix, of the re-centered world of the means.
+        settings: Cut-offs of the render.
+        count: N.
+        at_most_alpha: As of the `Response`: no hit of it has more than alpha exp(-rho^2 / 2).
+    Attributes:
+        mean, quat, scale, opacity: Activated parameters, columns (N,).
+        logit, e: Raw opacity, and exp(-|logit|), which activations of it are formed from.
+        rotation: (3, 3) local axes to world axes.
+        extent: Cut-off radius in standard deviations.
+        view: (3, 4) rows of w2c.
+        center: (3,) means in camera axes.
+        from_local: (3, 3) local axes to camera axes.
+    """
+
+    def __init__(
+        self, lib: Lib, p: dict, w2c: Float, settings: RenderSettings, count: int, at_most_alpha: bool
+    ) -> None:
+        Float64, UInt32 = lib.Float64, lib.UInt32
+        self.lib = lib
+        self.settings = settings
+        self.at_most_alpha = at_most_alpha
+        i = dr.arange(UInt32, count)
+        # Each Gaussian gathers its own entries once, so the adjoint needs no atomics.
+        permute = dr.ReduceMode.Permute
+
+        def column(name: str, k: int, stride: int) -> Float:
+            return dr.gather(type(p[name]), p[name], i * stride + k, mode=permute)
+
+        self.column = column
+        # Raw parameters may be float32: a difference of world coordinates keeps its digits only in float64.
+        self.mean = [Float64(column("means", k, 3)) for k in range(3)]
+        q = [Float64(column("quats", k, 4)) for k in range(4)]
+        # Dividing by the largest component first keeps the square of tiny or huge quaternions finite. It cancels in
+        # the division by the norm, hence no derivative.
+        big = dr.detach(dr.maximum(dr.maximum(abs(q[0]), abs(q[1])), dr.maximum(abs(q[2]), abs(q[3]))))
+        inverse = dr.rcp(big)
+        q = [x * inverse for x in q]
+        norm = dr.rsqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+        self.quat = [x * norm for x in q]
+        w, x, y, z = self.quat
+        self.rotation = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        # In float32 the square of a scale overflows at a log-scale of 45, which is a legal parameter.
+        self.scale = [dr.exp(Float64(column("log_scales", k, 3))) for k in range(3)]
+        self.logit = Float64(column("logit_opacities", 0, 1))
+        # exp of a non-positive number on both sides: no overflow at any logit. Not of -|logit|, whose derivative at a
+        # logit of 0 is 0.
+        self.e = dr.exp(dr.select(self.logit >= 0, -self.logit, self.logit))
+        self.opacity = dr.select(self.logit >= 0, 1, self.e) / (1 + self.e)
+        self.extent = self._extent(count)
+        v = [[dr.gather(Float64, w2c, UInt32(4 * r + c)) for c in range(4)] for r in range(3)]
+        self.view = v
+        self.center = [
+            v[r][0] * self.mean[0] + v[r][1] * self.mean[1] + v[r][2] * self.mean[2] + v[r][3] for r in range(3)
+        ]
+        self.from_local = [[sum(v[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
+
+    def _extent(self, count: int) -> Float:
+        """Cut-off radius in standard deviations; a constant of the derivative, as every cut-off is."""
+        if self.settings.extent is not None:
+            # Opaque: another extent is no other kernel.
+            return dr.opaque(self.lib.Float64, self.settings.extent)
+        opacity = dr.detach(self.opacity)
+        # All N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5.
+        return dr.sqrt(2 * dr.log(dr.maximum(opacity * (count / 1e-5), 1)))
+
+    def listed_extent(self) -> Float:
+        """Radius beyond which no hit counts: the extent, or less where alpha_min cuts earlier; detached, a cut-off."""
+        extent = dr.detach(self.extent)  # a cut-off
+        if self.settings.alpha_min > 0 and self.at_most_alpha:
+            ratio = dr.maximum(dr.detach(self.opacity) / self.settings.alpha_min, 1)
+            # A cut-off, too. The factor keeps a hit that float32 rounds to the right side of alpha_min.
+            extent = dr.minimum(extent, dr.sqrt(2 * dr.log(ratio)) * 1.001 + 1e-3)
+        return extent
+
+    def distance(self) -> Float:
+        """(N,) distance of the means from the camera."""
+        return dr.sqrt(dot(self.center, self.center))
+
+    def color(self, coefficients: int) -> SeenColor:
+        """Colors towards the means, from so many SH coefficients (1, 4, 9 or 16)."""
+        Float, v = self.lib.Float, self.view
+        # The direction in world axes: R_wc times the camera-frame mean.
+        d = [v[0][k] * self.center[0] + v[1][k] * self.center[1] + v[2][k] * self.center[2] for k in range(3)]
+        squared = dot(d, d)
+        # A mean at the camera center has no direction; any finite one will do.
+        scale = dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0)
+        # Cast where it is a unit vector: float32 holds it, and a color of it, to 1e-7.
+        direction = [Float(x * scale) for x in d]
+        basis = sh_basis(direction, coefficients)
+        rgb = sh_color(basis, lambda k, c: Float(self.column("sh", k * 3 + c, 3 * coefficients)))
+        return SeenColor(direction, Float(scale), basis, rgb)
+
+
+class Projected:
+    """What a view needs to know about each Gaussian.
+
+    Attributes:
+        record: List of Dr.Jit floats of width N, laid out as `records` says, attached to the AD graph of the
+            parameters.
+        key: (N,) float, the depth key of `order="center"`; detached.
+        bounds: Four (N,) floats x0, y0, x1, y1, in pixels, outside of which the Gaussian has no hit; detached.
+        alive: (N,) mask of Gaussians that can have a hit.
+        ellipsoids: World records only: mean (3), quaternion wxyz (4) and half axes of the extent (3); detached.
+        frame: What closed-form derivatives of a response need (None of `ewa`): rotation (3, 3) to world axes, scales
+            (3), and of the local frame, on the screen only, the plane (u, v) of o' x d' and the axes (f1, f2, f3) that
+            directions are stored along.
+    """
+
+    def __init__(
+        self,
+        record: list[Float],
+        key: Float,
+        bounds: list[Float] | None,
+        alive: Mask,
+        ellipsoids: list[Float] | None = None,
+        frame: tuple | None = None,
+    ) -> None:
+        self.record = record
+        self.key = key
+        self.alive = alive
+        # Any: None where a view has no such thing, and then nobody reads it.
+        self.bounds: list[Float] | Any = bounds
+        self.ellipsoids: list[Float] | Any = ellipsoids
+        self.frame: tuple | Any = frame
