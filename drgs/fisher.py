@@ -125,7 +125,8 @@ def diagonal(
             a name in its `parameters()`, such as a weight of a network, is the scene's own tensor (`columns`,
             `probes`), also where its Gaussians have the same name; `rotations` are then those of its `quats`.
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
-        probes, seed: Of method `probes`.
+        probes: Number of random images of method `probes`, of each view.
+        seed: Seed of these.
         semantics: The metric in which features tell about the geometry; None: they do not (`exact`, `columns`,
             `probes`; only `exact` makes use of its `estimate`).
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared, as a fit
@@ -197,7 +198,7 @@ def blocks(
     """One dense block of J^T J for every Gaussian, summed over views.
 
     Args:
-        gaussians, cameras, settings, channel_weights, semantics, masks: As for `diagonal`.
+        gaussians, cameras, settings, channel_weights, semantics, masks: The same as for `diagonal`.
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
@@ -226,7 +227,7 @@ def coverage(
     """(N,) float64 sum over views and pixels of w^2: the information about a color without direction.
 
     Args:
-        gaussians, cameras, settings, masks: As for `diagonal`.
+        gaussians, cameras, settings, masks: The same as for `diagonal`.
     """
     cameras = _cameras_of("fisher.coverage", gaussians, cameras, settings)
     settings = settings or RenderSettings.preset("exact")
@@ -253,7 +254,7 @@ def backdrop(
     a row for each cell. See `drgs.information.backdrop`.
 
     Args:
-        gaussians, cameras, settings, channel_weights, masks: As for `diagonal`.
+        gaussians, cameras, settings, channel_weights, masks: The same as for `diagonal`.
         sphere: What the color is painted on, the same for all views that are compared, as `backdrop_sphere` makes it;
             None: infinitely far away.
         seen_opacity: (H, W) of each view, where they are known, as `drgs.render` gives them; None: they are rendered.
@@ -290,11 +291,11 @@ def variance_map(
     semantics it is that of the pixel's color and decoded features together; with channel weights 0, of the latter.
 
     Args:
-        gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
+        gaussians, camera, settings, channel_weights, semantics: The same as for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `backdrop`,
             (1536, 3), is that of the color behind what the Gaussians leave open. Those above 3e32, as lambda = 0 makes
             them of what was hardly seen, count as 3e32.
-        sphere: As for `backdrop`.
+        sphere: The same as for `backdrop`.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
     check_view("fisher.variance_map", seen, camera, settings)

@@ -167,7 +167,7 @@ def check(where: str, information: Information, signed: bool = False) -> None:
 
     Args:
         where: What the error begins with.
-        information: Of one view or of many.
+        information: The information of one view or of many.
         signed: Whether entries may be negative, as those off the diagonal of dense blocks.
     """
     lowest = -math.inf if signed else 0.0

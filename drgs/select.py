@@ -73,12 +73,12 @@ def select(
         k: How many.
         policy: A name in `POLICIES`, or `package.module:function` of a function like those: `Pool` to `Selection`.
         scoring: How views are scored; default `Scoring()`.
-        rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
+        rng: Generator of `random`; default one that lives as long as the process. Give a run its own, and keep it.
         masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside was not learned from.
             Candidates have none. Only `fisher`, `coverage` and policies that are made of these use masks.
         empty_outside: Nothing is outside of the masks, as of an object's: what these views leave open there is known
             to be empty (block `backdrop`).
-        cache: Where to look for and keep information of single views.
+        cache: Cache where information of single views is looked for and kept.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
             Not done where scores can rise (a relative lambda, lambda = 0, or z-scores).
         progress: Called with (views done, views) after each view.
@@ -86,7 +86,7 @@ def select(
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
         workers: Processes that compute what single views tell, here or on other machines
             (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
-        **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
+        **fields: Fields of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, information is negative, NaN

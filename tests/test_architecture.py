@@ -78,7 +78,7 @@ SHARED = {
 }
 
 # Rooms in which modules still know each other. None may be added.
-CIRCLES = {"data", "fitting", "commands"}
+CIRCLES = {"data"}
 
 LINES = 600  # one subject, unpacked; above it a file is about two things
 

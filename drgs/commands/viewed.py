@@ -50,7 +50,8 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     """What is looked at.
 
     Args:
-        args, given: Of the command line.
+        args: The options of the command line.
+        given: The scene that they name.
         before: What was looked at, where a file has changed: browsers stay where they are.
     Raises:
         FileNotFoundError, ValueError: If a file that was named is not there or damaged.

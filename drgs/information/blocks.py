@@ -185,7 +185,7 @@ class DenseBlocksQuestion(BlockQuestion):
     """`drgs.fisher.blocks` of a view.
 
     Attributes:
-        channel_weights, semantics: As of a `DiagonalQuestion`.
+        channel_weights, semantics: The same as of a `DiagonalQuestion`.
     """
 
     channel_weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -210,7 +210,7 @@ class NetworkQuestion(BlockQuestion):
         estimate: What is estimated of H.
         probes: Random images, or tangents.
         groups: Groups of the network that count; None: all.
-        channel_weights, semantics: As of a `DiagonalQuestion`.
+        channel_weights, semantics: The same as of a `DiagonalQuestion`.
     """
 
     estimate: str = "diagonal"

@@ -26,7 +26,8 @@ class ViewCriterion:
 
     Attributes:
         term: (ratio, variance) -> what each parameter adds to the score, of ratio = Hc / (H + l), which it may
-            overwrite, and variance = 1 / (H + l); both float64, one entry a parameter. None with `of_blocks`.
+            overwrite, and variance = 1 / (H + l); all float64, one entry a parameter, and 0 where the ratio is 0. None
+            with `of_blocks`.
         needs_pool: Whether `variance` is P / (H + l), for which P must be known.
         scores_fall: Whether no score rises as H grows. Greedy choice then scores only what could still win; where it
             is wrongly said, picks may be wrong.
@@ -74,7 +75,8 @@ def criterion_named(name: str, where: str = "criterion") -> ViewCriterion:
     """The criterion of a name, or of the function that `package.module:function` names.
 
     Args:
-        name: In `CRITERIA`, or of somebody's own function. Never one that a file holds: importing runs the module.
+        name: A name in `CRITERIA`, or of somebody's own function. Never one that a file holds: importing runs the
+            module.
         where: What an error begins with.
     Raises:
         ValueError: If there is none.

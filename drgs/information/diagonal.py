@@ -42,7 +42,7 @@ def diagonal_and_opacity(
     block `backdrop`, which is about (1 - opacity)^2, then need not render the view a second time.
 
     Args:
-        gaussians, cameras, settings, method, groups, channel_weights, probes, seed, semantics, masks: As for
+        gaussians, cameras, settings, method, groups, channel_weights, probes, seed, semantics, masks: Those of
             `drgs.fisher.diagonal`, of which messages speak.
         backgrounds: One for each view, in place of that of the settings; empty: none.
     Returns:

@@ -46,10 +46,10 @@ class Selection:
     """What a policy chose, in which order, and the scores that it chose by; `to_json` is how files hold it.
 
     Attributes:
-        picks: In the order of picking.
+        picks: Picks in the order of picking.
         scores: Scores of all candidates, before the first pick.
         parts: Parts of all candidates' scores, before the first pick: group -> what it adds.
-        unseen: For every candidate, what of its score, in the same unit, is of parameters that no training view has
+        unseen: Share of each candidate's score, in the same unit, that is of parameters that no training view has
             information about (lambda alone decides how much they count).
         left_out: Group -> parameters not counted because lambda = 0 and no training view has information about them.
         evaluations: How often a candidate was scored.
@@ -105,7 +105,7 @@ class Selection:
         """Each candidate as files hold it: what is said of its view, score, parts, unseen, what is said after these.
 
         Args:
-            views, after: As for `picks_json`.
+            views, after: The same as for `picks_json`.
             no_parts: What stands for `parts` where the policy has no groups.
         """
         count = len(self.scores)
@@ -155,19 +155,19 @@ class Pool:
     """Everything that a policy may look at: the scene, the views that are known and those to choose from.
 
     Attributes:
-        scene: As it is now; the Gaussians that a camera sees are `scene.at(camera.time)`.
+        scene: The scene as it is now; the Gaussians that a camera sees are `scene.at(camera.time)`.
         candidates: Cameras to choose from, at least `k`; a policy names them by their place in this list.
         train: Cameras whose views are known; may be empty.
         masks: Masks of these, where they have some; see `drgs.fisher.diagonal`.
         empty_outside: Whether it is known that nothing is outside of the masks, as of an object's.
         k: How many to pick.
         scoring: How views are scored, where the policy scores them by information.
-        rng: Where policies that draw take their numbers from.
-        cache: Where information of single views is looked up and kept; None: nowhere.
+        rng: Generator that policies that draw take their numbers from.
+        cache: Cache where information of single views is looked up and kept; None: nowhere.
         lazy: Whether greedy policies leave out scores that cannot win; see `drgs.information.greedy`.
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
-        workers: Where information is computed; None: here.
+        workers: Processes that compute information; None: this one.
     """
 
     scene: Scene
@@ -196,7 +196,7 @@ class Pool:
         """What views say, one after another: out of the cache, else computed by the workers, if any, else here.
 
         Args:
-            views: In their order.
+            views: Questions to the views, in their order.
             accept: Called with the place of a view and what was computed of it; returns what is made of that, and kept.
         """
         cache = self.cache

@@ -125,9 +125,9 @@ class Scoring(Record):
         """The blocks that are scored of a scene.
 
         Args:
-            gaussians: As they are at some time of it.
-            where: For messages.
-            scene: Itself; None: it is these Gaussians, which do not move.
+            gaussians: The Gaussians at some time of it.
+            where: What an error begins with.
+            scene: The scene; None: it is these Gaussians, which do not move.
         Raises:
             ValueError: If one is wanted that the scene does not have.
         """
