@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.gain import Information
     from drgs.information.backdrop import Sphere
+    from drgs.information.choices import Block, NetworkEstimate
     from drgs.settings import RenderSettings
 
 __all__ = [
@@ -213,7 +214,7 @@ class NetworkQuestion(BlockQuestion):
         channel_weights, semantics: The same as of a `DiagonalQuestion`.
     """
 
-    estimate: str = "diagonal"
+    estimate: NetworkEstimate = "diagonal"
     probes: int = 16
     groups: tuple[str, ...] | None = None
     channel_weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -341,7 +342,7 @@ class SceneBlocks:
 
     scene: Scene
     scoring: Scoring
-    names: tuple[str, ...]
+    names: tuple[Block, ...]
     prepared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     empty_outside: bool = False
 
@@ -474,7 +475,7 @@ def _of_network(of: SceneBlocks, names: tuple[str, ...]) -> BlockQuestion | None
     if groups == ():
         return None
     scoring = of.scoring
-    estimate = "diagonal" if scoring.network == "ratio" else scoring.network
+    estimate: NetworkEstimate = "diagonal" if scoring.network == "ratio" else scoring.network
     return NetworkQuestion(estimate, scoring.probes, groups, **_rows(of, of.names))
 
 

@@ -109,8 +109,8 @@ class Selection:
             no_parts: What stands for `parts` where the policy has no groups.
         """
         count = len(self.scores)
-        parts = self.parts or [no_parts] * count
-        unseen = self.unseen or [None] * count
+        parts: Sequence[Mapping | None] = self.parts or [no_parts] * count
+        unseen: Sequence[float | None] = self.unseen or [None] * count
         rows = zip(views, self.scores, parts, unseen, after or [{}] * count, strict=True)
         return [{**view, "score": score, "parts": own, "unseen": x, **rest} for view, score, own, x, rest in rows]
 

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Scoring"]
 
+_EXACT = RenderSettings.preset("exact")  # made once: every record of options has a `Scoring`
+
 
 @dataclasses.dataclass(frozen=True)
 class Scoring(Record):
@@ -80,9 +82,7 @@ class Scoring(Record):
     """
 
     criterion: str = CRITERION_NAMES[0]
-    settings: RenderSettings = dataclasses.field(
-        default_factory=lambda: RenderSettings.preset("exact"), metadata=TRANSIENT
-    )
+    settings: RenderSettings = dataclasses.field(default=_EXACT, metadata=TRANSIENT)
     method: Method = METHODS[0]
     prior: Prior | None = None
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
