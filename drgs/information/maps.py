@@ -30,8 +30,8 @@ def fisherrf_map(
     of twice. The map adds up to `eig` of method `fisherrf`.
 
     Args:
-        gaussians: As the camera sees them.
-        camera, settings: As for `drgs.render`.
+        gaussians: The Gaussians as the camera sees them.
+        camera, settings: The same as for `drgs.render`.
         known: `drgs.fisher.diagonal(..., method="fisherrf")` of the known views.
         prior: lambda.
     """

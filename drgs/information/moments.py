@@ -34,8 +34,8 @@ def moments_map(gaussians: Gaussians, camera: Camera, settings: RenderSettings) 
     from the camera (without the background, and towards the means whatever `sh_direction` is).
 
     Args:
-        gaussians: As the camera sees them.
-        camera, settings: As for `drgs.render`.
+        gaussians: The Gaussians as the camera sees them.
+        camera, settings: The same as for `drgs.render`.
     """
     g = gaussians.detach()
     values = g.features

@@ -84,13 +84,13 @@ def network(
         cameras: One or several; each has a time.
         settings: Default `RenderSettings.preset("exact")`.
         estimate: `diagonal`, `trace` or `paper`, see the module's text.
-        mode: Of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one traversal.
-            `diagonal` has reverse mode only, `paper` needs both.
+        mode: Mode of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one
+            traversal. `diagonal` has reverse mode only, `paper` needs both.
         probes: K, of each view; the error falls as 1 / sqrt(K).
-        seed: Of the random signs, the same in all views.
+        seed: Seed of the random signs, the same in all views.
         channel_weights: Inverse noise variances of R, G and B.
         semantics: The metric in which decoded features tell, too; its `estimate` says how many channels they take.
-        masks: As for `drgs.fisher.diagonal`.
+        masks: The same as for `drgs.fisher.diagonal`.
     Returns:
         Group (`grid`, `mlp`; those that there are) -> float64 on the CPU: (P,) of its P parameters in the order of
         `scene.parameters()`, of `trace` and `paper` a number ().
@@ -131,8 +131,8 @@ def network_variance_map(
     mean of (J v)^2 over v = z sqrt(weights), z random signs: forward mode.
 
     Args:
-        scene, camera, settings, probes, seed, channel_weights, semantics: As for `network`; a pixel of n rows has a
-            relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
+        scene, camera, settings, probes, seed, channel_weights, semantics: The same as for `network`; a pixel of n rows
+            has a relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
         weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
     """
     where = "fisher.network_variance_map"
@@ -169,7 +169,7 @@ class _View:
     """The rows of a view's image, each divided by its noise, as a function of phi.
 
     Attributes:
-        call: Of the view.
+        call: The call of the view.
         scales: (C,) what the call's channels are multiplied by, colors, then semantic channels; with a mask
             (pixels, C).
     """

@@ -38,9 +38,9 @@ def by_probes(
     """Mean of (J^T v)^2 over Rademacher images v of RGB and decoded features; what only features tell about is exact.
 
     Args:
-        semantics: Of the features; v has a sign for each direction that the decoder sees, and L v is what the features
-            get of it, for E (J^T L v)^2 = diag(J^T M J). None: v is of RGB only.
-        scene: Where the Gaussians come from: all groups are of this scene then.
+        semantics: The metric of the features; v has a sign for each direction that the decoder sees, and L v is what
+            the features get of it, for E (J^T L v)^2 = diag(J^T M J). None: v is of RGB only.
+        scene: The scene that the Gaussians come from: all groups are of it then.
         mask: (H, W) what the image is multiplied by; None: 1.
     """
     if not (isinstance(probes, int) and probes >= 1):
@@ -74,8 +74,8 @@ class Pullback:
     def __init__(self, call: Call, names: Sequence[str]) -> None:
         """
         Args:
-            call: Of the view; its scene, if it has one, is where the Gaussians come from.
-            names: Of the call's inputs, those that slopes are wanted of.
+            call: The call of the view; its scene, if it has one, is where the Gaussians come from.
+            names: The call's inputs that slopes are wanted of.
         """
         self.call = call
         self.names = list(names)

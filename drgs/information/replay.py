@@ -41,7 +41,7 @@ class Walk(NamedTuple):
 
     Attributes:
         first: It is the traversal whose colors weigh.
-        weights: Of its channels: three colors, then semantic channels.
+        weights: Weights of its channels: three colors, then semantic channels.
         channels: What it composited.
         part, finals: The rays, and their final states.
         table: What is known of their hits, where final states are not needed.

@@ -57,7 +57,7 @@ class SemanticMetric:
         weight: gamma, the inverse noise variance of a decoded channel, where that of a color is 1.
         estimate: `exact`, `principal` or `collapsed` (the module's text).
         samples: K, channels of `principal` and `collapsed`; `exact` is taken where it needs no more.
-        seed: Of its signs: the same for all views that are compared.
+        seed: Seed of its signs: the same for all views that are compared.
     Raises:
         ValueError: If a value is out of range, or the matrix is no metric.
     """
