@@ -202,7 +202,7 @@ def read_model(model: Path, points: bool = True) -> object:
 
 def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
     """What pycolmap reads in a folder; errors name the model."""
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
@@ -336,7 +336,7 @@ def _parameter_count(path: Path, number: int) -> int:
     for model_number, parameters in _MODELS.values():
         if model_number == number:
             return parameters
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     try:
         name = pycolmap.CameraModelId(number).name

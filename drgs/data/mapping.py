@@ -111,7 +111,7 @@ def map_photos(
     Returns:
         pycolmap's models by number; empty if no two photographs could be connected.
     """
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     told = _Told(total, progress, doing)
     told.still()
@@ -129,7 +129,7 @@ def map_photos(
 @contextlib.contextmanager
 def _followed(folder: Path, told: _Told) -> Iterator[None]:
     """COLMAP's log goes to a file in a folder, and `told` hears of every line soon after it is written."""
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     log = pycolmap.logging
     before = log.minloglevel, log.logtostderr, log.alsologtostderr, log.stderrthreshold
@@ -248,7 +248,7 @@ class PhotoGroups:
 
 def _evidence(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
     """Number of features by photograph, and of verified matches by pair."""
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     with pycolmap.Database.open(database) as handle:
         images = {image.image_id: image.name for image in handle.read_all_images()}

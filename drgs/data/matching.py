@@ -26,7 +26,7 @@ _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few feature
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """COLMAP's log kept off the terminal, errors included: they arrive as exceptions. Signals end a command there."""
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
@@ -62,7 +62,7 @@ def extract(
         masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
         progress: Called with ("features", done, total).
     """
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -103,7 +103,7 @@ def state_focal_lengths(database: Path, folder: Path) -> None:
         database: COLMAP's database, with features of images whose names are those in the folder.
         folder: The photographs.
     """
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     with pycolmap.Database.open(database) as handle:
         first = {image.camera_id: image.name for image in reversed(handle.read_all_images())}
@@ -132,7 +132,7 @@ def match(
         guided: Look for more matches once the epipolar geometry of a pair is known.
         progress: Called with ("matching", done, total).
     """
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -161,7 +161,7 @@ def match(
 @contextlib.contextmanager
 def _numbered(database: Path) -> Iterator[dict[str, str]]:
     """Name -> number that the images of a database are called by meanwhile: COLMAP splits a list of pairs at spaces."""
-    from drgs.data.pycolmap import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     with pycolmap.Database.open(database) as handle:
         images = handle.read_all_images()

@@ -201,8 +201,8 @@ def _reconstruct(
     is_masked: bool,
 ) -> SfmSummary:
     """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
+    from drgs.data.colmap_bindings import pycolmap
     from drgs.data.matching import extract, match, quiet, sequential_pairs, state_focal_lengths
-    from drgs.data.pycolmap import pycolmap
 
     database = partial / "database.db"
     shared = len({image_size(image_dir / name) for name in names}) == 1
