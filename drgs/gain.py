@@ -156,6 +156,7 @@ def variances(train: Information, prior: Prior | None = None) -> dict[str, torch
     lambdas = (prior or Prior()).per_group(train)
     result = {}
     for name, H in train.items():
+        # float64: lambda = 1e-6 beside an H of 1e4 would vanish in float32.
         precision = H.to(torch.float64) + lambdas[name]
         # 1 / 0 would be inf and inf * 0 NaN; a variance of 0 drops the parameter from every criterion.
         result[name] = torch.where(precision > 0, precision.reciprocal(), 0.0)
