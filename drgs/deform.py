@@ -80,7 +80,7 @@ class FieldConfig:
         """The sizes of 4D Gaussian Splatting for videos of rooms (`neu3d`) or for one synthetic object (`dnerf`).
 
         Args:
-            name: Of the preset.
+            name: Name of the preset.
             times: How many distinct times there are; there is a node in time for every two of them, as in 4DGS. None
                 for those of its own data sets: 300 (`neu3d`) and 100 (`dnerf`).
             **fields: Fields that replace the preset's.
@@ -321,6 +321,7 @@ def _checked_bounds(bounds: ArrayLike | torch.Tensor) -> torch.Tensor:
         )
     middle = box.mean(0)
     size = box[1] - box[0]
+    # Coordinates are divided by it: a flat scene has a side of 0, a single point three.
     size = size.clamp_min(_FLATTEST * float(size.max()) or 1.0)
     return torch.stack([middle - size / 2, middle + size / 2])
 

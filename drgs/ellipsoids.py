@@ -306,7 +306,7 @@ def ellipsoids_shape(gaussians: Gaussians, extent: float = 3.0) -> dict:
     """The Gaussians as a Mitsuba `ellipsoids` shape, for `mi.load_dict`.
 
     Args:
-        gaussians: At least one.
+        gaussians: One Gaussian or more.
         extent: Radius in standard deviations that Mitsuba bounds them by (the integrator `drgs` uses its own).
     Returns:
         A dict with centers, scales, quaternions (xyzw, normalized) and the attributes `opacities` (N, 1) and

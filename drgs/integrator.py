@@ -44,8 +44,8 @@ def render(
 
     Args:
         gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians at `camera.time` are seen.
-        camera: Its pose is differentiated when `camera.w2c` is a torch tensor that requires a gradient. Or a list of
-            cameras of one image size.
+        camera: A camera, or a list of cameras of one image size. The pose is differentiated when `camera.w2c` is a
+            torch tensor that requires a gradient.
         settings: Default `RenderSettings.preset("exact")`.
         outputs: What to compute besides rgb, alpha and features: any of `OUTPUTS`, or "all". What is not asked for
             costs nothing.
@@ -100,8 +100,8 @@ def render_jvp(
     """Forward mode: how a view changes along tangents of its parameters.
 
     Args:
-        gaussians, camera, settings, outputs, couple_features: As for `render` (median depth, count and visibility have
-            no tangent).
+        gaussians, camera, settings, outputs, couple_features: Arguments of `render` (median depth, count and visibility
+            have no tangent).
         tangents: Name -> tangent of the raw parameter, shaped like it, optionally with a leading axis K (the same
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
@@ -147,8 +147,9 @@ def render_rays(
     Args:
         origins, directions: (..., 3) world frame; directions need not be normalized. Differentiable torch tensors or
             arrays.
-        settings: Default `exact` on `bvh`. `order="center"` sorts by the distance to the first origin.
-        outputs, couple_features: As for `render`.
+        settings: Settings with traversal `bvh`; default `exact`. `order="center"` sorts by the distance to the first
+            origin.
+        outputs, couple_features: Arguments of `render`.
     Returns:
         An `Output` with the leading shape of the rays instead of (H, W).
     """

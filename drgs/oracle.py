@@ -50,7 +50,7 @@ class Footprints:
     tiles: list[tuple[torch.Tensor, torch.Tensor]] | None
 
     def take(self, keep: torch.Tensor) -> Footprints:
-        """Those at `keep`, a mask or an index."""
+        """The footprints at `keep`, a mask or an index."""
         tiles = None if self.tiles is None else [(first[keep], last[keep]) for first, last in self.tiles]
         return Footprints(self.means[keep], self.rows[keep], self.diagonal[keep], tiles)
 
@@ -72,7 +72,7 @@ class OracleScene:
         index: (N,) places among the Gaussians that were passed in.
         colors: (N, 3) where they are those towards the means; None where they depend on the ray.
         near_margin: (N,) z / near - 1, where means behind `near` were culled; else None.
-        screen: Where Gaussians are of the image plane (`ewa`); else None.
+        screen: Footprints on the image plane, of `ewa`; else None.
     """
 
     means: torch.Tensor
@@ -92,12 +92,12 @@ class OracleScene:
     def take(self, keep: torch.Tensor) -> OracleScene:
         """The Gaussians at `keep`, a mask or an index."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        taken = {name: x[keep] for name, x in fields.items() if isinstance(x, torch.Tensor)}
+        taken: dict[str, Any] = {name: x[keep] for name, x in fields.items() if isinstance(x, torch.Tensor)}
         screen = None if self.screen is None else self.screen.take(keep)
         return dataclasses.replace(self, **taken, screen=screen)
 
     def colored(self, center: torch.Tensor) -> OracleScene:
-        """With the colors towards the means from a camera's center (3,)."""
+        """The scene with the colors towards the means from a camera's center (3,)."""
         return dataclasses.replace(self, colors=sh_colors(self.sh, self.means - center))
 
 
@@ -184,7 +184,7 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
 
 
 def scale_and_shift(cam: Any) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of K, in pixels: the (2, 2) that acts on x/z and y/z, skew included, and the principal point (2,).
+    """The part (2, 2) of K that acts on x/z and y/z, skew included, and the principal point (2,), both in pixels.
 
     Raises:
         ValueError: If the last row of K is not 0 0 1: that is no camera with its axis along z.
@@ -233,7 +233,7 @@ def screen_rows(
     Args:
         x, y, z: (N,) means in the camera's frame.
         cam: Camera that has `K`, `width` and `height`.
-        fov_clamp: As in `RenderSettings`.
+        fov_clamp: `RenderSettings.fov_clamp`.
         rotation: (3, 3) of w2c.
         axes: (N, 3, 3) semi-axes in its columns, world axes.
     """

@@ -21,8 +21,7 @@ from drgs import runtime
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.bvh import BvhTraversal
-from drgs.tracing.composite import arranged
-from drgs.tracing.operation import Composite
+from drgs.tracing.composite import Composite, compositor_of
 from drgs.tracing.projection import project_world
 
 mi = runtime.mitsuba()
@@ -89,18 +88,19 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[nam
         for k, v in enumerate(w2c):
             dr.scatter(pose, v, lib.UInt32(k))
         traversal = BvhTraversal(lib, s, project_world(lib, p, pose, s, coefficients), n)
-        compositor, arguments = arranged(lib, s, traversal, p, coefficients, o, d)
+        compositor, arguments = compositor_of(lib, s, traversal, p, coefficients, o, d)
         out = dr.custom(Composite, compositor, *arguments, dr.grad_enabled(p))
         i = dr.arange(lib.UInt32, n)
         return mi.Color3f(*[dr.gather(lib.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
 
     def to_string(self) -> str:
-        """For Mitsuba's printout of a scene."""
+        """What Mitsuba prints of a scene."""
         return f"DrgsIntegrator[{self.settings}]"
 
 
 def _camera_axes(lib: Lib, pose: Any, origins: list[Float]) -> list[list[Float]]:
     """Rows of w2c: of the sensor (whose x and y point the other way), or at the first ray's origin in world axes."""
+    # Float64, as a pose of `Call` is: what is projected with it cancels in float32 far from the origin.
     if pose is None:
         axes = [[lib.Float64(float(r == c)) for c in range(3)] for r in range(3)]
         center = [lib.Float64(dr.gather(lib.Float, x, 0)) for x in origins]

@@ -96,7 +96,7 @@ def rasterization(
             (..., C, N, K, 3), of which the first (sh_degree + 1)^2 are used.
         viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
         Ks: (..., C, 3, 3) in pixels, pixel centers at +0.5. A skew is followed (gsplat ignores it).
-        width, height: Of every image.
+        width, height: Size of every image, in pixels.
         near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out.
         radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
         eps2d: Added to the diagonal of the projected covariance, in px^2.
@@ -246,6 +246,8 @@ def _projected(
         z = torch.where(valid, z, 1)  # the others have no projection
         u, v = x / z, y / z
         means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
+        # The Jacobian of a mean far outside of the view is that at the view's widened edge, and has no derivative by
+        # where the mean is along that axis: the rasterizers' own rule.
         if settings.fov_clamp == "gsplat":
             half = 0.15 * camera.width / fx, 0.15 * camera.height / fy
             u = u.clamp(-cx / fx - half[0], (camera.width - cx) / fx + half[0])

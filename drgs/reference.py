@@ -138,7 +138,7 @@ def render(
     parts = []
     for i in range(0, max(len(directions), 1), step):
         part = (x[i : i + step] for x in (view.origins, directions, view.pixels))
-        args = (scene, s, rotation, center, *part, tolerance, exact_ties, effect)
+        args: tuple[Any, ...] = (scene, s, rotation, center, *part, tolerance, exact_ties, effect)
         # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
         if torch.is_grad_enabled() and len(directions) > step:
             parts.append(checkpoint(_composite, *args, use_reentrant=False))

@@ -286,7 +286,7 @@ def optix_status() -> tuple[bool, str | None]:
 
 
 def version() -> str:
-    """Of drgs."""
+    """Version of drgs."""
     import drgs
 
     return drgs.__version__

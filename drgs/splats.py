@@ -33,6 +33,7 @@ __all__ = [
     "scene_of",
 ]
 
+# Scales of 0 have no logarithm, opacities of 0 and 1 no logit: gsplat takes them, and nobody sees these instead.
 _LEAST_SCALE = 1e-20
 _LEAST_OPACITY = 1e-12
 _MOST_OPACITY = 1 - 2.0**-26
@@ -68,7 +69,7 @@ class Splats:
     degree: int | None
 
     def take(self, index: torch.Tensor) -> Splats:
-        """Those at `index`."""
+        """The Gaussians at `index`."""
         parts: dict[str, Any] = {name: x[index] for name, x in vars(self).items() if name != "degree"}
         return Splats(**parts, degree=self.degree)
 
@@ -174,6 +175,7 @@ def inside_opacities(opacities: torch.Tensor) -> torch.Tensor:
 
 def _inside(x: torch.Tensor, low: float, high: float) -> torch.Tensor:
     """x moved into [low, high], with the derivative of x: at the ends gsplat's functions have one."""
+    # The value of the clamp without its derivative. In float32, 1 - 2^-26 would be 1, whose logit is infinite.
     return x + (x.detach().double().clamp(low, high) - x.detach()) if x.numel() else x
 
 

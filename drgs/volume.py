@@ -122,7 +122,7 @@ def render_volume(
     """Emission and absorption of the sum of all densities, by adaptive quadrature in float64.
 
     Args:
-        g, cam, rays: As of `drgs.reference.render`; gradients reach the raw parameters and a torch `w2c`.
+        g, cam, rays: Arguments of `drgs.reference.render`; gradients reach the raw parameters and a torch `w2c`.
         settings: Only `background`, `near` and `sh_direction` apply; default `RenderSettings.preset("exact")`.
         window: (x, y, width, height) in pixels: only these of the camera's image.
         tolerance: An interval is halved until its error estimate falls below tolerance times its weight T(a) - T(b);

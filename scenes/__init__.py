@@ -349,7 +349,7 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
             image = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i)
             image = encode_srgb(np.asarray(image) * exposure)
             write_depth(folder / "depth" / name, z_depth(scene, K, c2w, width, height))
-            write_png(folder / "images" / name, image[..., ::-1])
+            write_png(folder / "images" / name, image[..., ::-1])  # as BGR
         frames.append(
             {
                 "file_path": f"images/{name}",

@@ -240,7 +240,8 @@ class _Recording:
         image = mi.render(self.stage.scene, sensor=sensor, integrator=integrator, spp=self.spp, seed=seed)
         output.write_png(label_path, labels)
         output.write_file(feature_path, teacher.tensor_bytes(feature))
-        output.write_png(image_path, scenes.encode_srgb(np.asarray(image) * _EXPOSURE)[..., ::-1])
+        image = scenes.encode_srgb(np.asarray(image) * _EXPOSURE)
+        output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the frame is finished
 
     def _seen(self, camera):
         """(labels, world points, depth) of the surfaces at a camera's pixel centers."""

@@ -14,7 +14,7 @@ def build(parts, classes, lights=None):
 
     Args:
         parts: Arguments of `scenes.shape` of each part, whose names are classes; the k-th one has the identifier
-            ``part{k:03d}``.
+            `part{k:03d}`.
         classes: Names of the classes, of which labels are the numbers from 1.
         lights: Dict of what else is in the scene, as `mi.load_dict` takes it.
     Returns:

@@ -260,7 +260,8 @@ class _Views:
                 output.write_png(label_path, labels)
                 output.write_depth(depth_path, depth)
                 output.write_file(feature_path, teacher.tensor_bytes(feature))
-                output.write_png(image_path, scenes.encode_srgb(np.asarray(image) * _EXPOSURE)[..., ::-1])
+                image = scenes.encode_srgb(np.asarray(image) * _EXPOSURE)
+                output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the view is finished
             if progress is not None:
                 progress(k + 1, len(poses))
 

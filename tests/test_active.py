@@ -23,6 +23,7 @@ from drgs.fitting.config import SelectionConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import fitted_views
 from drgs.fitting.timetable import initial_views
+from drgs.information.prior import Prior
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 24
@@ -335,7 +336,7 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
         return choose(gaussians, candidates, train, *rest, **options)
 
     monkeypatch.setattr(drgs.select, "select", select)
-    active = plan(policy="fisher", criterion="eig", prior=1e-3, blocks=("geometry",), info_pixels=100)
+    active = plan(policy="fisher", criterion="eig", prior=Prior(1e-3), blocks=("geometry",), info_pixels=100)
     result = fit(lazily(still), tmp_path / "run", config(selection=active), progress=False)
     assert sizes == [({(10, 10)}, {(10, 10)}, 2), ({(10, 10)}, {(10, 10)}, 3)]
     record = json.loads((tmp_path / "run/selection.json").read_text())

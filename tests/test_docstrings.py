@@ -13,7 +13,7 @@ from test_architecture import modules
 TO_DO = {
     *("codecs", "data", "dynamics", "fitting", "guards", "studies", "tracing"),
     *("cameras", "deform", "ellipsoids", "evaluation", "integrator", "metrics", "oracle", "rasterize"),
-    *("reference", "train", "volume"),
+    *("reference", "settings", "train", "volume"),
     *("commands.orbits", "commands.render", "commands.scene_input", "commands.viewpoints"),
 }
 
@@ -64,6 +64,11 @@ def faults(lines: list[str]) -> Iterator[str]:
     for above, line in zip(lines[2:], lines[3:], strict=False):
         if SECTIONS.fullmatch(line) and not above and any(map(SECTIONS.fullmatch, lines[: lines.index(line)])):
             yield f"an empty line before {line}"
+    for line in lines:
+        if "``" in line:
+            yield f"two backticks, one is enough: {line.strip()}"
+        elif line in ("References:", "Parameters:", "Params:", "Return:", "Throws:", "Arguments:"):
+            yield f"another dialect's section: {line}"
 
 
 def room_of(module: str) -> str | None:
@@ -116,3 +121,4 @@ def test_a_fragment_is_found(text, count):
     assert len([*faults(lines)]) == count
     assert len([*faults([*lines, "Returns:", "    Of what is returned nothing is asked."])]) == count
     assert len([*faults([*lines, "", "Returns:", "    Something."])]) == count + 1
+    assert len([*faults([*lines, "References:", "    Somebody, ``Something``."])]) == count + 2

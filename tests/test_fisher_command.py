@@ -117,7 +117,7 @@ def test_plain_ply(place, monkeypatch, capsys):
     """Without a record the cameras given are the known ones, unless --train names others."""
     report, _ = run("scene.ply --cameras cameras.json", place, monkeypatch, capsys)
     assert (len(report["known"]["names"]), len(report["views"])) == (5, 4)
-    report, _ = run("scene.ply --train cameras.json --cameras orbit --count 3 --up z", place, monkeypatch, capsys)
+    report, _ = run("scene.ply --train cameras.json --cameras orbit --count 3 --orbit up=z", place, monkeypatch, capsys)
     assert [row["name"] for row in report["views"]] == ["orbit_0000", "orbit_0001", "orbit_0002"]
     report, _ = run("run --cameras data --split test", place, monkeypatch, capsys)
     assert [row["name"] for row in report["views"]] == ["0", "4", "8"]

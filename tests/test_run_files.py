@@ -156,13 +156,11 @@ _OTHERS = {
     "commands/info.py",  # stdout
     "commands/repeat.py",  # options on a line of a report
     "data/reader_process.py",  # between processes
-    "fitting/config.py",  # plain values
     "guards/json_files.py",  # a message
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
     "report/page.py",  # a cell of the report
-    "studies/cells.py",  # plain values
 }
 """Modules that make JSON which is no file of the page."""
 

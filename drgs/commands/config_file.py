@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from drgs.commands.overrides import override
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.guards.json_files import read_json, read_toml
 from drgs.guards.records import Record, hints_of, nearest, part_of, stated
@@ -78,11 +79,11 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
     settings = given.pop("settings", None)
     if settings is not None:
         given["preset"], differences = settings.nearest_preset()
-        given["overrides"] = tuple(f"{name}={_text(x)}" for name, x in differences.items())
+        given["overrides"] = tuple(override(name, x) for name, x in differences.items())
         if "background" in options.__dataclass_fields__:
             given["background"] = settings.background
         elif settings.background != RenderSettings.background:
-            given["overrides"] += (f"background={_text(settings.background)}",)
+            given["overrides"] += (override("background", settings.background),)
     if "prior" in given:
         prior = given.pop("prior")
         if prior is not None:
@@ -108,12 +109,3 @@ def _fields_of(record: Record) -> dict[str, Any]:
         if isinstance(value, Record):
             found |= _fields_of(value)
     return found
-
-
-def _text(value: Any) -> str:
-    """A render setting as --set reads it."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return ",".join(map(repr, value))
-    return repr(value) if isinstance(value, float) else str(value)

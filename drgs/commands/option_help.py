@@ -194,7 +194,7 @@ def options_in(kind: type, instance: Any = None) -> Iterator[Option]:
         if bare is bool and value is True:
             option = "--no-" + option[2:]
         if positional:
-            flags = str(said.get("metavar", field.name.upper()))
+            flags = metavar if metavar.startswith("{") else str(said.get("metavar", field.name.upper()))
         else:
             flags = ", ".join([*aliases, option]) + (f" {metavar}" if metavar else "")
         if required or bare is bool:

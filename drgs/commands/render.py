@@ -124,13 +124,14 @@ def render_views(
     """Render cameras to files, each of which appears once it is complete.
 
     Args:
-        scene, cameras, settings: As for `drgs.render`, a list of cameras; without `paint`, features are left out.
+        scene, cameras, settings: Arguments of `drgs.render`, with a list of cameras; without `paint`, features are left
+            out.
         out_dir: Folder of the files; made if absent.
-        formats: Of png (8 bits, clamped, no transfer function), exr (float32; R G B, A, and Z, the
-            distance along the ray) and webm (one video); others are left to the caller.
+        formats: Any of png (8 bits, clamped, no transfer function), exr (float32; R G B, A, and Z, the distance along
+            the ray) and webm (one video); others are left to the caller.
         depth: A color-mapped `NAME.depth.png` for each view, too.
-        fps: Of the video.
-        video: Its file name.
+        fps: Frames a second of the video.
+        video: File name of the video.
         paint: Kind -> what draws it, a `NAME.KIND.png` for each view, and `VIDEO.KIND.webm` beside the video.
         advance: Called after each view.
     Returns:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from drgs.commands.options import Fit
+from drgs.commands.overrides import override
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.settings import RenderSettings
 
@@ -51,7 +52,7 @@ def _settings(settings: RenderSettings) -> list[str]:
     nearest, differences = settings.nearest_preset()
     words = [] if nearest == Fit.preset else ["--preset", nearest]
     for name, value in differences.items():
-        words += ["--set", f"{name}={_value(value)}"]
+        words += ["--set", override(name, value)]
     return words + _option("background", settings.background, RenderSettings.background)
 
 

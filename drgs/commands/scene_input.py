@@ -27,13 +27,14 @@ class SceneInput:
     """Gaussians, and the run that they are of.
 
     Attributes:
-        gaussians: Of the file, or of the run's last checkpoint.
+        gaussians: Gaussians of the file, or of the run's last checkpoint.
         run: The run folder; None for a file.
         record: How the run was fitted; None for a file.
         step: How many steps of the fit its checkpoint has; None for a file, and where only the PLY could be read.
         fields: Render settings that hold whatever the preset is: what --set says, over the background of the fit. A
             run was fitted over its background; over another one its edges show a halo.
-        decoder, classes: Of a run that was fitted with semantics; else None.
+        decoder, classes: What turns features into those of the teacher, and the classes, of a run that was fitted with
+            semantics; else None.
         moving: The Gaussians and what moves them; None where nothing does.
     """
 

@@ -60,8 +60,8 @@ class Source:
     """What an option says about where views come from.
 
     Attributes:
-        option: Its name, for messages.
-        text: Its value.
+        option: Name of the option, for messages.
+        text: Value of the option.
         kind: `orbit`, `dome`, `list` (of cameras, in JSON), `run` or `data`.
         given: What the command looks at: the record of a run is read once.
     """
@@ -168,7 +168,7 @@ def drawn_views(
     """The cameras of `--cameras` as they are, and where they come from in words.
 
     Args:
-        args: Whose `split` and options of orbits apply.
+        args: Options of the command, of which `split` and those of orbits apply.
         text: What `--cameras` says.
         given: What an orbit goes around, like the photographs of the run if it is one.
         frames, size: Number of views of an orbit and their (width, height); where one is None, 640 wide and of the
@@ -250,7 +250,7 @@ class Known:
 
     Attributes:
         cameras: Pinhole, reduced.
-        source: Where they come from, in words.
+        source: Words that say where they come from.
         pixels: These views, and those that are compared with them, are reduced to at most so many.
         data: The data set that they are of, or None.
         sizes: Stated size -> size of the image file, as far as known.
@@ -268,8 +268,8 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
 
     Args:
         text: A data set (all its views), a run (those it was fitted to), a cameras.json, or None.
-        args: Whose `info_pixels` and `strict` apply.
-        given: Whose run is taken where `text` is None.
+        args: Options of the command, of which `info_pixels` and `strict` apply.
+        given: What the command looks at, whose run is taken where `text` is None.
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If a file of Gaussians comes without `--train`, or a run's data set no longer has its views.
@@ -308,8 +308,8 @@ def other_views(
 
     Args:
         option: Name of the option, for messages.
-        text: Its value.
-        args: Whose `split`, `count` and options of orbits apply.
+        text: Value of the option.
+        args: Options of the command, of which `split`, `count` and those of orbits apply.
         given: What is turned around.
         known: Views that are left out if `fresh`; the first one's lens serves orbits and domes.
         fresh: Leave out known views of the same data set.

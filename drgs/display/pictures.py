@@ -77,7 +77,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     import cv2
 
     pixels = image if image.dtype == np.uint8 else to_bytes(image)
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))  # as BGR, which OpenCV writes
     return encoded.tobytes()
 
 
@@ -156,6 +156,7 @@ def inferno(shares: np.ndarray) -> np.ndarray:
     """(..., 3) uint8 colors of shares in [0, 1], dark to bright; what is beyond is clamped."""
     import cv2
 
+    # OpenCV's colors are BGR; contiguous, as it takes no arrays that are read backwards.
     return np.ascontiguousarray(cv2.applyColorMap(to_bytes(shares), cv2.COLORMAP_INFERNO)[..., ::-1])
 
 

@@ -40,7 +40,7 @@ class HexPlane(torch.nn.ParameterList):
         bounds: (2, 3) float64, lowest and highest corner of what the planes of space cover, in world units.
         span: First and last time, which the first and the last node of the planes of time lie at.
     Attributes:
-        bounds, span: As given, float64 whatever the parameters are: a buffer each.
+        bounds, span: The arguments, buffers in float64 whatever the parameters are.
     """
 
     bounds: torch.Tensor
@@ -63,7 +63,7 @@ class HexPlane(torch.nn.ParameterList):
         self.register_buffer("span", span.to(torch.float64))
 
     def _apply(self, fn: Callable, recurse: bool = True) -> HexPlane:
-        """Of `.to(...)`: bounds of a world far from 0 and times keep their digits."""
+        """What `.to(...)` does, but bounds and times stay float64: those of a world far from 0 need the digits."""
         bounds, span = self.bounds, self.span
         super()._apply(fn, recurse)
         self.bounds = bounds.to(self.bounds.device)
@@ -81,7 +81,7 @@ def features(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.T
     """Look a HexPlane up.
 
     Args:
-        planes: As in `HexPlane`.
+        planes: Planes in the order of `HexPlane`.
         places: (N, 3), 0 at the lower and 1 at the upper bound; beyond them the features of the border.
         time: Scalar, 0 at the first and 1 at the last time.
     Returns:
@@ -108,6 +108,7 @@ def _between(x: torch.Tensor, nodes: int, dtype: torch.dtype) -> tuple[torch.Ten
 
     NaN stays NaN in the second, and is a legal index.
     """
+    # What lies outside sees the border, and has no derivative by where it is.
     x = x.clamp(0, 1) * (nodes - 1)
     below = x.detach().long().clamp(0, nodes - 2)  # which cell it is has no derivative
     return below, (x - below).to(dtype)

@@ -14,7 +14,7 @@ trained. What comes out is a vector a patch that a text embedding can be compare
 
 Nothing is downloaded and no pickle is run: weights are safetensors, or torch files read with `weights_only`.
 
-References:
+Reference:
     Radford et al. 2021 (CLIP); Zhou, Loy, Dai 2022, "Extract Free Dense Labels from CLIP" (MaskCLIP), section 3.
 """
 
@@ -126,7 +126,7 @@ class ClipEncoder:
             pixels = self._pixels(image, scale)
             found = self.patches(pixels)
             if flip:
-                mirrored = self.patches(pixels.flip(3)).flip(2)
+                mirrored = self.patches(pixels.flip(3)).flip(2)  # back again, so that patches lie on one another
                 found = torch.stack([_unit(found), _unit(mirrored)]).mean(0)
             resized = torch.nn.functional.interpolate(_unit(found)[None], (height, width), mode="bilinear")[0]
             total += resized.cpu()

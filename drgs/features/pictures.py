@@ -62,7 +62,7 @@ class FeatureColors:
         sample = _sample(maps, rows)
         mean = sample.mean(0)
         covariance = (sample - mean).T @ (sample - mean) / len(sample)
-        axes = torch.linalg.eigh(covariance).eigenvectors.flip(1)[:, :3]
+        axes = torch.linalg.eigh(covariance).eigenvectors.flip(1)[:, :3]  # `eigh` sorts by rising variance
         if axes.shape[1] < 3:  # of fewer channels: the others stay in the middle
             axes = torch.nn.functional.pad(axes, (0, 3 - axes.shape[1]))
         largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))

@@ -263,6 +263,6 @@ def _top(confusion: np.ndarray) -> float:
     """The average IoU of the labels of an image that are most frequent in prediction and reference together."""
     right, union, _ = _overlaps(confusion)
     often = confusion.sum(1)[1:] + confusion.sum(0)[1:]
-    top = np.argsort(-often, kind="stable")[:_TOP]
+    top = np.argsort(-often, kind="stable")[:_TOP]  # stable: of equally frequent labels the smaller number first
     top = top[often[top] > 0]
     return float((right[top] / union[top]).mean())

@@ -34,7 +34,7 @@ _finite: set[tuple[Path, int, int]] = set()  # files (path, size, time of change
 
 
 def map_name(path: str | os.PathLike) -> str | None:
-    """The image's stem that a file's name says it is the map of, ``rgb_000`` of ``rgb_000_fmap_CxHxW.pt``.
+    """The image's stem that a file's name says it is the map of, `rgb_000` of `rgb_000_fmap_CxHxW.pt`.
 
     Returns:
         None if it is not named as a map.

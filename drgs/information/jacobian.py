@@ -17,7 +17,7 @@ import drjit as dr
 from drgs.ellipsoids import Y_00
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import if_any_hit
-from drgs.tracing.hit_table import Table, passed
+from drgs.tracing.hit_table import Table, replayed_hit
 from drgs.tracing.kernels import Channels, HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.protocols import Sink
@@ -161,7 +161,7 @@ class Rows:
             color: list[Float] | Any = self.channels.values(m, loaded, ray) if self.colors else None
             if self.table is None:
                 terms = self.terms(k, color, depth, place, ok)
-                T, w, behind, new = passed(self.finals[k], st, a, terms, place, ok)
+                T, w, behind, new = replayed_hit(self.finals[k], st, a, terms, place, ok)
             else:
                 T, w, behind, ok = self.table.read(place, a)
                 new = dict(st)

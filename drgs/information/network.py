@@ -18,7 +18,7 @@ The random signs are the same in each view. Then equal views say the same, a can
 ratio of at most 1 as it should, and a cache may keep what was estimated. 1 / H is too large on average by a factor of
 about K / (K - 2) where one view of K probes is all that is known of a parameter: take 8 or more.
 
-References:
+Reference:
     [1] Bekas, Kokiopoulou, Saad: An estimator for the diagonal of a matrix, 2007; Hutchinson 1990 for the trace.
     [2] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771, section 3.3.
 """

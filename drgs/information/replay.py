@@ -15,7 +15,7 @@ from drgs.tracing.arrays import Float
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
 from drgs.tracing.harmonics import sh_basis
-from drgs.tracing.hit_table import Table, by_lists
+from drgs.tracing.hit_table import Table, along_lists
 from drgs.tracing.pose import quaternion_product
 from drgs.tracing.primitives import Activated
 
@@ -185,7 +185,7 @@ class Replay:
             tabled = None if numbers > _TABLED else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
             for at in done:
-                yield Walk(number == 0, own, channels, *by_lists(self.lib, *at, tabled, kernel))
+                yield Walk(number == 0, own, channels, *along_lists(self.lib, *at, tabled, kernel))
 
     def _rows(
         self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None

@@ -1,9 +1,9 @@
 """How much of a rasterizer's difference to exact ray tracing each of its approximations explains.
 
 From a rasterizer's settings to preset `exact` one thing is switched at a time, in a stated order and in its reverse,
-and each step's image and gradient are kept. With the step ``s_k = y_k - y_{k-1}`` and ``total = y_end - y_start`` a
-rung's share is ``<s_k, total> / |total|^2``: shares sum to 1, one above 1 or below 0 says that steps cancel, and the
-two orders agree where steps do not interact. Gradients are ``J^T u`` of one fixed Rademacher cotangent u, group by
+and each step's image and gradient are kept. With the step `s_k = y_k - y_{k-1}` and `total = y_end - y_start` a
+rung's share is `<s_k, total> / |total|^2`: shares sum to 1, one above 1 or below 0 says that steps cancel, and the
+two orders agree where steps do not interact. Gradients are `J^T u` of one fixed Rademacher cotangent u, group by
 group in raw parameters.
 
 The order is that of `RUNGS`. Its reverse is not always legal: dilation, culling and the field-of-view clamp exist

@@ -167,7 +167,7 @@ class ReferenceModel:
         """The raw parameters that have this model's meaning in ours."""
         raw = dict(raw)
         if self.quaternions == "xyzw":
-            raw["quats"] = raw["quats"][:, [3, 0, 1, 2]]
+            raw["quats"] = raw["quats"][:, [3, 0, 1, 2]]  # its real part stands last, ours first
         if self.rotation == "transposed":
             raw["quats"] = raw["quats"] * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
         if self.scales == "exponential":

@@ -160,7 +160,7 @@ class _Stage:
         if share == 1:
             return out.rgb
         size = (camera.height, camera.width)
-        image = out.rgb.permute(2, 0, 1)[None]
+        image = out.rgb.permute(2, 0, 1)[None]  # torch interpolates images whose channels come first
         return torch.nn.functional.interpolate(image, size=size, mode="bilinear")[0].permute(1, 2, 0)
 
     def check(self, settings: RenderSettings) -> None:

@@ -148,5 +148,5 @@ class _Functional(torch.autograd.Function):
 
 
 def _plain(lib: ModuleType, x: torch.Tensor) -> Any:
-    """As a Dr.Jit tensor: the values below any `torch.func` wrapper."""
+    """The values below any `torch.func` wrapper, as a Dr.Jit tensor."""
     return runtime.unwrapped(x, lambda values: to_drjit(lib, values))

@@ -52,7 +52,7 @@ class BvhTraversal:
     """Any rays, through an acceleration structure of proxies; a `Traversal`.
 
     Args:
-        rays: Their number; origin and direction are the last six floats that they carry.
+        rays: Number of rays; origin and direction are the last six floats that they carry.
     """
 
     world = True
@@ -102,7 +102,7 @@ class BvhTraversal:
         return [part]
 
     def weighed(self, share: int, size: int) -> list[Part]:
-        """As `parts`: there are no lists that rays have in common."""
+        """What `parts` returns: there are no lists that rays have in common."""
         return self.parts(share)
 
     def _ray(self, i: UInt32) -> Ray:
@@ -110,7 +110,7 @@ class BvhTraversal:
         return Ray(carried=carried, basis=self.basis)
 
     def _proxies(self, ray: Ray) -> Proxies | None:
-        """Of the view's ellipsoids, for rays with these origins."""
+        """Proxies of the view's ellipsoids, for rays with these origins."""
         if self.rays == 0:
             return None
         projected = self.projected
@@ -234,6 +234,7 @@ def proxy_scene(
 
 def _groups(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of equal columns (k, N) side by side, and where each group starts, one more at the end."""
+    # Stable: primitives come in an order that no sort chooses.
     order = np.argsort(columns[0], kind="stable")
     x = columns[0, order]
     equal = np.flatnonzero(x[1:] == x[:-1])
@@ -328,7 +329,7 @@ class _ProxyStream:
         return s[6] != 0
 
     def of(self, lanes: UInt32) -> _ProxyStream:
-        """The same for some of the rays."""
+        """The stream of some of the rays."""
         carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]
         return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.order)
 
@@ -387,6 +388,7 @@ def _coherent(lib: Lib, rays: list[Float]) -> UInt32:
             bits = lib.UInt64((x - y) * scale)
             for b in range(10):
                 key |= ((bits >> b) & 1) << (6 * b + group + k)
+    # Only which rays share a packet: each is composited on its own, so that the image is the same in any order.
     order = lib.UInt32(dr.argsort(key))
     dr.eval(order)
     return order

@@ -16,8 +16,7 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
-from drgs.tracing.composite import Arguments, Compositor, arranged
-from drgs.tracing.operation import Composite
+from drgs.tracing.composite import Arguments, Composite, Compositor, compositor_of
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.tiles import TileTraversal
 from drgs.tracing.walk import Traversal
@@ -39,8 +38,8 @@ class Output:
         count: (H, W) int32, composited hits.
         visibility: (N,) sum of w over all pixels; not differentiated.
         features: (H, W, D) when the Gaussians have features.
-        certificate: Of exact order: `rays`, `redone` (of `bvh`: rays walked again, for more hits than a buffer
-            holds); `pairs` listed. Of a list of views one for each.
+        certificate: What exact order is vouched for with: `rays`; on `bvh` `redone`, the rays walked again for more
+            hits than a buffer holds; on tiles `pairs`, the entries listed. A list of them for a list of views.
     """
 
     rgb: torch.Tensor
@@ -57,19 +56,20 @@ class Call:
     """One call of `render`.
 
     Args:
-        gaussians: At the time of the view.
+        gaussians: Gaussians at the time of the view.
         camera: None where there are rays.
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.
         rays: Origins and directions, (..., 3) each, instead of the camera's.
-        scene: Where the Gaussians come from, if derivatives by its parameters are wanted instead of by theirs.
-        timed: Whether by its time, too.
-        couple: As `couple_features` of `render`.
+        scene: The scene that the Gaussians are of, if derivatives by its parameters are wanted instead of by theirs.
+        timed: Whether derivatives by the scene's time are wanted, too.
+        couple: The argument `couple_features` of `render`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
             `time`, `w2c` (12 floats), rays where they are traced.
-        field: From the scene's parameters to the Gaussians'; None for those of the Gaussians themselves.
-        shape: Of the images: (H, W), or that of the rays.
-        extra, certificate: Of the last `trace`: outputs without a derivative, and `Output.certificate`.
+        field: Takes the scene's parameters to the Gaussians'; None where inputs are those of the Gaussians themselves.
+        shape: Shape of the images: (H, W), or that of the rays.
+        extra: After `trace`, outputs without a derivative.
+        certificate: After `trace`, `Output.certificate`.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Call:
 
     @property
     def image_names(self) -> list[str]:
-        """Of the images that `trace` returns."""
+        """Names of the images that `trace` returns."""
         return ["rgb", "alpha", *(["depth"] if "depth" in self.want else []), *(["features"] if self.width else [])]
 
     # -- Dr.Jit side ------------------------------------------------------------------------------------------------
@@ -195,7 +195,7 @@ class Call:
             trimmed = not self.want & {"depth", "count"}
             traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed)
         rays = self._column(p, "ray_origins"), self._column(p, "ray_directions")
-        return arranged(
+        return compositor_of(
             lib, s, traversal, p, self.coefficients, *rays, want=self.want, width=self.width, couple=self.couple
         )
 

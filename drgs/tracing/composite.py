@@ -18,13 +18,13 @@ from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import Adjoint, Tangent
 from drgs.tracing.harmonics import sh_basis
-from drgs.tracing.hit_table import Table, by_lists
+from drgs.tracing.hit_table import Table, along_lists
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.walk import Part, Traversal
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, in_rows, without_graph
 
-__all__ = ["CHUNK", "Arguments", "Compositor", "arranged"]
+__all__ = ["CHUNK", "Arguments", "Composite", "Compositor", "compositor_of"]
 
 CHUNK = 32  # feature channels of one traversal
 
@@ -38,7 +38,7 @@ class Arguments(NamedTuple):
     carried: list
 
 
-def arranged(
+def compositor_of(
     lib: Lib,
     settings: RenderSettings,
     traversal: Traversal,
@@ -53,7 +53,7 @@ def arranged(
     """The compositor of a view, and what it composites.
 
     Args:
-        lib, settings, traversal, want, width, couple: As `Compositor` takes them.
+        lib, settings, traversal, want, width, couple: Arguments of `Compositor`.
         p: Flat raw parameters by name, of which `sh` and `features` are read.
         coefficients: SH coefficients in `p["sh"]`.
         origins, directions: Three (P,) columns each, unit directions, both in the world of the means. Needed where rays
@@ -136,10 +136,10 @@ class Compositor:
         """Flat images rgb, alpha, and where there are any depth and features.
 
         Args:
-            record: Per-Gaussian floats, laid out as `records` says.
+            record: Columns (N,) of floats, laid out as `records` says.
             sh: Flat (N K 3) when SH are evaluated along rays, else None.
             features: Flat (N D) or None.
-            carried: Per-ray floats: SH basis values, then o and d of world rays.
+            carried: Columns (rays,): SH basis values, then o and d of world rays.
             keep: The adjoint may follow.
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
@@ -226,7 +226,7 @@ class Compositor:
         return out
 
     def _parts(self, channels: Channels) -> list[Part]:
-        """Of a pass: features need none where their weights are held."""
+        """The parts that a pass walks: features need none where their weights are held."""
         return [x for x in self.parts if x.weights is None] if channels.channels and not channels.color else self.parts
 
     def _primal(
@@ -337,7 +337,7 @@ class Compositor:
                 scalar = lambda k, place, ok: dr.gather(self.lib.Float, scalars, part.slot(k, place), ok)  # noqa: E731
             return Adjoint(self.model, channels, grads, finals, own, depth, part.reduction, scalar, table)
 
-        part, finals, table = by_lists(self.lib, part, finals, 1, kernel)
+        part, finals, table = along_lists(self.lib, part, finals, 1, kernel)
         states = part.run(kernel(part, finals, table))
         for st, at, inside in zip(states, part.flat, part.inside, strict=True):
             for total, x in zip(carried, st["carried"], strict=True):
@@ -468,6 +468,38 @@ class Compositor:
         first = 3 if channels.color else 0
         for k in range(channels.channels):
             dr.scatter(out["features"], d["sum"][first + k], at * self.width + channels.first + k, inside)
+
+
+class Composite(dr.CustomOp):
+    """`Compositor.forward` as one differentiable operation of Dr.Jit.
+
+    `dr.custom(Composite, compositor, *arguments, keep)`; `keep` says whether a derivative may follow.
+    """
+
+    def eval(
+        self,
+        compositor: Compositor,
+        record: list[Float],
+        sh: Float | None,
+        features: Float | None,
+        carried: list[Float],
+        keep: bool,
+    ) -> dict:
+        """The images, as Dr.Jit asks for them."""
+        self.compositor = compositor
+        return compositor.forward(record, sh, features, carried, keep)
+
+    def backward(self) -> None:
+        """Gradients of the arguments from those of the images, in Dr.Jit's reverse mode."""
+        for name, x in self.compositor.adjoint(self.grad_out()).items():
+            self.set_grad_in(name, x)
+
+    def forward(self) -> None:
+        """The tangent of the images from that of the arguments, in Dr.Jit's forward mode."""
+        c = self.compositor
+        tangent = {name: self.grad_in(name) for name in c.buffers}
+        carried = self.grad_in("carried") if c.carried else []
+        self.set_grad_out(c.tangents([tangent], [carried])[0])
 
 
 def _emit_weights(part: Part, buffer: Float | None, visibility: Float | None = None) -> Emit | None:

@@ -25,7 +25,7 @@ import drjit as dr
 
 from drgs.tracing.arrays import Float, Mask, UInt32
 from drgs.tracing.harmonics import sh_color
-from drgs.tracing.hit_table import Table, passed
+from drgs.tracing.hit_table import Table, replayed_hit
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_packed, packed_size
@@ -161,7 +161,7 @@ class Adjoint:
                 a0 = dr.detach(a)
                 (s,) = self.terms(number, values, depth, place, ok)
                 if self.table is None:
-                    T, w, (behind,), new = passed(self.finals[number], st, a0, [s], place, ok)
+                    T, w, (behind,), new = replayed_hit(self.finals[number], st, a0, [s], place, ok)
                 else:
                     T, w, (behind,), ok = self.table.read(place, a0)
                     new = dict(st)
@@ -193,7 +193,7 @@ class Tangent:
         slots: Entries of a record that they hold.
         tangents: K dicts of buffers laid out like those of `channels.buffers` besides the records.
         carried: Per shared ray and tangent, the tangent of what the ray carries.
-        emits: Per tangent, told of that of every weight like `Primal.emit`; None or empty without.
+        emits: Per tangent, what is told of that of every weight, as `Primal.emit` of the weight; None or empty without.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class Tangent:
         return state
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
-        """As Primal.shade, with the tangents."""
+        """What `Primal.shade` does, with the tangents."""
         m, lib = self.m, self.m.lib
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         # Nothing of the loop is recorded; `_slopes` and `_moved_values` differentiate on their own.

@@ -31,10 +31,11 @@ class Field:
     """The raw fields of a scene's Gaussians at one time, as a function of the scene's parameters.
 
     Args:
-        time: Of the view.
-        names: Of the fields that are wanted.
+        scene: What is deformed.
+        time: Time of the view; None where the parameters have it.
+        names: Names of the fields that are wanted.
         shift: (3,) that is taken from the means: the call's own origin; None for no shift.
-        fixed: Those of the scene's parameters that nothing is differentiated by, as they are no floats.
+        fixed: Parameters of the scene that are no floats, by which nothing is differentiated.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Field:
         return wrapped(lambda some: self.values({**still, **some}), self.seen)(moving)
 
     def values(self, parameters: _Tensors) -> _Tensors:
-        """The same in torch; `time` among the parameters is that of the view, as a scalar."""
+        """The fields in torch; `time` among the parameters is that of the view, as a scalar."""
         given = {**self.fixed, **parameters}
         fields = self.scene.deform(given, given.pop("time", self.time)).parameters()
         if self.shift is not None:
@@ -72,7 +73,7 @@ def wrapped(function: Callable[[_Tensors], _Tensors], seen: _Tensors | None = No
     """A torch function of tensors by name as a function of Dr.Jit tensors by name, by `dr.wrap`.
 
     Args:
-        function: By operations that torch differentiates in both modes.
+        function: What is wrapped, made of operations that torch differentiates in both modes.
         seen: What it returns, where that is known already; if empty it is filled.
     Returns:
         Differentiated by Dr.Jit in both modes; backward any number of times.
@@ -91,7 +92,7 @@ def wrapped(function: Callable[[_Tensors], _Tensors], seen: _Tensors | None = No
 
 
 def _dual(x: torch.Tensor) -> torch.Tensor:
-    """With a tangent, be it 0: `dr.wrap` takes that of every output."""
+    """The tensor with a tangent, be it 0: `dr.wrap` reads that of every output."""
     value, tangent = torch.autograd.forward_ad.unpack_dual(x)
     return x if tangent is not None else torch.autograd.forward_ad.make_dual(value, torch.zeros_like(value))
 
@@ -115,6 +116,7 @@ class _Kept(torch.autograd.Function):
         for x in ctx.values:
             x.grad = None
         if ctx.graph is None:
+            # Leaves of their own: the graph that is kept ends here, whatever made the values.
             leaves = [x.detach().requires_grad_() for x in ctx.values]
             with torch.enable_grad():
                 ctx.graph = leaves, tuple(ctx.function(dict(zip(ctx.names, leaves, strict=True))).values())

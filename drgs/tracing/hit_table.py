@@ -19,14 +19,15 @@ from drgs.tracing.kernels import Channels, HitModel
 from drgs.tracing.primitives import Ray
 from drgs.tracing.walk import Part
 
-__all__ = ["Replayed", "Table", "by_lists", "passed"]
+__all__ = ["Replayed", "Table", "along_lists", "replayed_hit"]
 
 
 class Replayed(Protocol):
     """A derivative that depends on the order by what lies in front of a hit and behind it.
 
     Attributes:
-        m, channels: Of the primal pass.
+        m: Says what a hit is.
+        channels: What the primal pass composited.
         finals: Per shared ray, its final state.
     """
 
@@ -38,7 +39,7 @@ class Replayed(Protocol):
         """Float64 sums along shared ray k, of which each hit takes its part."""
 
     def terms(self, k: int, values: list[Float], depth: Float, place: list, ok: Mask) -> list[Float]:
-        """Of each sum, what a hit's weight is multiplied by; values: its channels."""
+        """What a hit's weight is multiplied by in each sum; `values` are the channels of the hit."""
 
 
 class Table:
@@ -46,7 +47,7 @@ class Table:
 
     Args:
         part: Rays in the order of the lists of tiles, by which it is read.
-        count: Of the numbers that say what lies behind.
+        count: How many numbers say what lies behind.
     """
 
     def __init__(self, lib: Lib, part: Part, count: int) -> None:
@@ -63,8 +64,8 @@ class Table:
         return list(dr.gather(self.lib.ArrayXf, self.array, slot, active, shape=(self.count, dr.width(slot))))
 
     def read(self, place: list, a: Float) -> tuple[Float, Float, list[Float], Mask]:
-        """Of a hit of opacity `a` whose place begins with what was loaded: T, its weight, what lies behind it, and
-        whether it is one.
+        """T in front of a hit of opacity `a`, its weight, what lies behind it, and whether it is one; its place begins
+        with what was loaded.
         """
         T, *behind = place[0]
         return T, T * a, behind[: self.numbers - 1], T > 0
@@ -72,7 +73,7 @@ class Table:
     def if_any_hit(
         self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask, take: Callable
     ) -> list[dict]:
-        """As `derivatives.if_any_hit`, without looking at the Gaussian."""
+        """What `derivatives.if_any_hit` does, without looking at the Gaussian."""
         hits = self.lib.Bool(False)
         loaded = []
         for k, (st, place) in enumerate(zip(states, places, strict=True)):
@@ -88,30 +89,30 @@ class Table:
         )
 
 
-def by_lists(
+def along_lists(
     lib: Lib, part: Part, finals: list[dict], count: int | None, kernel: Callable[[Part, list[dict]], Replayed]
 ) -> tuple[Part, list[dict], Table | None]:
     """What a derivative walks of a part: its rays with their final states; in place of rays along rows of their own
     hits the same ones along the lists of tiles, with a table.
 
     Args:
-        count: Of the numbers that say what lies behind a hit; None: no table, all rays as they are.
+        count: How many numbers say what lies behind a hit; None: no table, all rays as they are.
         kernel: Part, final states -> what says how these numbers are summed up.
     """
     if count is None or part.in_lists is None:
         return part, finals, None
     table = Table(lib, part.in_lists(), count)
-    dr.eval(part.run(Behind(kernel(part, finals), part, table)), table.array)
+    dr.eval(part.run(_TableFiller(kernel(part, finals), part, table)), table.array)
     return table.part, [], table
 
 
-class Behind:
+class _TableFiller:
     """Replay of a primal pass in exact order that fills a table.
 
     Args:
-        kernel: Takes the derivative afterwards; says what is summed up along a ray.
-        part: Whose rays they are, in the table's tiles.
-        table: That is filled.
+        kernel: Takes the derivative afterwards, and says what is summed up along a ray.
+        part: Rays that are replayed, in the table's tiles.
+        table: The table that is filled.
     """
 
     def __init__(self, kernel: Replayed, part: Part, table: Table) -> None:
@@ -139,19 +140,19 @@ class Behind:
         loaded: Any = kernel.channels.load(self.m.lib, index, ray, going)
         a, depth, ok = self.m.hit(loaded["record"], ray, going)
         terms = kernel.terms(0, kernel.channels.values(self.m, loaded, ray), depth, place, ok)
-        T, _, behind, new = passed(kernel.finals[0], st, a, terms, place, ok)
+        T, _, behind, new = replayed_hit(kernel.finals[0], st, a, terms, place, ok)
         numbers = [T, *behind, *[self.m.lib.Float(0)] * (table.count - table.numbers)]
         dr.scatter(table.array, self.m.lib.ArrayXf(numbers), self.part.slot(0, place), ok)
         return [new]
 
 
-def passed(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok: Mask) -> tuple:
+def replayed_hit(final: dict, st: dict, a: Float, terms: list[Float], place: list, ok: Mask) -> tuple:
     """A hit of opacity `a` replayed: T in front of it, its weight, what lies behind it and the new state of the ray.
 
     Args:
         final: State of the ray after the primal pass.
         st: State with `T`, `alive` and `rest`, a Float64 for each term.
-        terms: Of each sum along the ray, what the hit's weight is multiplied by.
+        terms: What the hit's weight is multiplied by in each sum along the ray.
     """
     T = st["T"]
     left = 1 - a

@@ -57,7 +57,7 @@ class SeenColor(NamedTuple):
     """The color of each Gaussian in a view, evaluated towards its mean, in float32.
 
     Attributes:
-        direction: From the camera to the mean, unit length, world axes.
+        direction: Unit vector from the camera to the mean, world axes.
         inverse: 1 / distance of the mean; 0 for a mean at the camera center, which has no direction.
         basis: SH basis at the direction.
         rgb: max(0.5 + SH, 0); differentiated by the coefficients and, through the direction, by mean and pose.
@@ -78,7 +78,7 @@ class Activated:
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix, of the re-centered world of the means.
         settings: Cut-offs of the render.
         count: N.
-        at_most_alpha: As of the `Response`: no hit of it has more than alpha exp(-rho^2 / 2).
+        at_most_alpha: No hit of the response has more opacity than alpha exp(-rho^2 / 2).
     Attributes:
         mean, quat, scale, opacity: Activated parameters, columns (N,).
         logit, e: Raw opacity, and exp(-|logit|), which activations of it are formed from.

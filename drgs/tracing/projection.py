@@ -55,6 +55,7 @@ def project_screen(
     iz = dr.select(front, 1 / dr.select(front, zd, 1), 0)
     px = dr.select(front, fx * (cd[0] * iz) + skew * (cd[1] * iz) + cx, cx)
     py = dr.select(front, fy * (cd[1] * iz) + cy, cy)
+    # Into the image: around an anchor far outside, the record would lose digits at the pixels that are looked at.
     ax = dr.clip(dr.floor(px), 0, width - 1) + 0.5
     ay = dr.clip(dr.floor(py), 0, height - 1) + 0.5
     shape, bounds, alive, frame = response.project(g, Screen(pinhole, width, height, ax, ay))

@@ -26,12 +26,12 @@ W_RGB = 14
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
-    """Of two lists of three."""
+    """Dot product of two lists of three."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Sequence[Float], b: Sequence[Float]) -> list[Float]:
-    """Of two lists of three."""
+    """Cross product of two lists of three."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 

@@ -22,16 +22,16 @@ from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, word_of
 from drgs.tracing.walk import ListStream, Part
 from drgs.tracing.weights import PIXELS, signed
 
-__all__ = ["Room", "SortedHits", "SortedRows"]
+__all__ = ["MemoryBudget", "SortedHits", "SortedRows"]
 
 _TILES = 64  # that a thread sorts at a time
 
 
-class Room:
+class MemoryBudget:
     """Memory that orders may be held in.
 
     Attributes:
-        left: Bytes.
+        left: Bytes that are not taken yet.
     """
 
     def __init__(self, left: int) -> None:
@@ -48,11 +48,11 @@ class SortedHits:
     """The hits of the pixels of some tiles, found and sorted when they are walked along (`opened`).
 
     Args:
-        in_lists: Makes a part with these pixels, four a lane, along the lists of the tiles.
+        in_lists: Function that makes a part with these pixels, four a lane, along the lists of the tiles.
         index: (entries,) Gaussians of all lists; of the same key the first entry is the nearer hit.
         lengths: (tiles,) of the lists of these tiles.
         cut: (tiles,) what is taken off the squared extents, or None.
-        room: To hold the order in once it is known.
+        budget: Memory to hold the order in once it is known.
     """
 
     def __init__(
@@ -62,13 +62,13 @@ class SortedHits:
         index: UInt32,
         lengths: torch.Tensor,
         cut: Float | None,
-        room: Room,
+        budget: MemoryBudget,
     ) -> None:
         self.lib = lib
         self.in_lists = in_lists
         self.index = index
         self.lengths = lengths
-        self.room = room
+        self.budget = budget
         self.cut = cut
         self.held: SortedRows | None = None
 
@@ -78,7 +78,7 @@ class SortedHits:
             return self.held
         words, start, count = self._sorted()
         total = int(dr.sum(self.lib.UInt64(count))[0])
-        if self.room.take(4 * total):
+        if self.budget.take(4 * total):
             # The entries alone, one row behind the other: a fraction of what the words take.
             first = dr.cumsum(count) - count
             entries = self._entries(words, start, count, first, total)
@@ -151,9 +151,9 @@ class _Finder:
     """Writes the word of every hit into the row of its pixel; a `Kernel`.
 
     Args:
-        part: Whose rays they are.
-        words: Of all rows.
-        starts: Per shared ray, of its row.
+        part: Rays that look for hits.
+        words: Buffer of all rows.
+        starts: Per shared ray, where its row starts.
         cut: What is taken off the squared extents.
     """
 
@@ -201,10 +201,11 @@ def _sort(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor) -> N
 
 
 def _sort_at_once(words: torch.Tensor, lengths: torch.Tensor) -> None:
-    """By words, then, stably, by rows."""
+    """Sort by words, then, stably, by rows: cards sort one long array faster than many short ones."""
     row = torch.arange(PIXELS * len(lengths), device=words.device)
     row = row.repeat_interleave(lengths.repeat_interleave(PIXELS))
     used = words[: len(row)]
+    # The stable second sort keeps the order of the first within each row.
     order = torch.sort(used).indices
     used.copy_(used[order[torch.sort(row[order], stable=True).indices]])
 

@@ -28,6 +28,7 @@ def word_of(lib: Lib, key: Float, name: UInt32) -> Float:
 
 def positive(lib: Lib, x: Float) -> Float:
     """A number >= 0 that orders like x, of either sign, up to the last bit of x."""
+    # Infinities and what is near them would have the bits of NaN, whose comparisons are all false.
     bits = dr.reinterpret_array(lib.UInt32, dr.clip(x, -1e37, 1e37))
     sign = lib.UInt32(0x80000000)
     return dr.reinterpret_array(lib.Float, dr.select((bits & sign) != 0, ~bits, bits | sign) >> 1)

@@ -25,7 +25,7 @@ from drgs.tracing.kernels import HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
-from drgs.tracing.rows import Room, SortedHits
+from drgs.tracing.rows import MemoryBudget, SortedHits
 from drgs.tracing.sort_keys import ascending
 from drgs.tracing.walk import ListStream, Part, Slots
 from drgs.tracing.weights import PIXELS, Weights, signed
@@ -48,7 +48,7 @@ class TileTraversal:
 
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
-        trimmed: In `ray` order, leave tails out whose opacities add up to `_TAILS` at most in a pixel.
+        trimmed: Leave tails out, in `ray` order, whose opacities add up to `_TAILS` at most in a pixel.
     """
 
     world = False
@@ -85,7 +85,7 @@ class TileTraversal:
         size = self.width, self.height
         self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed)
         self.certificate["pairs"] = self.lists.pairs
-        self.room = Room(_HELD if replayed else 0)
+        self.budget = MemoryBudget(_HELD if replayed else 0)
         if self.settings.order == "ray":
             self.certificate |= {"rays": self.rays, "redone": 0}  # rows hold every hit
 
@@ -133,7 +133,7 @@ class TileTraversal:
         cut = None if self.lists.cut is None else dr.gather(lib.Float, self.lists.cut, tiles)
         # Hits are found four pixels a lane; derivatives that carry an SH basis of each pixel would not fit registers.
         found_by = functools.partial(self._band_in_lists, band, 4)
-        hits = SortedHits(lib, found_by, self.lists.index, band.lengths, cut, self.room)
+        hits = SortedHits(lib, found_by, self.lists.index, band.lengths, cut, self.budget)
         in_lists = functools.partial(self._band_in_lists, band, 1 if self.basis else 4)
         return self._band_in_lists(band, share, hits, in_lists, weights)
 
@@ -384,7 +384,7 @@ def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
 
 
 class _Tiles:
-    """Of pairs of a Gaussian and a tile: whether there is a pixel center that may be hit.
+    """Whether a Gaussian may hit a pixel center of a tile, for pairs of these.
 
     Args:
         loaded: The first entries of each lane's record.
@@ -403,7 +403,7 @@ class _Tiles:
             self.limit = dr.minimum(self.limit, needed + 1e-4 * abs(needed) + 1e-4)
 
     def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
-        """Of tile (x, y), from the anchor."""
+        """Center of tile (x, y) from the anchor, in pixels."""
         at = (self.lib.Float(v) + 0.5 for v in (x, y))
         dx, dy = (v * TILE - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
         return dx, dy

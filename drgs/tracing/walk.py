@@ -43,7 +43,7 @@ class ListStream:
 
     Args:
         index: (entries,) Gaussians.
-        start, end: Per lane.
+        start, end: (lanes,) first entry of each lane, and that behind its last.
     """
 
     def __init__(self, lib: Lib, index: UInt32, start: UInt32, end: UInt32) -> None:
@@ -89,7 +89,7 @@ class Part:
 
     Args:
         lib: Dr.Jit types of the backend.
-        model: Says what a hit is.
+        model: The formula of a hit.
         records: Flat record buffer of the view.
         rays: One or four a lane, all of which walk along the same stream.
         flat: Per shared ray, the pixel (row-major index) it belongs to.
@@ -99,11 +99,11 @@ class Part:
         center_key: (N,) order keys of Gaussians that are sorted by their centers; None where a ray's own order counts.
         buffer: Number of hits that a ray is sorted among.
         first: These rays were not walked before, with a shorter buffer.
-        slots: Where an entry and a pixel stand in tables, of rays through tiles; None for others. A hit's place is then
+        slots: Places of entries and pixels in tables, for rays through tiles; None for others. A hit's place is then
             where it stands in the ray's row and in the tile's list.
-        in_lists: Makes a part with the same rays along the lists of their tiles; of rays that walk along rows of
-            their own hits.
-        weights: Where the weights of these rays are held; None where they are not.
+        in_lists: For rays that walk along rows of their own hits, makes a part with the same rays along the lists of
+            their tiles.
+        weights: Holds the weights of these rays; None where they are not held.
     Attributes:
         failed: After a primal pass of rays that sort: lanes whose buffer was too short.
     """
@@ -189,7 +189,7 @@ class Part:
         return [part] if count >= _MANY and self.buffer < _DEEP else part._listed(count)
 
     def _listed(self, count: int) -> list[Part]:
-        """The same rays along sorted lists."""
+        """Parts with the same rays along sorted lists of all their hits."""
         lib = self.lib
         with dr.suspend_grad():  # lists say what to look at, and in which order: neither has a derivative
             hits = self._each_hit(count, lambda *hit: None)
@@ -339,9 +339,9 @@ class Traversal(Protocol):
         """Build lists or proxies from the record buffer.
 
         Args:
-            model: Says what a hit is.
+            model: The formula of a hit.
             records: Flat record buffer.
-            carried: Per-ray floats, `basis` of them an SH basis.
+            carried: Floats a ray, `basis` of them an SH basis.
             basis: Number of SH basis values.
             replayed: Derivatives follow: what they need again may be held.
         """

@@ -72,7 +72,7 @@ class Weights:
     def __init__(self, lib: Lib, index: torch.Tensor, lengths: torch.Tensor, pixels: torch.Tensor) -> None:
         self.lib = lib
         self.lengths = lengths
-        self.pixels = pixels.clamp_min(0)
+        self.pixels = pixels.clamp_min(0)  # any pixel will do outside, where nothing is added
         self.inside = pixels >= 0
         self.index = torch.cat([index, index.new_zeros(1)])  # of the row that is 0, too
         self.rows = len(index)
@@ -140,6 +140,7 @@ class Weights:
 
         def body(k: UInt32, total: Float) -> tuple[UInt32, Float]:
             at = dr.gather(lib.UInt32, rows, k) * PIXELS + lane % PIXELS
+            # The adjoint subtracts these products again, hit by hit: what float32 left would be all that remains.
             w, s = (lib.Float64(dr.gather(lib.Float, x, at)) for x in (buffer, scalars))
             return k + 1, dr.fma(w, s, total)
 
@@ -163,6 +164,7 @@ class Weights:
         if self._groups is not None and self._width == width:
             return self._groups
         starts, ends = self._bounds()
+        # Stable: how tiles are grouped decides how sums are split, which must not change from run to run.
         counts, tiles = torch.sort(ends - starts, descending=True, stable=True)
         touched = torch.cat([self._touched, self._touched.new_full((1,), self.rows)])
         ascending = counts.flip(0)
@@ -221,10 +223,10 @@ def _matrix(buffer: Float) -> torch.Tensor:
 
 
 def signed(x: UInt32) -> torch.Tensor:
-    """In torch, which knows few operations of unsigned integers."""
+    """The same bits as int32 in torch, which knows few operations of unsigned integers."""
     return x.torch().view(torch.int32)
 
 
 def _unsigned(lib: Lib, x: torch.Tensor) -> UInt32:
-    """In Dr.Jit."""
+    """Numbers >= 0 of torch as unsigned integers of Dr.Jit."""
     return lib.UInt32(lib.Int32(x.to(torch.int32)))

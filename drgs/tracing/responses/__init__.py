@@ -21,7 +21,7 @@ class Response(Protocol):
     Attributes:
         planar: The response is a model of the image plane: tiles, order `center` and pinhole cameras only.
         front_only: Peaks behind the origin of a ray do not count.
-        at_most_alpha: Where rho^2 is, the opacity of a hit is at most alpha exp(-rho^2 / 2).
+        at_most_alpha: No hit has more opacity than alpha exp(-rho^2 / 2).
         extra: Floats a Gaussian that `slopes` needs besides the record (`extras`).
         by_tangents: These floats are tangents of the record, not closed forms.
     """
@@ -55,7 +55,7 @@ class Response(Protocol):
         """rho^2, t* (the order key) and u = t* |d'| (None where `opacity` does not need it) of a ray."""
 
     def opacity(self, x: Float, u: Float | None) -> Float:
-        """Of a hit, from x = strength exp(-rho^2 / 2)."""
+        """Opacity of a hit, from x = strength exp(-rho^2 / 2)."""
 
     def slopes(self, r: list[Float], extra: list[Float], ray: Ray, world: bool) -> list[Float]:
         """d opacity / d (mean 3, rotation 3, log-scale 3, log strength)."""

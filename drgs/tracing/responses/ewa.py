@@ -133,6 +133,7 @@ def _clamped(tx: Float, ty: Float, screen: Screen, fov_clamp: str) -> tuple[Floa
         low_x = cx / fx + 0.3 * half_x
         high_y = (screen.height - cy) / fy + 0.3 * half_y
         low_y = cy / fy + 0.3 * half_y
+    # Both rasterizers' gradients are 0 where it is clamped, as a clip's is.
     return dr.clip(tx, -low_x, high_x), dr.clip(ty, -low_y, high_y)
 
 

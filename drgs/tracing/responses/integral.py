@@ -78,7 +78,7 @@ class Integral(Peak):
         return [*(dr.fma(across, x, along * y) for x, y in zip(du, approach(extra, p), strict=True)), along]
 
     def least_strength(self, alpha_min: float) -> float:
-        """At most all of the density lies in front: W <= 1."""
+        """What it takes where all of the density lies in front, W = 1, which is the most there can be."""
         return -math.log1p(-alpha_min)
 
 

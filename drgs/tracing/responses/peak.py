@@ -222,15 +222,20 @@ def approach(extra: list[Float], p: list[Float]) -> list[Float]:
 
 
 def times(extra: list[Float], which: int, x: list[Float]) -> list[Float]:
-    """In world axes R S^-1 (0) times a vector in the stored axes; in local axes 1 (1) times one; in world axes R (S x x
-    S^-1 y) (2), from (x_2 y_3, x_3 y_1, x_1 y_2) in local axes, y = x or the sum of it both ways round.
+    """One of the three matrices of `Peak.extra` times x.
+
+    Args:
+        extra: Columns of `Peak.extras`.
+        which: 0: R S^-1, from the stored axes to world axes. 1: the stored axes to local ones. 2: R (S x x S^-1 y) in
+            world axes, from the products (x_2 y_3, x_3 y_1, x_1 y_2) in local axes, y = x or their sum both ways round.
+        x: Three floats.
     """
     m = extra[6 + 9 * which : 15 + 9 * which]
     return [m[3 * r] * x[0] + m[3 * r + 1] * x[1] + m[3 * r + 2] * x[2] for r in range(3)]
 
 
 def _on_screen(r: list[Float], ray: Ray) -> tuple[Float, Float, list[Float], Float]:
-    """Of a pinhole ray: the two parts of o' x d', d' in its own frame, and 1 / |d'|^2."""
+    """The two parts of o' x d' of a pinhole ray, d' in its own frame, and 1 / |d'|^2."""
     L = layout
     dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
     c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
@@ -246,7 +251,7 @@ def _direction(r: list[Float], dx: Float, dy: Float) -> list[Float]:
 
 
 def _local(r: list[Float], ray: Ray) -> tuple[Float, list[Float], list[Float], Float]:
-    """Of a ray o + t d in the world: t0, w = (o - mu) + t0 d and d in the local frame, and 1 / |d'|^2.
+    """t0 of a ray o + t d in the world, w = (o - mu) + t0 d and d in the local frame, and 1 / |d'|^2.
 
     t0, where the ray is nearest to the mean, only moves the point about which the local frame is expanded, so that what
     is rounded is as small as the Gaussian's distance from the ray.
