@@ -5,7 +5,7 @@ noise on every channel), l the prior's precision lambda, in the inverse squared 
 a dict group -> tensor with one entry a parameter, as `drgs.fisher.diagonal` returns it. docs/information.md says what
 the criteria mean, and where others publish something else under the same names.
 
-References:
+Reference:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771: `eig`, section 3.3.
     [2] Jiang et al., FisherRF, ECCV 2024: `eig` of a diagonal, lambda = 1e-6.
     [3] Wilson et al., POp-GS, CVPR 2025: `logdet` ("D-opt"), `trace_cov` ("T-opt"), one block a Gaussian.
@@ -156,6 +156,7 @@ def variances(train: Information, prior: Prior | None = None) -> dict[str, torch
     lambdas = (prior or Prior()).per_group(train)
     result = {}
     for name, H in train.items():
+        # float64: lambda = 1e-6 beside an H of 1e4 would vanish in float32.
         precision = H.to(torch.float64) + lambdas[name]
         # 1 / 0 would be inf and inf * 0 NaN; a variance of 0 drops the parameter from every criterion.
         result[name] = torch.where(precision > 0, precision.reciprocal(), 0.0)

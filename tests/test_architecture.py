@@ -44,7 +44,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"information"}, "what a view's pixels say about each parameter: groups, Jacobian, replay"),
     ({"fisher"}, "information of views, for users"),
     (
-        {f"information.{x}" for x in ("blocks", "cache", "pool", "greedy", "combine", "spacetime")},
+        {f"information.{x}" for x in ("blocks", "cache", "pool", "greedy", "combine")},
         "choosing views by it",
     ),
     ({"policies"}, "what chooses, by information or by poses"),

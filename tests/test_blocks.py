@@ -109,6 +109,8 @@ def test_a_block_is_one_row(world):
     assert list(H) == [*BLOCKS["geometry"].groups, "brightness"]
     maps = blocks.variance_maps(cams[0], {name: torch.ones_like(x) for name, x in H.items()})
     assert float(maps["brightness"].double().sum()) == pytest.approx(squares[0], rel=1e-5)
+    weights = {name: torch.ones_like(x) for name, x in H.items()}
+    assert torch.equal(blocks.variance_map(cams[0], weights), maps["geometry"] + maps["brightness"])
     assert "brightness" not in select(g, cams[2:], cams[:2], 1, settings=FAST).blocks  # counts where it is named
     with pytest.raises(ValueError, match="groups must be of blocks geometry, got brightness; add its block or drop it"):
         select(g, cams[2:], cams[:2], 1, settings=FAST, blocks=("geometry",), groups=("means", "brightness"))

@@ -10,8 +10,7 @@ import torch
 from drgs import fisher
 from drgs.display import pictures
 from drgs.information.blocks import add
-from drgs.information.maps import fisherrf_map
-from drgs.information.moments import moments_map
+from drgs.information.maps import fisherrf_map, moments_map
 from drgs.integrator import render
 
 if TYPE_CHECKING:

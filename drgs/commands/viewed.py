@@ -175,7 +175,7 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
     return Uncertainty(
         cameras,
         lambda camera: together(blocks.information(camera)),
-        lambda camera, weights: sum(x.numpy() for x in blocks.variance_maps(camera, weights).values()),
+        lambda camera, weights: blocks.variance_map(camera, weights).numpy(),
         prior,
     )
 

@@ -139,8 +139,8 @@ def opacity_of(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.
 def _open(opacity: torch.Tensor) -> torch.Tensor:
     """(H, W) float64: (1 - alpha)^2.
 
-    In float64, where 1 - alpha of a float32 alpha is exact. Sums of compositing exceed 1 by rounding, to 1 + 1e-6:
-    clamped, so that no pixel is more open the more it is covered.
+    In float64, where 1 - alpha of a float32 alpha is exact. A sum of weights may exceed 1 by rounding: clamped, so that
+    no pixel is more open the more it is covered.
     """
     return (1 - opacity.double().cpu()).clamp(min=0).square()
 

@@ -15,6 +15,7 @@ Information of different views, and of different blocks of one view, adds up (`a
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -429,6 +430,10 @@ class SceneBlocks:
                 )
                 for name, one in self._apart()
             }
+
+    def variance_map(self, camera: Camera, weights: Information) -> torch.Tensor:
+        """(H, W) float32 map of all blocks together; see `variance_maps`."""
+        return functools.reduce(torch.add, self.variance_maps(camera, weights).values())
 
     def _apart(self) -> list[tuple[str, BlockQuestion]]:
         """What a view is asked for each block alone."""

@@ -90,11 +90,12 @@ def by_columns(
         wanted: Groups: the Gaussians', or with `scene` the scene's own.
         weights: Inverse noise variances of R, G and B.
         semantics: The metric of the features, if these tell about the geometry.
-        scene: That the Gaussians come from.
+        scene: The scene that the Gaussians come from.
         mask: (H, W) what the image is multiplied by; None: 1.
     """
     result = {}
     scale = torch.tensor(weights, dtype=torch.float64)
+    # A mask is a number, whatever graph it is in; sums of squares of all pixels are float64, as everywhere here.
     factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
     for name, group in wanted.items():
         shape = group.tangent(gaussians)

@@ -113,7 +113,11 @@ class Rows:
         self.colors = buffer is not None or (sink is not None and sink.needs_color)
 
     def rest(self, k: int) -> list[Float]:
-        """The whole sum of each channel of shared ray k; none without geometry."""
+        """The whole sum of each channel of shared ray k; none without geometry.
+
+        In float64: what lies behind a hit is left of it by subtraction, and in float32 nothing were left of what many
+        hits in front of it have covered.
+        """
         final, D = self.finals[k], self.m.lib.Float64
         if self.buffer is None:
             return []

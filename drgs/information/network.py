@@ -18,7 +18,7 @@ The random signs are the same in each view. Then equal views say the same, a can
 ratio of at most 1 as it should, and a cache may keep what was estimated. 1 / H is too large on average by a factor of
 about K / (K - 2) where one view of K probes is all that is known of a parameter: take 8 or more.
 
-References:
+Reference:
     [1] Bekas, Kokiopoulou, Saad: An estimator for the diagonal of a matrix, 2007; Hutchinson 1990 for the trace.
     [2] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771, section 3.3.
 """
@@ -158,7 +158,7 @@ def network_variance_map(
             for name, root in roots.items():
                 tangents |= _unflat(groups[name], _signs(generator, count, len(root)) * root)
             total += view.push(tangents).square().sum((0, 2))
-    return (total / probes).float().reshape(camera.height, camera.width)
+    return (total / probes).float().reshape(camera.height, camera.width)  # a map, as `fisher.variance_map` gives it
 
 
 Groups = Mapping[str, Mapping[str, torch.Tensor]]  # group -> name -> parameter
@@ -188,7 +188,7 @@ class _View:
         semantics: SemanticMetric | None,
         mask: torch.Tensor | None = None,
     ) -> _View | None:
-        """Of a scene at the time of a camera; None if there is nothing to see."""
+        """A scene at the time of a camera; None if there is nothing to see."""
         with torch.no_grad():  # derivatives are taken from Dr.Jit's side
             seen = gaussians_at(where, scene, camera)
         check_view(where, seen, camera, settings)
@@ -207,8 +207,9 @@ class _View:
             seen = reduced.reduced(seen)
             scales = torch.cat([scales, torch.full((directions.shape[1],), semantics.weight**0.5)])
         settings = settings or RenderSettings.preset("exact")
-        if mask is not None:
+        if mask is not None:  # a number, whatever graph it is in
             scales = mask.detach().double().cpu().reshape(-1, 1) * scales
+        # Detached: Dr.Jit differentiates through `deformed`, of which these are only the values now.
         return cls(Call(seen.detach(), camera, settings, frozenset(), scene=deformed), scales)
 
     @property
@@ -222,7 +223,7 @@ class _View:
 
     def pulled(self, pull: Pullback, groups: Groups, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """Group -> (P,) slopes along (pixels, C) rows."""
-        scaled = (rows * self.scales).float()
+        scaled = (rows * self.scales).float()  # as cotangents of images are
         slopes = pull(scaled[:, :3], scaled[:, 3:] if self.rows > 3 else None)
         return {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
 

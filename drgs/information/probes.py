@@ -48,12 +48,14 @@ def by_probes(
     other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
     groups = {name: group for name, group in groups.items() if name not in other}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
-    # Without a graph of torch, as in `Replay`.
+    # Detached: information is a number, and its derivatives are taken by Dr.Jit. Features that nobody asks about would
+    # be composited for nothing.
     seen = gaussians.detach() if semantics else gaussians.detach().replace(features=None)
     call = Call(seen, camera, settings, frozenset(), scene=scene)
     generator = torch.Generator().manual_seed(seed)
     pull = Pullback(call, [group.input for group in groups.values()])
     root = torch.tensor(weights).sqrt()
+    # float32, as cotangents of images are; squares of the slopes are summed in float64.
     factor = torch.ones(1, 1) if mask is None else mask.detach().float().cpu().reshape(-1, 1)
     for _ in range(probes if groups else 0):
         sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1

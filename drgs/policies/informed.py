@@ -129,6 +129,6 @@ class _Moments:
     settings: RenderSettings
 
     def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        from drgs.information.moments import moments_map  # loads Dr.Jit, which other policies need not have
+        from drgs.information.maps import moments_map  # loads Dr.Jit, which other policies need not have
 
         return {"moments": moments_map(scene.at(camera.time), camera, self.settings).double().mean()}

@@ -132,7 +132,7 @@ def maps(
         weights = variances(total, MAP_PRIOR)
         for name, camera in shown.items():
             plain = colors_only(scene, camera.time)
-            variance = torch.stack([*blocks.variance_maps(camera, weights).values()]).sum(0).numpy()
+            variance = blocks.variance_map(camera, weights).numpy()
             with torch.no_grad():  # a picture
                 alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
             bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
