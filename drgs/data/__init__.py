@@ -1,6 +1,4 @@
-"""Data sets: `drgs.data.load(path)` finds out which format a folder has and returns a
-`Dataset`.
-"""
+"""Data sets: `drgs.data.load(path)` finds out which format a folder has, and returns a `Dataset`."""
 
 from __future__ import annotations
 
@@ -103,7 +101,7 @@ def load(
             held out.
         strict: Refuse a data set that lists images which are not there. By default at least 3 must be left; the
             missing ones are named in the log and held in `Dataset.absent`.
-        semantics: Look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
+        semantics: Look for a teacher's maps and for labels (`drgs.data.sidecars`); False leaves them alone.
         times: How many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
             if there are no more; `Dataset.frames` says which. D-NeRF's photographs are all used.
         test_cameras: Names of synchronous cameras that `Dataset.split` holds out at all times, which wins over

@@ -17,7 +17,7 @@ __all__ = ["Format"]
 class Format:
     """How data sets of one format are told from others, and read.
 
-        CAMERAS_TXT = Format(lambda path: (path / "cameras.txt").is_file(), load_lines, ("cameras.txt",))
+        LINES = Format(lambda path: (path / "views.txt").is_file(), load_lines, looks_for=("views.txt",))
 
     Attributes:
         recognizes: Whether a folder, or a file that was named itself, is such a data set; it opens no images. Formats

@@ -26,8 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 def lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the
-    photo did not see.
+    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the photo did not see.
 
     Raises:
         ValueError: The photo saw next to nothing of its own undistorted image.

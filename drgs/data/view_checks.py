@@ -129,9 +129,9 @@ def check_times(dataset: Dataset) -> None:
             f"{dataset.path}: every view of a scene that moves must have a time, {len(without)} have none (as view "
             f"{without[0]!r}); state all, or remove all for a scene that stands still"
         )
-    first = min(view.camera.time for view in train)
-    last = max(view.camera.time for view in train)
-    beyond = [view.name for view in test if not first <= view.camera.time <= last]
+    times = [view.camera.time for view in train if view.camera.time is not None]
+    first, last = min(times), max(times)
+    beyond = [view.name for view in test if view.camera.time is not None and not first <= view.camera.time <= last]
     if beyond:
         _log.warning(
             "%d of the %d test views are before or after all training views (%g to %g), as %r: nothing says how things "

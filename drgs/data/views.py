@@ -81,8 +81,7 @@ class View:
         return dataclasses.replace(self, camera=camera, is_checked=True)
 
     def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
-        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted,
-        area-resized.
+        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted, area-resized.
 
         The result belongs to `camera.undistorted().resized(width, height)`.
 
@@ -118,25 +117,21 @@ class View:
     def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.
 
-        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask
-        file.
+        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask file.
         """
-        if self.mask_path is None and not (self.camera.is_distorted and lens_maps(self.camera)[2] is not None):
+        unseen = self._unseen()
+        if self.mask_path is None and unseen is None:
             return None
         if self.mask_path is None:
             data = np.ones((self.camera.height, self.camera.width), dtype=np.float32)
         else:
             data = self._nearest(read_mask(self.mask_path), self.mask_path)
-        if self.camera.is_distorted:
-            unseen = lens_maps(self.camera)[2]
-            if unseen is not None:
-                data = np.where(unseen, np.float32(0), data)
+        if unseen is not None:
+            data = np.where(unseen, np.float32(0), data)
         return resize_area(data, *self._size(width, height))
 
     def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is
-        no depth map.
-        """
+        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map."""
         import cv2
 
         if self.depth_path is None:
@@ -150,8 +145,8 @@ class View:
         data = raw.astype(np.float32) * np.float32(self.depth_scale)
         data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
         data = self._nearest(data, self.depth_path)
-        if self.camera.is_distorted and lens_maps(self.camera)[2] is not None:
-            data = np.where(lens_maps(self.camera)[2], np.float32(0), data)
+        if (unseen := self._unseen()) is not None:
+            data = np.where(unseen, np.float32(0), data)
         # Averaging depths across an edge, or with unknown zeros, would invent surfaces.
         return cv2.resize(data, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
@@ -173,8 +168,8 @@ class View:
             labels = self.semantics.numbered(raw, self.label_path)
         # OpenCV has no int64; float32 holds all numbers of 16 bits.
         labels = self._nearest(labels.astype(np.float32), self.label_path)
-        if self.camera.is_distorted and lens_maps(self.camera)[2] is not None:
-            labels = np.where(lens_maps(self.camera)[2], np.float32(0), labels)
+        if (unseen := self._unseen()) is not None:
+            labels = np.where(unseen, np.float32(0), labels)
         return cv2.resize(labels, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT).astype(np.int64)
 
     def teacher(self) -> torch.Tensor | None:
@@ -195,6 +190,10 @@ class View:
         if self.semantics is not None:
             self.semantics.check_map(values, self.teacher_path, self.camera)
         return undistorted_map(values, self.camera) if self.camera.is_distorted else values
+
+    def _unseen(self) -> np.ndarray | None:
+        """(H,W) bool: pixels of the undistorted image that the photo did not see; None if it saw all."""
+        return lens_maps(self.camera)[2] if self.camera.is_distorted else None
 
     def _size(self, width: int | None, height: int | None) -> tuple[int, int]:
         return width or self.camera.width, height or self.camera.height
