@@ -68,6 +68,10 @@ _SHOWN = 80  # characters of a name in messages
 class Camera:
     """One camera: intrinsics, pose, image size and lens. See the module text for conventions.
 
+        K = drgs.cameras.intrinsics(60.0, 60.0, 32.0, 24.0)
+        pose = drgs.cameras.look_at((3, 0, -1), target=(0, 0, 0), up=(0, -1, 0))
+        camera = drgs.Camera(K, pose, width=64, height=48)
+
     Attributes:
         K: (3,3) float64 intrinsics in pixels.
         w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that gradients reach it. A

@@ -111,6 +111,9 @@ def fit(
 ) -> FitResult:
     """Fit Gaussians to a data set and write a run folder.
 
+        result = drgs.fit(drgs.load_data("scene"), "runs/scene", drgs.FitConfig(max_steps=3000))
+        result.metrics["mean"]["psnr"]  # of the held-out views
+
     Args:
         dataset: Result of `drgs.data.load`.
         out_dir: The run folder: new, or with `resume` one that a fit of the same config has begun.

@@ -14,7 +14,7 @@ from test_times import Drift
 from test_train import FAST, config, dataset, random_rows, scene  # noqa: F401 (a fixture)
 
 from drgs.cameras import orbit
-from drgs.data.views import Dataset, View
+from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.files import load_ply, load_state, save_state
 from drgs.fitting.config import SelectionConfig

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.guards.arguments import check_fields
 from drgs.guards.records import Record, ways_of
-from drgs.information.choices import POLICY_NAMES
+from drgs.information.choices import POLICIES, check_named
 from drgs.information.prior import Prior
 from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings
@@ -372,9 +372,7 @@ class SelectionConfig(Record):
     where: ClassVar[str] = "active"
 
     def __post_init__(self) -> None:
-        if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
-            known = ", ".join(POLICY_NAMES)
-            raise ValueError(f"active: policy must be one of {known}, or package.module:function, got {self.policy!r}")
+        check_named("active", POLICIES, self.policy)
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         check_fields("active", self, dict.fromkeys(("initial", "add", "every", "info_pixels", "measure"), _COUNT))

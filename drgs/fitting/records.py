@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.files import CONFIG_SCHEMA, load_ply, load_state
+from drgs.files import CONFIG_SCHEMA, Run, load_ply, load_state
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
@@ -127,16 +128,22 @@ class LoadedRun:
         return self.gaussians if self.moving is None else self.moving
 
 
-def load_run(run: Run) -> LoadedRun:
+def load_run(run: Run | str | os.PathLike) -> LoadedRun:
     """What a run holds, from its last checkpoint; point_cloud.ply holds less, and is for other programs.
+
+        scene = drgs.load_run("runs/scene").scene
+        image = drgs.render(scene, camera).rgb
 
     Where the checkpoint is missing or damaged, the PLY is taken. Where both are there but differ, because somebody has
     edited the PLY, the checkpoint is taken; `drgs.load_ply` reads the PLY. Either way the log has one line about it.
 
+    Args:
+        run: Run folder.
     Raises:
         FileNotFoundError: If it is no run folder, or has neither a checkpoint nor a PLY.
         ValueError: If config.json or the classes' embeddings are damaged, or everything else.
     """
+    run = run if isinstance(run, Run) else Run(run)
     record = fit_record(run)
     known = record.semantics
     decoder = None

@@ -30,13 +30,15 @@ class Registry(MutableMapping[str, T], Generic[T]):
 
     Args:
         kind: What a row is, for messages: "policy".
-        group: Of the entry points: "drgs.policies".
+        group: Group of the entry points: "drgs.policies".
         rows: Those of this package.
+        row: Type that a row must have; None where any will do, as functions that are checked by what they return.
     """
 
-    def __init__(self, kind: str, group: str, rows: Mapping[str, T | str]) -> None:
+    def __init__(self, kind: str, group: str, rows: Mapping[str, T | str], row: type[T] | None = None) -> None:
         self.kind = kind
         self.group = group
+        self.row = row
         self._rows: dict[str, Any] = dict(rows)
 
     def __getitem__(self, name: str) -> T:
@@ -48,15 +50,23 @@ class Registry(MutableMapping[str, T], Generic[T]):
             return row
         point = _entry_points(self.group)[name]
         try:
-            row = self._rows[name] = point.load()
+            row = point.load()
         except Exception as error:  # whatever the other package raises, the line names it
             raise ValueError(
                 f"{self.kind} {name!r} of {_package(point)}: must be importable, got {type(error).__name__}: {error}"
             ) from error
+        self._rows[name] = self._checked(f"{self.kind} {name!r} of {_package(point)}", row)
         return row
 
     def __setitem__(self, name: str, value: T) -> None:
-        self._rows[name] = value
+        self._rows[name] = self._checked(f"{self.kind} {name!r}", value)
+
+    def _checked(self, where: str, row: T) -> T:
+        """The row; ValueError where it has another type than rows of this table have."""
+        if self.row is None or isinstance(row, self.row):
+            return row
+        wanted = f"{self.row.__module__}.{self.row.__name__}"
+        raise ValueError(f"{where}: must be a {wanted}, got {type(row).__name__}; make one of it")
 
     def __delitem__(self, name: str) -> None:
         del self._rows[name]
