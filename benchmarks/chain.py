@@ -13,19 +13,19 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
 
 import dense_jacobian  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from scenes_random import camera, gaussians  # noqa: E402
+from studies import rank_correlation  # noqa: E402
 
 from drgs import reference  # noqa: E402
 from drgs.gain import dense  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
-BEGIN = "<!-- chain: begin -->"
-END = "<!-- chain: end -->"
 FORMS = ("trace_bound", "eig", "logdet", "block_logdet")
 GAUSSIANS = 12
 CANDIDATES = 8
@@ -45,12 +45,6 @@ def views(seed: int) -> tuple[list[torch.Tensor], torch.Tensor]:
     return [x.flatten(1) for x in rows], torch.arange(13 * GAUSSIANS) // 13
 
 
-def kendall(a, b) -> float:
-    """Kendall's tau-a of two score lists."""
-    i, j = np.triu_indices(len(a), 1)
-    return float(np.mean(np.sign(np.subtract(a[i], a[j])) * np.sign(np.subtract(b[i], b[j]))))
-
-
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--scenes", type=int, default=24)
@@ -66,7 +60,8 @@ def main():
                 for form in FORMS:
                     scores = np.array([getattr(x, form) for x in chains])
                     regret = 1 - truth[scores.argmax()] / truth.max()
-                    found.setdefault((value, count, form), []).append((scores / truth, kendall(scores, truth), regret))
+                    tau = rank_correlation(scores, truth, "kendall")
+                    found.setdefault((value, count, form), []).append((scores / truth, tau, regret))
     lines = [
         "| lambda | training views | form | form / mutual information: median (5 %, 95 %) | Kendall tau "
         "| regret: mean, worst |",
@@ -80,12 +75,8 @@ def main():
             f"| {100 * regret.mean():.1f} %, {100 * regret.max():.0f} % |"
         )
     print("\n".join(lines))
-    page = ROOT / "docs" / "information.md"
     if not args.print:
-        text = page.read_text(encoding="utf-8")
-        start = text.index(BEGIN) + len(BEGIN)
-        end = text.index(END)
-        page.write_text(text[:start] + "\n" + "\n".join(lines) + "\n" + text[end:], encoding="utf-8")
+        fill_between(ROOT / "docs" / "information.md", "chain", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs.cameras import Camera, intrinsics_from_fov, look_at  # noqa: E402
 from drgs.cluster.connect import opened  # noqa: E402
-from drgs.cluster.payloads import Parcel  # noqa: E402
+from drgs.cluster.payloads import Payload  # noqa: E402
 from drgs.files import write_json  # noqa: E402
 from drgs.select import Selection, select  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
@@ -64,8 +64,7 @@ def ring(count: int) -> list[Camera]:
     K = intrinsics_from_fov(50.0, *SIZE)
     found = []
     for i in range(count):
-        # the golden angle
-        angle = 2.399963 * i
+        angle = 2.399963 * i  # the golden angle
         height = 0.25 + 1.0 * (i + 0.5) / count
         across = np.sqrt(max(2.6**2 - (2 * height) ** 2, 0.2))
         eye = (across * np.cos(angle), across * np.sin(angle), 2 * height)
@@ -94,7 +93,6 @@ def measured(arguments: argparse.Namespace) -> dict:
     g = scene(arguments.gaussians)
     cameras = ring(arguments.candidates + KNOWN)
     known = cameras[:: len(cameras) // KNOWN][:KNOWN]
-    candidates = []
     candidates = [camera for camera in cameras if all(camera is not other for other in known)]
     rows = []
     reference = None
@@ -140,7 +138,7 @@ def measured(arguments: argparse.Namespace) -> dict:
         "candidates": len(candidates),
         "known": len(known),
         "size": SIZE,
-        "scene_bytes": len(Parcel.of(g).data),
+        "scene_bytes": len(Payload.of(g).data),
         "rows": rows,
     }
 

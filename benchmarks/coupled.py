@@ -14,7 +14,6 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -23,7 +22,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from chain import kendall  # noqa: E402
+from clocks import interleaved  # noqa: E402
+from studies import rank_correlation  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -43,18 +43,6 @@ COUNTS = (1, 2, 4, 8, 16)
 CRITERIA = ("eig", "logdet")
 
 
-def interleaved(runs: dict[str, Callable], turns: int) -> dict[str, float]:
-    """Median CPU seconds of each, peers taking turns after a warm-up."""
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for turn in range(turns + 1):
-        for name, run in runs.items():
-            start = time.process_time()
-            run()
-            if turn:
-                seconds[name].append(time.process_time() - start)
-    return {name: float(np.median(x)) for name, x in seconds.items()}
-
-
 def costs(g: Gaussians, camera: Camera, metric: SemanticMetric, preset: str, turns: int) -> dict[str, float]:
     """Seconds of one view: rendered, its diagonal of colors, and with features by every estimate."""
     settings = Preset(preset)
@@ -70,7 +58,7 @@ def costs(g: Gaussians, camera: Camera, metric: SemanticMetric, preset: str, tur
     runs["8, blocks"] = lambda: fisher.blocks(g, camera, settings, semantics=metric)
     exact = dataclasses.replace(metric, estimate="exact")
     runs["exact"] = lambda: fisher.diagonal(g, camera, settings, semantics=exact)
-    return interleaved(runs, turns)
+    return interleaved(runs, turns, time.process_time)
 
 
 def added(a: dict, b: dict) -> dict:
@@ -79,7 +67,7 @@ def added(a: dict, b: dict) -> dict:
 
 
 def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int) -> dict:
-    """Of entries and of the scores of all views but the first two, which are known, by estimate; preset `fast`."""
+    """Errors of entries and of the scores of all views but the first two, which are known, by estimate, on `fast`."""
     settings = Preset("fast")
     colors = [fisher.diagonal(g, view, settings, groups=(*GEOMETRY, "sh")) for view in views]
 
@@ -100,7 +88,7 @@ def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int
     best, second = np.sort(truth["eig"])[::-1][:2]
     result: dict = {
         "share of the trace": trace[0] / sum(trace),
-        "tau of uncoupled": kendall(only, truth["eig"]),
+        "tau of uncoupled": rank_correlation(only, truth["eig"], "kendall"),
         "margin": float((best - second) / best),
         "views": len(views) - 2,
     }
@@ -119,7 +107,7 @@ def errors(g: Gaussians, views: list[Camera], metric: SemanticMetric, seeds: int
                 row = [float(ratios.abs().median()), float(ratios.square().mean().sqrt())]
                 for criterion, x in truth.items():
                     y = scores(found, criterion)
-                    row += [float(np.std(y / x)), kendall(x, y), float(1 - x[y.argmax()] / x.max())]
+                    row += [float(np.std(y / x)), rank_correlation(x, y, "kendall"), float(1 - x[y.argmax()] / x.max())]
                 rows.append(row)
             result[f"{estimate} {K}"] = np.mean(rows, 0).tolist()
             print(estimate, K, result[f"{estimate} {K}"], flush=True)

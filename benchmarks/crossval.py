@@ -37,8 +37,7 @@ from drgs.commands.orbits import Wish, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
-from drgs.lab.crops import crops  # noqa: E402
-from drgs.lab.crossval import VERDICTS, crossval  # noqa: E402
+from drgs.lab.crossval import VERDICTS, crops, crossval  # noqa: E402
 from drgs.lab.dumps import cotangents  # noqa: E402
 from drgs.lab.rasterizers import function, load_rasterizer  # noqa: E402
 from drgs.lab.raw import PARAMETERS, raw_of, with_pose  # noqa: E402

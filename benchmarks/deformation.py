@@ -15,6 +15,7 @@ import dataclasses
 import json
 import os
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -23,8 +24,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from chain import kendall  # noqa: E402
-from coupled import interleaved  # noqa: E402
+from clocks import interleaved  # noqa: E402
+from studies import rank_correlation  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -103,21 +104,22 @@ def traces(found: list[Information], known: int) -> np.ndarray:
 
 def judged(scores: list[np.ndarray], truth: np.ndarray) -> list[float]:
     """Bias, error and rank correlation of scores, and what their best view lacks of the best: averages over seeds."""
-    rows = [
-        (np.mean(y / truth), np.std(y / truth), kendall(truth, y), 1 - truth[y.argmax()] / truth.max()) for y in scores
-    ]
+    rows = []
+    for y in scores:
+        tau = rank_correlation(truth, y, "kendall")
+        rows.append((np.mean(y / truth), np.std(y / truth), tau, 1 - truth[y.argmax()] / truth.max()))
     return np.mean(rows, 0).tolist()
 
 
 def errors(scene: DynamicGaussians, views: list[Camera], known: int, exact: int, seeds: int) -> dict:
-    """Of every estimate against `exact` probes, by score."""
+    """Errors of every estimate against `exact` probes, by score."""
     candidates = views[known:]
     halves = [told(scene, views, exact // 2, seed, True) for seed in (77, 78)]
     many = [{name: (a[name] + b[name]) / 2 for name in a} for a, b in zip(*halves, strict=True)]
     truth = {name: made(many, known) for name, made in SCORES.items()}
     paper = traces(told(scene, candidates, exact // 8, 77, True, estimate="paper"), 0)
     first, second = ({name: made(half, known) for name, made in SCORES.items()} for half in halves)
-    result: dict = {"halves": {name: kendall(first[name], second[name]) for name in SCORES}}
+    result: dict = {"halves": {name: rank_correlation(first[name], second[name], "kendall") for name in SCORES}}
     for K in COUNTS:
         for name, own in (("same", False), ("own", True)):
             if own and K not in SOME:
@@ -134,7 +136,7 @@ def errors(scene: DynamicGaussians, views: list[Camera], known: int, exact: int,
     still = [fisher.diagonal(scene.at(view.time), view, FAST) for view in views]
     scores = {**truth, "paper": paper, "geometry": ratios(still, known)}
     names = list(scores)
-    result["tau"] = {a: {b: kendall(scores[a], scores[b]) for b in names} for a in names}
+    result["tau"] = {a: {b: rank_correlation(scores[a], scores[b], "kendall") for b in names} for a in names}
     return result
 
 
@@ -159,7 +161,7 @@ def costs(count: int, size: tuple[int, int], share: float, turns: int) -> dict[s
         "paper": lambda: fisher.network(scene, camera, FAST, estimate="paper"),
         "map": lambda: fisher.network_variance_map(scene, camera, weights, FAST),
     }
-    return interleaved(runs, turns)
+    return interleaved(runs, turns, time.process_time)
 
 
 def report(r: dict) -> str:

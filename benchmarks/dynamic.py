@@ -16,7 +16,6 @@ import dataclasses
 import json
 import math
 import os
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -28,6 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import cubes  # noqa: E402
 import torch  # noqa: E402
+from clocks import interleaved  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -82,7 +82,7 @@ def of_run(path: Path, size: tuple[int, int], count: int) -> tuple[Gaussians, to
 
 def trainer(g: Gaussians, shown: list[Frame], gates: torch.Tensor | None) -> Trainer:
     """A fit at the first step of its dynamic stage; of what stands still where there are no gates."""
-    config = FitConfig(max_steps=10**6, static_share=0.0)  # so long that neither rates nor density control begin
+    config = FitConfig.of(max_steps=10**6, static_share=0.0)  # so long that neither rates nor density control begin
     tensors = g.parameters()
     rows = GaussianRows(
         {**{k: v for k, v in tensors.items() if k != "sh"}, "sh_dc": g.sh[:, :1], "sh_rest": g.sh[:, 1:]}
@@ -96,28 +96,15 @@ def trainer(g: Gaussians, shown: list[Frame], gates: torch.Tensor | None) -> Tra
     return made
 
 
-def clock(run: Callable[[], object], turns: int) -> float:
-    """Median CPU seconds."""
-    run()
-    spent = []
-    for _ in range(turns):
-        began = time.process_time()
-        run()
-        spent.append(time.process_time() - began)
-    return statistics.median(spent)
-
-
 def steps(made: dict[str, Trainer], turns: int) -> dict[str, float]:
     """CPU seconds a step by name, medians of turns of ten."""
-    spent: dict[str, list[float]] = {name: [] for name in made}
-    for turn in range(turns + 1):  # the first warms up
-        for name, fit in made.items():
-            began = time.process_time()
-            for _ in range(STEPS):
-                fit.step()
-            if turn:
-                spent[name].append((time.process_time() - began) / STEPS)
-    return {name: statistics.median(each) for name, each in spent.items()}
+
+    def ten(fit: Trainer) -> None:
+        for _ in range(STEPS):
+            fit.step()
+
+    spent = interleaved({name: lambda fit=fit: ten(fit) for name, fit in made.items()}, turns, time.process_time)
+    return {name: seconds / STEPS for name, seconds in spent.items()}
 
 
 def profile(fit: Trainer, turns: int) -> dict[str, float]:
@@ -131,11 +118,14 @@ def profile(fit: Trainer, turns: int) -> dict[str, float]:
         total = seen.means.sum() + seen.quats.sum() + seen.log_scales.sum()
         torch.autograd.grad(total, fitted, allow_unused=True)
 
+    def alone(run: Callable[[], object]) -> float:
+        return interleaved({"": run}, turns, time.process_time)[""]
+
     return {
-        "field, forward": clock(lambda: scene.at(0.3), turns),
-        "field, forward and backward": clock(there_and_back, turns),
-        "regularizers": clock(lambda: smooth(None, None, None).backward(), turns),
-        "optimizer": sum(clock(network.optimizer.step, turns) for network in fit.parts.networks),
+        "field, forward": alone(lambda: scene.at(0.3)),
+        "field, forward and backward": alone(there_and_back),
+        "regularizers": alone(lambda: smooth(None, None, None).backward()),
+        "optimizer": sum(alone(network.optimizer.step) for network in fit.parts.networks),
     }
 
 

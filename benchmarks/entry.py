@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,7 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
 import torch  # noqa: E402
-from coupled import interleaved  # noqa: E402
+from clocks import interleaved  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -42,7 +43,7 @@ def huge() -> Gaussians:
 
 
 def errors(g: Gaussians, camera: Camera, window: tuple[int, int, int, int]) -> dict:
-    """Of the pixels of a window: shares that are ambiguous, and off among all and among the others."""
+    """Errors of the pixels of a window: shares that are ambiguous, and off among all and among the others."""
     x, y, width, height = window
     seen = drgs.render(g, camera, MITSUBA).rgb[y : y + height, x : x + width]
     truth = drgs.reference.render(g, camera, MITSUBA, window=window, tolerance=3e-4)
@@ -66,7 +67,7 @@ def costs(g: Gaussians, camera: Camera, turns: int) -> dict[str, float]:
     for name, settings in (("entry", MITSUBA), ("center", MITSUBA.replace(order="center"))):
         runs[f"{name} image"] = lambda s=settings: drgs.render(g, camera, s, outputs=()).rgb.sum().item()
         runs[f"{name} gradients"] = lambda s=settings: drgs.render(free, camera, s, outputs=()).rgb.mean().backward()
-    seconds = interleaved(runs, turns)
+    seconds = interleaved(runs, turns, time.process_time)
     return {kind: seconds[f"entry {kind}"] / seconds[f"center {kind}"] for kind in ("image", "gradients")}
 
 

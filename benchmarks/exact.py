@@ -13,7 +13,6 @@ rest; a smaller cube against gsplat's own torch code, by examples/gsplat_torch.p
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import subprocess
@@ -26,16 +25,16 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from render import Preset, backward, forward, interleaved, volprim  # noqa: E402
-from where import ran  # noqa: E402
+from clocks import interleaved  # noqa: E402
+from render import Preset, backward, forward, volprim  # noqa: E402
+from where import DATA, ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import data, fisher  # noqa: E402
 from drgs.machine import peak_memory  # noqa: E402
-from drgs.sizes import at_most  # noqa: E402
+from drgs.sizes import at_most, cropped  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
 
-DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
 PIXELS = 76_800  # of a view: 320x240
 FITTED = ("office", "banana", "still life", "statue")
 SCENES = ("office", "banana", "still life", "wolf", "cube")
@@ -43,7 +42,7 @@ CHECKED = (*SCENES, "statue")  # against the oracle
 KINDS = ("forward", "forward + backward", "Fisher diagonal")
 CROP = (48, 36)  # pixels that the oracle looks at
 MESH = {"type": "ellipsoidsmesh", "extent_adaptive_clamping": True}
-SMALL = 10_000, 128  # Gaussians, and pixels along a side: what torch code can do
+TORCH = 10_000, 128  # Gaussians, and pixels along a side: what torch code can do
 LIMITS = (8, 10, 5)  # targets for `exact`, in multiples of `fast`
 
 
@@ -61,7 +60,7 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
     dataset = data.load(source)
     run = folder / name.replace(" ", "-")
     if not (run / "point_cloud.ply").exists():
-        fit(dataset, run, FitConfig(max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"))
+        fit(dataset, run, FitConfig.of(max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"))
     view = dataset.views[len(dataset.views) // 2]
     return drgs.load_ply(run / "point_cloud.ply"), at_most(view.camera.undistorted(), PIXELS)
 
@@ -113,9 +112,7 @@ def task_oracle(name: str, folder: Path, turns: int) -> dict | None:
     if found is None:
         return None
     g, cam = found
-    K = cam.K.copy()
-    K[:2, 2] -= (cam.width // 2 - CROP[0] // 2, cam.height // 2 - CROP[1] // 2)
-    crop = dataclasses.replace(cam, K=K, width=CROP[0], height=CROP[1])
+    crop = cropped(cam, cam.width // 2 - CROP[0] // 2, cam.height // 2 - CROP[1] // 2, *CROP)
     g = g.detach()
     s = Preset("exact")
     with torch.no_grad():
@@ -159,8 +156,8 @@ def task_torch(name: str, folder: Path, turns: int) -> dict:
     """gsplat's torch code against our preset of its model, on a cube that its memory allows."""
     from examples.gsplat_torch import rasterization
 
-    g = cubes.cube(SMALL[0])
-    cam = cubes.camera(SMALL[1])
+    g = cubes.cube(TORCH[0])
+    cam = cubes.camera(TORCH[1])
     s = Preset("gsplat")
     raw = {"means": g.means, "quats": g.quats, "log_scales": g.log_scales, "logits": g.logit_opacities, "sh": g.sh}
     leaves = {key: x.clone().requires_grad_() for key, x in raw.items()}
@@ -297,7 +294,7 @@ def report(result: dict) -> str:
         "",
         "## Against gsplat's torch code",
         "",
-        f"{SMALL[0]:,} Gaussians, {SMALL[1]}x{SMALL[1]}, ms, two threads: gsplat 1.5.3's own torch functions on the",
+        f"{TORCH[0]:,} Gaussians, {TORCH[1]}x{TORCH[1]}, ms, two threads: gsplat 1.5.3's own torch functions on the",
         "CPU (examples/gsplat_torch.py says which), and our preset of its model; 99.9 % of the values differ by less",
         f"than {result['torch']['difference']:.0e}.",
         "",

@@ -27,6 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from clocks import in_turns  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -36,14 +37,6 @@ from drgs.tracing.tiles import TileTraversal  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 WIDTHS = (3, 16, 32, 64, 128, 512)
-
-
-def camera() -> drgs.Camera:
-    """320x240, 45 degrees, distance 4."""
-    f = 0.5 * 320 / np.tan(np.radians(45) / 2)
-    w2c = np.eye(4)
-    w2c[2, 3] = 4
-    return drgs.Camera(K=np.array([[f, 0, 160], [0, f, 120], [0, 0, 1]]), w2c=w2c, width=320, height=240)
 
 
 @contextlib.contextmanager
@@ -61,7 +54,7 @@ def frame(gaussians: drgs.Gaussians, settings: drgs.RenderSettings, couple: bool
     """A frame and the gradients of the sum of its images with respect to every parameter."""
     leaves = {k: v.clone().requires_grad_() for k, v in gaussians.parameters().items()}
     moving = gaussians.replace(**leaves)
-    cam = camera()
+    cam = cubes.camera(320, 240)
 
     def run():
         with contextlib.nullcontext() if products else traversals():
@@ -86,14 +79,7 @@ def against_colors(count: int, preset: str, width: int, ways: dict, turns: int, 
     settings = Preset(preset)
     runs = {"colors": frame(with_features(count, 0), settings, True)}
     runs |= {name: frame(with_features(count, width), settings, *way) for name, way in ways.items()}
-    seconds = {name: [] for name in runs}
-    for run in runs.values():
-        run()
-    for _ in range(turns):
-        for name, run in runs.items():
-            start = clock()
-            run()
-            seconds[name].append(clock() - start)
+    seconds = in_turns(runs, turns, clock)
     ratios = {
         name: statistics.median(a / b for a, b in zip(seconds[name], seconds["colors"], strict=True)) for name in ways
     }
@@ -131,12 +117,12 @@ def held(count: int, preset: str, width: int) -> dict:
 def grown(count: int, width: int) -> int:
     """Bytes that a coupled `fast` frame and its gradients add to a process that has the Gaussians and the kernels."""
     code = (
-        "import torch, features\n"
-        "def peak(): return next(int(x.split()[1]) for x in open('/proc/self/status') if x.startswith('VmHWM'))\n"
+        "import features\n"
+        "from drgs.machine import forget_peak_memory, peak_memory\n"
         f"small, large = (features.frame(features.with_features(n, {width}), features.Preset('fast'), True)"
         f" for n in (100, {count}))\n"
-        "small(); open('/proc/self/clear_refs', 'w').write('5')\n"  # the peak is what there is now
-        "before = peak(); large(); print(1024 * (peak() - before))"
+        "small(); forget_peak_memory()\n"  # the peak is what there is now
+        "before = peak_memory(); large(); print(peak_memory() - before)"
     )
     told = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "benchmarks", capture_output=True, check=True)
     return int(told.stdout.split()[-1])

@@ -23,7 +23,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from render import backward, forward, interleaved  # noqa: E402
+from clocks import interleaved  # noqa: E402
+from render import backward, forward  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402

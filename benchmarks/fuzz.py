@@ -34,6 +34,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from clocks import processor_seconds  # noqa: E402
 from fuzz_targets import TARGETS, Bench  # noqa: E402
 from fuzz_worker import GREEDY, SLOW  # noqa: E402
 from where import ran  # noqa: E402
@@ -55,8 +56,8 @@ class Reader:
     """One reader's inputs and what they came to, over all processes that it took.
 
     Args:
-        name: Of `TARGETS`.
-        row: What earlier runs counted; is added to.
+        name: Name of the reader in `TARGETS`.
+        row: Counts of earlier runs; is added to.
         corpus: Folder of what reached new lines, where atheris chooses.
     """
 
@@ -113,8 +114,8 @@ class Reader:
                 if (now := _number(scratch)) != number:
                     number = now
                     since = time.monotonic()
-                    spent = _processor(process.pid)
-                elif _processor(process.pid) - spent > SLOW or time.monotonic() - since > _STUCK:
+                    spent = processor_seconds(process.pid)
+                elif processor_seconds(process.pid) - spent > SLOW or time.monotonic() - since > _STUCK:
                     ended = "hang"
                     break
         finally:
@@ -171,15 +172,6 @@ def _damaged(scratch: Path) -> Path:
     """The file that was read last."""
     data = (scratch / "number").read_bytes()
     return Path(os.fsdecode(data[10 : 10 + int.from_bytes(data[8:10], "little")]))
-
-
-def _processor(pid: int) -> float:
-    """Seconds of processor time that a process has taken."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def again(name: str, number: int) -> None:

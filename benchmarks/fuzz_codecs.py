@@ -30,7 +30,7 @@ def _sample(name: str) -> Seed:
 
 
 def _saved(name: str) -> Seed:
-    """As drgs writes it."""
+    """A file as drgs writes it."""
 
     def write(folder: Path) -> None:
         from fuzz_seeds import gaussians

@@ -25,9 +25,9 @@ def mutate(data: bytes, suffix: str, draw: Random, others: Sequence[bytes] = ())
     """A damaged copy of a file.
 
     Args:
-        data: The file.
-        suffix: Of its name, which says what it is made of.
-        draw: What decides.
+        data: Bytes of the file.
+        suffix: Suffix of its name, which says what it is made of.
+        draw: Generator that decides.
         others: Other files of this kind, to be spliced with.
     """
     damage = _STRUCTURED.get(suffix)

@@ -29,7 +29,7 @@ class Target:
     """A reader.
 
     Attributes:
-        name: Of the reader, as tables have it.
+        name: Name of the reader, as tables have it.
         seeds: Functions that write valid files into an empty folder each.
         files: Patterns of the files that are damaged, below that folder.
         read: Reads the folder.
@@ -62,7 +62,6 @@ class Bench:
         target: The reader.
         scratch: Empty folder, best in memory.
         made: Folders that hold valid files already, in place of those that the target's functions write.
-
     Attributes:
         files: (folder, path, bytes) of the valid files that are damaged.
     """

@@ -32,6 +32,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from clocks import processor_seconds  # noqa: E402
+
 GREEDY = 1 << 30
 LIMIT = 6 << 30
 SLOW = 5.0
@@ -65,15 +67,11 @@ def peak() -> tuple[int, int]:
 
 def spent() -> float:
     """Seconds of processor time of all processes together."""
-    total = time.process_time()
-    for pid in children():
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return total
+    return time.process_time() + sum(processor_seconds(pid) for pid in children())
 
 
 def place_of(error: BaseException) -> str:
-    """Where in drgs an error came from, file:line, by which findings of one cause are told."""
+    """The place in drgs that an error came from, file:line, by which findings of one cause are told."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if f"{ROOT}/drgs" in frame.filename] or list(frames)
     return f"{os.path.relpath(own[-1].filename, ROOT)}:{own[-1].lineno}" if own else "?"

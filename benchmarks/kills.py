@@ -125,10 +125,10 @@ def campaign(kind: str, folder: Path, kills: int, seed: int = 0) -> dict:
     """Kill fits of a kind so many times.
 
     Args:
-        kind: Of `KINDS`.
-        folder: For scenes and runs.
-        kills: How many.
-        seed: Of the moments.
+        kind: Kind of fit, a key of `KINDS`.
+        folder: Folder for scenes and runs.
+        kills: Number of kills.
+        seed: Seed of the moments.
     Returns:
         Kind, kills, those by SIGTERM and before the first checkpoint, fits that were finished, how many of these are
         the undisturbed one to the last bit, and seconds.

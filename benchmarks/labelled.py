@@ -51,10 +51,10 @@ class Capture:
     """A capture with labels, and how its teacher errs.
 
     Attributes:
-        folder: What is loaded, below the data.
+        folder: Folder that is loaded, below the data.
         classes: Names by label; None: as the capture names them.
-        shift: What is added to a pixel of its label images; None: they are read by the capture's own names.
-        confusions: Of the teacher.
+        shift: Number that is added to a pixel of its label images; None: they are read by the capture's own names.
+        confusions: What its teacher takes for what.
         moving: Classes that move by themselves.
     """
 
@@ -101,13 +101,13 @@ def generate(
     """Make a data set, unless `out_dir` already holds it; an interrupted call is continued.
 
     Args:
-        name: Of `CAPTURES`.
+        name: Name of the capture in `CAPTURES`.
         out_dir: Folder to make; what was made otherwise is refused.
-        offset: Of the first test photograph, 0 to 2.
-        seed: Of the teacher's errors.
+        offset: Index of the first test photograph, 0 to 2.
+        seed: Seed of the teacher's errors.
         teacher_size: (w, h) of its maps; a quarter of the photographs if left out.
-        mask_moving: Mask the classes that move by themselves.
-        data: Where the captures are.
+        mask_moving: Whether the classes that move by themselves are masked.
+        data: Folder of the captures.
     Returns:
         `out_dir` as a Path.
     Raises:

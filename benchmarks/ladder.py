@@ -34,9 +34,8 @@ from drgs.lab.ladder import Pictures, ladder, table
 from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
+from drgs.studies.tables import fill_between
 
-BEGIN = "<!-- ladder: begin -->"
-END = "<!-- ladder: end -->"
 FOVS = (20, 45, 70, 95, 120)
 STARTS = ("inria", "gsplat")
 PIXELS = 19_200  # 160 x 120
@@ -292,7 +291,7 @@ def apart(heads: list[str], reports: list[dict], others: list[dict]) -> list[str
 
 
 def rms(part: dict, order: str, name: str) -> float:
-    """Of one rung."""
+    """RMS of one rung."""
     return next(row["rms"] for row in part[order] if row["rung"] == name)
 
 
@@ -323,10 +322,7 @@ def main():
         print(f"{name}, {fov} degrees, {width} pixels: {time.perf_counter() - begin:.0f} s", flush=True)
     found = {**result["scenes"], "widths": result["widths"], "order": [x for x in CROP if result["scenes"].get(x)]}
     plot(found, ROOT / "docs" / "pictures" / "ladder.png")
-    path = ROOT / "docs" / "ladder.md"
-    text = path.read_text()
-    head, tail = text.split(BEGIN)[0], text.split(END)[1]
-    path.write_text("\n".join([head + BEGIN, "", page(found, result["made"]), "", END]) + tail)
+    fill_between(ROOT / "docs" / "ladder.md", "ladder", page(found, result["made"]))
 
 
 if __name__ == "__main__":

@@ -86,8 +86,8 @@ def report(r: dict) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for preset, row in r["rows"].items():
-        (all_a, all_b) = row["all"]
-        (one_a, one_b) = row["later"]
+        all_a, all_b = row["all"]
+        one_a, one_b = row["later"]
         cells = f"{all_a:.0f} s | {all_b:.0f} s | {all_a / all_b:.1f} | {one_a:.1f} s | {one_b:.1f} s"
         lines.append(f"| `{preset}` | {cells} | {one_a / one_b:.1f} |")
     return "\n".join(lines)

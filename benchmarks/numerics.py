@@ -22,9 +22,7 @@ from drgs.commands.stress import markdown  # noqa: E402
 from drgs.lab.extremes import CASES  # noqa: E402
 from drgs.lab.refusals import REFUSALS  # noqa: E402
 from drgs.lab.stress import rows  # noqa: E402
-
-BEGIN = "<!-- table: begin -->"
-END = "<!-- table: end -->"
+from drgs.studies.tables import fill_between  # noqa: E402
 
 
 def main() -> int:
@@ -39,10 +37,7 @@ def main() -> int:
     at = ran()
     made = f"`python benchmarks/numerics.py`, {at['machine']}, {at['date']}, commit {at['commit']}."
     if not args.print:
-        page = ROOT / "docs" / "numerics.md"
-        text = page.read_text()
-        head, tail = text.split(BEGIN)[0], text.split(END)[1]
-        page.write_text("\n".join([head + BEGIN, "", made, "", *markdown(found), "", END]) + tail)
+        fill_between(ROOT / "docs" / "numerics.md", "table", "\n".join([made, "", *markdown(found)]))
     return int(any(row.verdict == "FAILS" for row in found))
 
 

@@ -96,7 +96,8 @@ def report(result: dict, made: str) -> str:
     lines = [
         f"Made by {made}",
         "",
-        f"A fit to {VIEWS} views ({STEPS:,} steps, `--scale small`), then each candidate added alone for {MORE} more",
+        f"A fit to {VIEWS} views ({STEPS:,} steps, {studies.BASE['max_gaussians']:,} Gaussians, at most "
+        f"{studies.BASE['max_pixels']:,} pixels), then each candidate added alone for {MORE} more",
         "steps.",
         "Spearman's rho between the score and the realised drop of the held-out squared error, over the candidates;",
         "in brackets what 95 % of random rankings stay below.",

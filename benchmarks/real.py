@@ -49,7 +49,7 @@ PEERS = {
 def run(name: str, data: Path, runs: Path) -> dict:
     """metrics.json of a fit, made now if it is not there, with the previews of its log."""
     folder = runs / name
-    (scene, options) = FITS[name]
+    scene, options = FITS[name]
     if not (folder / "metrics.json").exists():
         source = data / scene
         if name.endswith("-sfm"):  # its photographs alone
@@ -57,7 +57,7 @@ def run(name: str, data: Path, runs: Path) -> dict:
             if not source.exists():
                 command = ["sfm", str(data / scene / "images"), "-o", str(source)]
                 subprocess.run([sys.executable, "-m", "drgs", *command], check=True, cwd=ROOT)
-        fit(load(source), folder, FitConfig(**options), resume=folder.exists())
+        fit(load(source), folder, FitConfig.of(**options), resume=folder.exists())
     metrics = json.loads((folder / "metrics.json").read_text())
     events = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     config = json.loads((folder / "config.json").read_text())
@@ -108,7 +108,7 @@ def report(results: dict, crossed: list, machine: str) -> str:
         if name.startswith("model-"):
             continue
         mean = r["mean"]
-        (width, height) = r["size"][0]
+        width, height = r["size"][0]
         rows.append(
             f"| {name} | {r['train']} + {r['count']} | {width}x{height} | {r['points']} | {r['steps']:,} "
             f"| {r['seconds'] / 60:.1f} | {r['gaussians']:,} | {mean['psnr']:.2f} | {mean['ssim']:.3f} "

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -24,6 +23,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from clocks import interleaved  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -61,7 +61,7 @@ def volprim(gaussians, camera, differentiate: bool, **shape):
     """`volprim_rf_basic` as shipped, without its sRGB step (whose gradient is wrong) and with unlimited depth.
 
     Args:
-        shape: Of the shape, beside or instead of what `ellipsoids_shape` says.
+        shape: Properties of the shape, beside or instead of what `ellipsoids_shape` says.
     """
     mi = runtime.mitsuba()
     import drjit as dr
@@ -98,19 +98,6 @@ def volprim(gaussians, camera, differentiate: bool, **shape):
         dr.sync_thread()
 
     return run
-
-
-def interleaved(runs: dict, turns: int) -> dict:
-    """Median seconds of each run, taking turns."""
-    seconds = {name: [] for name in runs}
-    for run in runs.values():
-        run()
-    for _ in range(turns):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            run()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: statistics.median(s) for name, s in seconds.items()}
 
 
 def headline(turns: int) -> dict:

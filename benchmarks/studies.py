@@ -1,9 +1,7 @@
-"""What the studies share: scenes at `--scale small`, base models, and the line that says where and when.
+"""What the studies share: base models, their command line, and the line that says where and when.
 
-Studies of fits are cells of `drgs.studies.cells`, their statistics are in `drgs.studies.statistics`.
-
-`small` is 15,000 Gaussians, at most 12,000 pixels and a fifth of the paper's steps (a pick every 40 of 1,400);
-`paper` is 30,000 Gaussians, 130,000 pixels and its 7,000 steps.
+Studies of fits are cells of `drgs.studies.cells`, their statistics are in `drgs.studies.statistics`; what `--scale`
+means is in `drgs.studies.experiments.SIZES`.
 """
 
 from __future__ import annotations
@@ -11,7 +9,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import ran  # noqa: E402
+from where import DATA, ran  # noqa: E402
 
 from drgs.data import initial_points, load, scene_extent  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
@@ -33,7 +30,7 @@ from drgs.studies.rows import append_row, read_study  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 __all__ = [
-    "SCALES",
+    "DATA",
     "SCENES",
     "base",
     "command",
@@ -45,12 +42,9 @@ __all__ = [
     "write_rows",
 ]
 
-DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
 SCENES = ("office", "head", "still_life")
-SCALES = {
-    "small": {"max_pixels": 12_000, "max_gaussians": 15_000, "max_steps": 1400, "every": 40},
-    "paper": {"max_pixels": 130_000, "max_gaussians": 30_000, "max_steps": 7000, "every": 200},
-}
+BASE = {"max_pixels": 12_000, "max_gaussians": 15_000}
+"""Size of the base models."""
 
 
 def folder(name: str, runs: Path) -> Path:
@@ -67,32 +61,31 @@ def dataset(name: str, runs: Path, **options):
     return load(folder(name, runs), **options)
 
 
-def base(name: str, runs: Path, views: int, steps: int, scale: str = "small") -> tuple:
+def base(name: str, runs: Path, views: int, steps: int) -> tuple:
     """(trainer, pool frames, indices of the training views among them, held-out frames) of a fit to a few views.
 
     The first training view and those farthest from it; kept as a checkpoint for the next call.
     """
     train, test = dataset(name, runs).split(8)
-    size = SCALES[scale]
-    config = FitConfig(max_pixels=size["max_pixels"], max_gaussians=size["max_gaussians"], max_steps=steps)
+    config = FitConfig.of(**BASE, max_steps=steps)
     chosen = initial_views([view.camera for view in train], views)
-    pool = load_frames(train, config.max_pixels)
-    held_out = load_frames(test, config.max_pixels)
+    pool = load_frames(train, config.data.max_pixels)
+    held_out = load_frames(test, config.data.max_pixels)
     frames = [pool[i] for i in chosen]
-    path = runs / "base" / f"{name}-{scale}-{views}-{steps}.safetensors"
+    path = runs / "base" / f"{name}-{views}-{steps}.safetensors"
     if path.exists():
         tensors, header = load_state(path)
         return Trainer.from_state(config, frames, tensors, header, str(path)), pool, chosen, held_out
     views_seen = [train[i] for i in chosen]
-    points, colors, _ = initial_points(views_seen, seed=0, max_points=config.max_gaussians)
+    points, colors, _ = initial_points(views_seen, seed=0, max_points=config.density.max_gaussians)
     dense = any(view.depth_path is not None for view in views_seen)
     import torch
 
     model = GaussianRows.from_points(
         torch.from_numpy(points),
         torch.from_numpy(colors),
-        config.dense_opacity if dense else config.initial_opacity,
-        config.dense_scale if dense else 1.0,
+        config.density.dense_opacity if dense else config.density.initial_opacity,
+        config.density.dense_scale if dense else 1.0,
     )
     trainer = Trainer(config, frames, model, scene_extent([f.camera for f in frames], points))
     while trainer.step_index < steps:
@@ -121,7 +114,7 @@ def rank_correlation(a, b, kind: str = "spearman") -> float:
 
 
 def stamp(script: str) -> str:
-    """Where and when a study ran."""
+    """The line that says where and when a study ran."""
     at = ran()
     return f"`python benchmarks/{script}.py`, {at['machine']}, {at['date']}, commit {at['commit']}."
 
@@ -154,9 +147,9 @@ def command(
     the first, whose page it is, to SCRIPT-SET.jsonl.
 
     Args:
-        script: Its name, and that of its part of the page.
-        page: Where the tables go.
-        scales: What --scale may be, the default first.
+        script: Name of the script, and of its part of the page.
+        page: Page that the tables are written into.
+        scales: Values of --scale, the default first.
         study_of: Scale, folder of runs -> study.
         units_of: Study, --seeds and, with `sets`, the scenes -> units, as `Study.cells` takes them.
         planned: --seeds -> cells of the whole study.

@@ -23,6 +23,7 @@ import drgs
 from drgs import fisher
 from drgs.cameras import Camera, look_at
 from drgs.gain import Prior, information_gain
+from drgs.lab.tradeoff import scaled_diagonal
 
 Preset = drgs.RenderSettings.preset
 PRIOR = Prior(1e-3, relative=True)
@@ -65,10 +66,7 @@ def scene(name: str, runs: Path) -> tuple:
 
 def information(g, camera, settings, method: str, share: float) -> fisher.Information:
     """One view's, at a share of its resolution, per full-size pixel."""
-    small = camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
-    found = fisher.diagonal(g, small, settings, method)
-    scale = camera.width * camera.height / (small.width * small.height)
-    return {name: x.float() * scale for name, x in found.items()}
+    return {name: x.float() for name, x in scaled_diagonal(g, camera, settings, share, method).items()}
 
 
 def measure(g, train: list, candidates: list) -> list[dict]:

@@ -96,7 +96,7 @@ def measured(study: Study, cell: Cell, runs: Path) -> dict | None:
     names = {one["name"] for one in (*known["start"], *known["picks"])}
     train, test = study.dataset(cell).split()
     loaded = load_run(run)
-    pixels = study.fit.max_pixels
+    pixels = study.fit.data.max_pixels
     step = -(-len(test) // VIEWS)
     seen = load_frames([view for view in train if view.name in names], pixels)
     found = ause(loaded.gaussians, seen, load_frames(test[::step], pixels), study.fit.settings)
@@ -122,7 +122,7 @@ def table(rows: list[dict], scenes: list[str]) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--set", choices=list(active.SETS), default="report")
-    parser.add_argument("--scale", choices=list(active.SCALES), default="small")
+    parser.add_argument("--scale", choices=active.SCALES, default="small")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
     args = parser.parse_args()

@@ -1,24 +1,25 @@
-"""Where and when a benchmark ran: what stands beside every result."""
+"""Where and when a benchmark ran: what stands beside every result, and where the captures are."""
 
 from __future__ import annotations
 
 import datetime
-import subprocess
+import os
 from pathlib import Path
 
-from drgs import runtime
+from drgs import machine, runtime
 
-__all__ = ["ran"]
+__all__ = ["DATA", "ROOT", "ran"]
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
+"""Folder of the captures that people took."""
 
 
 def ran() -> dict[str, str]:
     """`machine` (processor, threads, variant), `date`, and the `commit` that is checked out."""
     backend = runtime.backend()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
-    )
     return {
-        "machine": f"{runtime.info().get('cpu', 'CPU')}, {backend.threads} threads, {backend.variant}",
+        "machine": f"{machine.cpu_model()}, {backend.threads} threads, {backend.variant}",
         "date": datetime.date.today().isoformat(),
-        "commit": commit.stdout.strip(),
+        "commit": machine.commit() or "unknown",
     }

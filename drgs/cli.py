@@ -20,12 +20,15 @@ import typing
 from typing import Annotated, Any, TextIO
 
 import tyro
+from tyro import MISSING
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 import drgs
-from drgs.cluster.wanted import check_wanted
+from drgs.cluster.options import check_options
+from drgs.commands.config_file import config_fields, default_of, named_config
 from drgs.commands.making_options import Demo, Reproduce, Scene, Sfm, Teach
 from drgs.commands.option_groups import Clustered
+from drgs.commands.option_help import help_page
 from drgs.commands.options import (
     Cite,
     Convert,
@@ -42,6 +45,7 @@ from drgs.commands.options import (
     Tradeoff,
     View,
 )
+from drgs.commands.renamed import as_written_now
 from drgs.display.progress import Bar
 from drgs.guards import interrupts
 
@@ -87,7 +91,11 @@ def main(argv: list[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"drgs {drgs.__version__}")
         return 0
-    args = _parse_arguments(argv)
+    try:
+        args = _parse_arguments(argv)
+    except (ValueError, OSError) as error:
+        _complain(argv[0], str(error))
+        return 2
     from drgs.guards import outputs  # not for --help
 
     name = next(name for name, options in _OPTIONS.items() if type(args) is options)
@@ -97,7 +105,7 @@ def main(argv: list[str] | None = None) -> int:
         if not 0 <= getattr(args, "seed", 0) < 1 << 31:
             raise ValueError(f"--seed must be in [0, {(1 << 31) - 1}], got {args.seed}; choose another")
         if isinstance(args, Clustered):
-            check_wanted(args.scheduler, args.workers)
+            check_options(args.scheduler, args.workers)
         with interrupts.handled(outputs.clean, lambda error: f"drgs {name}: {_ending(error)}\n"):
             try:
                 # Whatever a command does without a bar of its own is not silent either.
@@ -145,25 +153,42 @@ class _Stderr(logging.StreamHandler):
 
 
 def _parse_arguments(argv: list[str]) -> Any:
-    """The dataclass of the command in argv; tyro's framed usage errors become one line."""
-    commands: Any = typing.Union[  # noqa: UP007 (built at run time)
-        tuple(Annotated[options, subcommand(name)] for name, options in _OPTIONS.items())
-    ]
+    """The dataclass of the command in argv; without one tyro lists the commands, or says what is wrong.
+
+    Raises:
+        SystemExit: After help, and on bad usage, which is told in one line.
+        ValueError, OSError: If a file of --config cannot be read.
+    """
+    name = argv[0] if argv and argv[0] in _OPTIONS else None
+    if name is None:
+        commands: Any = typing.Union[  # noqa: UP007 (built at run time)
+            tuple(Annotated[options, subcommand(name)] for name, options in _OPTIONS.items())
+        ]
+        about = "Differentiable Gaussian rendering, exact gradients, any CPU. Version: drgs --version."
+        return _by_tyro(None, commands, args=argv, prog="drgs", description=about, config=(FlagCreatePairsOff,))
+    options = _OPTIONS[name]
+    words, notes = as_written_now(name, argv[1:])
+    for note in notes:
+        print(f"drgs {name}: {note}", file=sys.stderr)
+    path = named_config(words) if "config" in options.__dataclass_fields__ else None
+    default = None if path is None else default_of(options, config_fields(path), MISSING)
+    if asked := {"-h", "--help", "--help-all"}.intersection(words):
+        print(help_page(name, options, "--help-all" in asked, default), end="")
+        raise SystemExit(0)
+    known = {} if default is None else {"default": default}
+    return _by_tyro(name, options, args=words, prog=f"drgs {name}", **known)
+
+
+def _by_tyro(name: str | None, kind: Any, **how: Any) -> Any:
+    """What tyro makes of words; its framed usage errors become one line."""
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
-            return tyro.cli(
-                commands,
-                args=argv,
-                prog="drgs",
-                description="Differentiable Gaussian rendering, exact gradients, any CPU. Version: drgs --version.",
-                config=(FlagCreatePairsOff,),
-            )
+            return tyro.cli(kind, **how)
     except SystemExit as end:
         if end.code:
-            command = next((a for a in argv if a in _OPTIONS), None)
             line = _one_line(errors.getvalue())
-            _complain(command, f"{line} (see `drgs {f'{command} ' if command else ''}--help`)")
+            _complain(name, f"{line} (see `drgs {f'{name} ' if name else ''}--help`)")
         raise
 
 

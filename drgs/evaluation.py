@@ -59,7 +59,7 @@ def evaluate_run(
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
-    frames = load_frames(views, config.max_pixels, config.mask)
+    frames = load_frames(views, config.data.max_pixels, config.data.mask)
     names = file_names([frame.name for frame in frames])
     kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
     claimed.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)

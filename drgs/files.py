@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
 __all__ = [
+    "CONFIG_SCHEMA",
     "SCHEMA",
     "Run",
     "atomic_write",
@@ -44,7 +45,10 @@ __all__ = [
 ]
 
 SCHEMA = 1
-"""Version of config.json, log.jsonl, metrics.json and state.safetensors; raised when a reader must change."""
+"""Version of log.jsonl, metrics.json, state.safetensors and what commands write; raised when a reader must change."""
+CONFIG_SCHEMA = 2
+"""Version of config.json. Of version 1, which is read too, the fields of a fit stand beside each other, those of its
+selection under `active`; of version 2 they are nested by subject."""
 
 _log = logging.getLogger(__name__)
 
@@ -383,9 +387,12 @@ class Run:
         if not path.is_file():
             raise FileNotFoundError(f"{self.path}: must be a run folder, found no config.json; run `drgs fit` first")
         config = read_json(path, "a run's config.json", "fit again in another folder")
-        if not isinstance(config, dict) or config.get("schema") != SCHEMA:
-            got = config.get("schema") if isinstance(config, dict) else type(config).__name__
-            raise ValueError(f"{path}: schema must be {SCHEMA}, got {repr(got)[:40]}; fit again in another folder")
+        schema = config.get("schema") if isinstance(config, dict) else None
+        if isinstance(schema, bool) or schema not in (SCHEMA, CONFIG_SCHEMA):
+            got = schema if isinstance(config, dict) else type(config).__name__
+            raise ValueError(
+                f"{path}: schema must be {SCHEMA} or {CONFIG_SCHEMA}, got {repr(got)[:40]}; fit again in another folder"
+            )
         return config
 
     def log(self, event: str, **fields: Any) -> None:

@@ -29,7 +29,8 @@ from drgs.guards.arguments import kind_of, must_be
 from drgs.guards.imports import imported_function
 from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.cache import Cache
-from drgs.information.pool import Pick, Pool, Scoring, Selection, Workers
+from drgs.information.pool import Pick, Pool, Selection, Workers
+from drgs.information.scoring import Scoring
 from drgs.policies.informed import coverage, fisher, fisherrf, moments
 from drgs.policies.spread import farthest, random, uniform
 

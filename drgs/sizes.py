@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
 
-__all__ = ["at_most", "reduced_size", "resized_alike"]
+__all__ = ["at_most", "by_share", "cropped", "reduced_size", "resized_alike"]
 
 
 def reduced_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
@@ -22,12 +25,26 @@ def at_most(camera: Camera, pixels: int) -> Camera:
     return camera.resized(*reduced_size(camera, pixels))
 
 
+def by_share(camera: Camera, share: float) -> Camera:
+    """The camera with a share of its width and of its height, a pixel of each at least."""
+    if share == 1:
+        return camera
+    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+
+
+def cropped(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """A camera that shows a part of another one's image: column `x` and row `y` of that are its first ones."""
+    K = np.array(camera.K, float)
+    K[:2, 2] -= x, y
+    return dataclasses.replace(camera, K=K, width=width, height=height)
+
+
 def resized_alike(camera: Camera, sizes: dict[tuple[int, int], tuple[int, int]]) -> Camera:
     """The camera at the size that its image probably has: images reduced after calibration are reduced alike.
 
     Args:
-        camera: Of the size that the camera file states.
-        sizes: Stated (width, height) -> that of the file, of images that have been opened.
+        camera: Camera of the size that the camera file states.
+        sizes: Stated (width, height) -> (width, height) of the file, for images that have been opened.
     """
     size = sizes.get((camera.width, camera.height))
     return camera.resized(*size) if size else camera

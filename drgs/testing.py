@@ -1,4 +1,4 @@
-"""For the tests of other people's rasterizers: one assertion, and scenes on which faults show.
+"""Tests of other people's rasterizers: one assertion, and scenes on which faults show.
 
 from drgs.testing import assert_matches
 def test_gradients():
@@ -37,12 +37,13 @@ def assert_matches(
 
     Args:
         rasterizer: A function with gsplat's argument names, or a name as `drgs crossval --rasterizer` takes it.
-        scene, cameras: What to compare on; default random scenes of `seeds`.
-        preset: What it claims to compute.
-        background: RGB; black hides what happens to the background's gradient.
+        scene: Gaussians to compare on; default random scenes of `seeds`.
+        cameras: Views of the scene; both are given, or none.
+        preset: Preset that it claims to compute, or `auto`.
+        background: RGB of the background; black hides what happens to its gradient.
         allow: Verdicts (drgs.crossval.VERDICTS) besides `agreement` that pass.
-        seeds: Of the random scenes.
-        options: Of `drgs.crossval.crossval`.
+        seeds: Seeds of the random scenes.
+        options: Further arguments of `drgs.crossval.crossval`.
     Returns:
         A `Result` a scene.
     Raises:
@@ -76,10 +77,10 @@ def random_scene(
     end), small ones (dilation), some behind the camera, quaternions of any length and sign, SH of degree 2.
 
     Args:
-        seed: Of everything.
+        seed: Seed of everything random.
         count: Number of Gaussians.
-        width, height: Of the image.
-        aspect: fy / fx; 1 for renderers that know square pixels only.
+        width, height: Size of the image in pixels.
+        aspect: Ratio fy / fx; 1 for renderers that know square pixels only.
     """
     rng = np.random.default_rng(seed)
     focal = 0.55 * width

@@ -11,6 +11,7 @@ import dataclasses
 import logging
 import math
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import ActiveConfig, FitConfig, SelectionConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from drgs.fitting.parts import Parts
     from drgs.information.pool import Workers
 
-__all__ = ["ActiveConfig", "FitConfig", "FitResult", "Trainer", "fit"]
+__all__ = ["ActiveConfig", "FitConfig", "FitResult", "SelectionConfig", "Trainer", "fit"]
 
 _log = logging.getLogger(__name__)
 
@@ -77,25 +78,26 @@ def fit(
     out_dir: str | Path,
     config: FitConfig | None = None,
     *,
-    active: ActiveConfig | None = None,
     parts: Parts | None = None,
     resume: bool = False,
     progress: bool = True,
     workers: Workers | None = None,
+    active: SelectionConfig | None = None,
 ) -> FitResult:
     """Fit Gaussians to a data set and write a run folder.
 
     Args:
         dataset: As `drgs.data.load` returns it.
         out_dir: The run folder: new, or with `resume` one that a fit of the same config has begun.
-        config: What to do; the defaults if left out.
-        active: Start with a few views and choose more on the way; the data set is best loaded with `lazy=True` and
-            without points, so that nothing of views that are not chosen is read.
+        config: What to do; the defaults if left out. With a `selection` the fit begins with a few views and chooses
+            more on the way; the data set is best loaded with `lazy=True` and without points, so that nothing of views
+            that are not chosen is read.
         parts: Terms of the loss, rates, networks and what is rendered; default those of `config`. Every fit must have
             its own: they hold networks and their optimizers.
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
         workers: Processes that compute what candidates of an active fit tell, as `drgs.select` takes them.
+        active: The config's `selection`, where it stood before; for one release.
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
             not finite.
@@ -103,11 +105,15 @@ def fit(
         KeyboardInterrupt: On Ctrl-C, SIGTERM and SIGHUP, after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
+    if active is not None:
+        text = "fit(active=...) is written fit(config=FitConfig(selection=...)); the old way ends with the next release"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        config = config.replace(selection=active)
     runtime.backend()  # sets torch's threads too, at first use
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
-            return _fit(dataset, out_dir, config, active, parts, resume, workers)
+            return _fit(dataset, out_dir, config, parts, resume, workers)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
@@ -121,20 +127,20 @@ def _fit(
     dataset: Dataset,
     out_dir: str | Path,
     config: FitConfig,
-    active: ActiveConfig | None,
     parts: Parts | None,
     resume: bool,
     workers: Workers | None,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
-    train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
+    train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
     if train:
         check_parallax(train)
         check_cameras(train)
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
-    plan = ActiveViews(active, train, config, motion is not None, workers) if active else None
-    if active and active.measure and not test:
+    selection = config.selection
+    plan = ActiveViews(train, config, motion is not None, workers) if selection else None
+    if selection and selection.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
     # Parts of a caller's own say themselves what is fitted to what.
     begun = [plan.views[i] for i in plan.chosen] if plan else train
@@ -142,8 +148,8 @@ def _fit(
     if plan and parts is None:
         plan.check_blocks({"semantic": taught is not None, "deformation": motion is not None})
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
-    frames = plan.frames() if plan else load_frames(train, config.max_pixels, config.mask)
-    held_out = load_frames(test, config.max_pixels, config.mask)
+    frames = plan.frames() if plan else load_frames(train, config.data.max_pixels, config.data.mask)
+    held_out = load_frames(test, config.data.max_pixels, config.data.mask)
     if taught and taught.embeddings:
         from drgs.fitting.segments import check_references
 
@@ -315,7 +321,8 @@ class _Loop:
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
                 # What a step has spoiled shows in the next one: good checkpoints stay until losses are finite again.
-                is_due = done % config.save_every == 0 or time.monotonic() - self._saved_at > 60 * config.save_minutes
+                late = time.monotonic() - self._saved_at > 60 * config.saving.save_minutes
+                is_due = late or done % config.saving.save_every == 0
                 if is_due and done < config.max_steps and trainer.is_sound:
                     self.save()
             self.save()
@@ -349,7 +356,7 @@ class _Loop:
         else:
             points, colors, dense = plan.points(frame, trainer.scene())
             if len(points):
-                trainer.add_points(points, colors, *trainer.config.start_of(dense))
+                trainer.add_points(points, colors, *trainer.config.density.start_of(dense))
             record["points"] = len(points)
         trainer.reserved = plan.reserved
         trainer.add_frame(frame)

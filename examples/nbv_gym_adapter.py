@@ -92,7 +92,7 @@ class NearestFirst:
     def select_views(
         self, active_indices: list[int], remaining_indices: list[int], num_to_select: int, **context: Any
     ) -> list[int]:
-        """By camera centers, in world units."""
+        """Choose by camera centers, in world units."""
         cameras = context["datamanager"].train_dataset.cameras
         centers = {i: cameras[i : i + 1].camera_to_worlds[0, :3, 3] for i in (*active_indices, *remaining_indices)}
         last = centers[active_indices[-1]] if active_indices else torch.zeros(3)
@@ -109,9 +109,9 @@ class DrgsViewSelector:
     """A policy of drgs as a selector of nbv_gym.
 
     Args:
-        policy: A name in `drgs.select.POLICIES`.
-        max_pixels: Views are scored at this size at most.
-        fields: Of `drgs.select.Scoring`, e.g. criterion="eig".
+        policy: Name in `drgs.select.POLICIES`.
+        max_pixels: Largest size that views are scored at.
+        fields: Fields of `drgs.select.Scoring`, e.g. criterion="eig".
     """
 
     def __init__(self, policy: str = "fisher", max_pixels: int = 76_800, **fields: Any) -> None:

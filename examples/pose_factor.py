@@ -32,8 +32,10 @@ def linearize(
     """Residual and Jacobian of an image at a camera's pose.
 
     Args:
-        gaussians, camera, settings: As for `drgs.render`.
-        photograph: (H, W, 3), values as the Gaussians' colors.
+        gaussians: Gaussians of the scene.
+        camera: Camera at the pose that is linearized at.
+        photograph: (H, W, 3) photograph, values as the Gaussians' colors.
+        settings: Render settings; default preset `exact`.
     Returns:
         (3 H W,) float64 render minus photograph, and (3 H W, 6) its derivative along a step in the camera's axes,
         rotation (radians) first, then translation (world units).

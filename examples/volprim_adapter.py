@@ -16,8 +16,7 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
-
-_Y0 = 0.28209479177387814
+from drgs.ellipsoids import Y_00
 
 
 def volprim_rf_basic(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
@@ -61,7 +60,7 @@ def rasterize(
         srgb: Mitsuba's `srgb_primitives`.
         sh_degree: 0..3 or None.
         backgrounds: (C, 3) or None for black.
-        near_plane: Where rays start.
+        near_plane: Distance at which rays start.
         **unused: Other options of gsplat are ignored.
     Returns:
         (C, H, W, 3) image, (C, H, W, 1) alpha, {}; float32.
@@ -70,8 +69,8 @@ def rasterize(
     """
     unit = torch.nn.functional.normalize(quats, dim=-1)[:, [1, 2, 3, 0]]  # Mitsuba's order is xyzw
     data = torch.cat([means, scales, unit], 1)
-    sh = (colors - 0.5)[:, None] / _Y0 if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
-    white = torch.full((len(means), 1, 3), 0.5 / _Y0)
+    sh = (colors - 0.5)[:, None] / Y_00 if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
+    white = torch.full((len(means), 1, 3), 0.5 / Y_00)
     images, alphas = [], []
     for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
         camera = Camera(K=_numpy(K), w2c=_numpy(pose), width=width, height=height)

@@ -25,8 +25,8 @@ def noise(rng, height, width, cells, octaves=4, stretch=1.0):
     """Value noise in [0, 1], (height, width); repeats in x, so that it closes around a revolution.
 
     Args:
-        cells: lattice cells across the width in the first octave.
-        stretch: lattice cells per unit of y, relative to x.
+        cells: Lattice cells across the width in the first octave.
+        stretch: Lattice cells per unit of y, relative to x.
     """
     import cv2
 
@@ -39,7 +39,7 @@ def noise(rng, height, width, cells, octaves=4, stretch=1.0):
         wide = cv2.resize(lattice, (3 * width, height), interpolation=cv2.INTER_CUBIC)
         total += 0.5**octave * wide[:, width : 2 * width]  # only the middle third has no seam
         weight += 0.5**octave
-    return np.clip((total / weight - 0.5) * 1.6 + 0.5, 0, 1)
+    return np.clip((total / weight - 0.5) * 1.6 + 0.5, 0, 1)  # with more contrast; cubic interpolation overshoots
 
 
 def mix(a, b, t):
@@ -83,7 +83,7 @@ def grid(points, closed=False, uv=None):
     for pole, beside in ((0, 1), (-1, -2)):  # a row shrunk to one point has no normal of its own
         if np.ptp(points[pole], axis=0).max() < 1e-9:
             normals[pole] = normals[beside].mean(0)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-20)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-20)  # of faces without an area: 0
     if uv is None:
         uv = np.stack(np.meshgrid(np.linspace(0, 1, cols), np.linspace(0, 1, rows)), -1)
     k = (np.arange(rows - 1)[:, None] * cols + np.arange(cols - 1)).ravel()
@@ -96,8 +96,10 @@ def revolve(profile, center=(0, 0, 0), turn=(0, 0, 0), segments=72, bumps=None):
 
     Args:
         profile: (rows, 2) radius and z, upward on an outer side, downward on an inner one.
-        turn: rotation vector in degrees.
-        bumps: optional (rows, segments) relative change of the radius.
+        center: (3,) shift in meters.
+        turn: Rotation vector in degrees.
+        segments: Number of faces around the axis.
+        bumps: (rows, segments) relative change of the radius, or None.
     """
     import cv2
 
@@ -152,10 +154,9 @@ def box(size, center, turn):
     corners = ((1, 5, 3, 7), (4, 0, 6, 2), (0, 4, 1, 5), (6, 2, 7, 3), (4, 6, 5, 7), (2, 0, 3, 1))
     faces = []
     for k, quad in enumerate(corners):  # lower left, lower right, upper left, upper right
-        # e: lookups stay inside their cell
         u = k % 3 / 3
         v = 0.5 - k // 3 / 2
-        e = 2e-3
+        e = 2e-3  # lookups stay inside their cell: at its border a texture is mixed with the neighbor
         uv = np.meshgrid((u + e, u + 1 / 3 - e), (v + e, v + 0.5 - e))
         faces.append(grid(p[list(quad)].reshape(2, 2, 3), uv=np.stack(uv, -1)))
     return join(faces)
@@ -180,11 +181,13 @@ def shape(name, mesh, bsdf, paint=None, two_sided=False, glow=None):
     """A Mitsuba mesh.
 
     Args:
-        bsdf: dict of a `diffuse`, `roughplastic` or conductor plugin, or a `material` that was made of it.
-        paint: picture (h, w, 3) or one color (3,) for its (diffuse) reflectance, or None.
-        two_sided: whether its back is painted as well; costs time, so only for open sheets.
-        glow: (what it radiates from its front: linear radiance (3,) or a factor on its picture, decoded;
-            its share of the light paths).
+        name: Identifier of the shape.
+        mesh: Positions, faces, texture coordinates and normals.
+        bsdf: Dict of a `diffuse`, `roughplastic` or conductor plugin, or a `material` that was made of it.
+        paint: Picture (h, w, 3) or one color (3,) for its (diffuse) reflectance, or None.
+        two_sided: Whether its back is painted as well; costs time, so only for open sheets.
+        glow: Pair of what it radiates from its front (linear radiance (3,), or a factor on its picture, decoded) and
+            its share of the light paths; None: nothing.
     """
     import mitsuba as mi
 
@@ -237,7 +240,7 @@ def sensor(K, width, height):
 
 
 def aim(sensor, c2w):
-    """Gives a sensor the pose c2w (4, 4). Mitsuba's camera has +x to the left and +y up."""
+    """Give a sensor the pose c2w (4, 4). Mitsuba's camera has +x to the left and +y up."""
     import mitsuba as mi
 
     params = mi.traverse(sensor)
@@ -280,9 +283,10 @@ def dome(views, seed, center, distance, arc, elevations):
     view, which every split holds out, does not lie at its end.
 
     Args:
-        center: (3,) target in meters; distance: meters from the origin.
+        center: (3,) target in meters.
+        distance: Distance from the origin in meters.
         arc: Degrees of azimuth covered around the -y axis.
-        elevations: Degrees, cycled through from view to view.
+        elevations: Elevations in degrees, cycled through from view to view.
     """
     rng = np.random.default_rng([seed, 1])
     poses = np.tile(np.eye(4), (views, 1, 1))
@@ -295,7 +299,7 @@ def dome(views, seed, center, distance, arc, elevations):
         eye *= distance * (1 + 0.07 * jitter[2])
         forward = center + 0.03 * distance * jitter[3:6] - eye
         forward /= np.linalg.norm(forward)
-        (right, down, _) = axes(forward).T
+        right, down, _ = axes(forward).T
         roll = np.radians(3.0 * jitter[6])
         poses[i, :3, 0] = np.cos(roll) * right + np.sin(roll) * down
         poses[i, :3, 1] = np.cos(roll) * down - np.sin(roll) * right
@@ -306,7 +310,7 @@ def dome(views, seed, center, distance, arc, elevations):
 
 def encode_srgb(linear):
     """Linear radiance to 8-bit sRGB."""
-    linear = np.clip(linear, 0, 1)
+    linear = np.clip(linear, 0, 1)  # what is brighter is overexposed
     curve = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)
 
@@ -319,7 +323,7 @@ def strata(spp):
 
 
 def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, exposure, seed=0, progress=None):
-    """Path traces `scene` and writes Nerfstudio's layout: images/, depth/, transforms.json.
+    """Path trace `scene` and write Nerfstudio's layout: images/, depth/, transforms.json.
 
     Args:
         folder: Existing folder.
@@ -345,7 +349,7 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
             image = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i)
             image = encode_srgb(np.asarray(image) * exposure)
             write_depth(folder / "depth" / name, z_depth(scene, K, c2w, width, height))
-            write_png(folder / "images" / name, image[..., ::-1])
+            write_png(folder / "images" / name, image[..., ::-1])  # as BGR
         frames.append(
             {
                 "file_path": f"images/{name}",

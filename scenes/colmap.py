@@ -6,24 +6,24 @@ import numpy as np
 
 __all__ = ["SparsePoints", "back_project", "project", "sparse_points", "write_model"]
 
-# standard deviations in every direction and along the ray, shares of the distance
-_SIDE = 0.002
-_ALONG = 0.006
-_OUTLIERS = 0.02  # share of the points that were matched wrongly, and how far along the ray they are
-_FAR = (0.6, 1.5)
+_SIDE = 0.002  # standard deviation of an error in every direction, as a share of the distance
+_ALONG = 0.006  # and of one along the ray
+_OUTLIERS = 0.02  # share of the points that were matched wrongly
+_FAR = (0.6, 1.5)  # how far along the ray these are, as a share of the distance
 _PIXEL = 0.5  # standard deviation of what is observed, in pixels
-_SLACK = 0.01  # of the depth: a point is seen where it is no deeper than the surface by more
+_SLACK = 0.01  # share of the depth: a point is seen where it is no deeper than the surface by more
 
 
 class SparsePoints:
     """Points as structure from motion would find them.
 
     Attributes:
-        xyz, exact: (n, 3) positions with and without their errors.
-        rgb: (n, 3) uint8 of the pixel that a point came from.
+        xyz: (n, 3) positions with their errors.
+        exact: (n, 3) positions without them.
+        rgb: (n, 3) uint8 color of the pixel that a point came from.
         label: (n,) class of that pixel.
-        outlier: (n,) whether it was matched wrongly.
-        tracks: For each view, (ids (k,), pixels (k, 2)) of the points that it observes.
+        outlier: (n,) whether the point was matched wrongly.
+        tracks: Pair (ids (k,), pixels (k, 2)) a view, of the points that it observes.
     """
 
     def __init__(self, xyz, exact, rgb, label, outlier, tracks):
@@ -46,7 +46,7 @@ def project(K, c2w, points):
     """(pixels (n, 2), z (n,)) of world points (n, 3)."""
     camera = (points - c2w[:3, 3]) @ c2w[:3, :3]
     z = camera[:, 2]
-    safe = np.where(z > 1e-6, z, 1e-6)
+    safe = np.where(z > 1e-6, z, 1e-6)  # a point in the camera plane would divide by 0; who asks looks at z
     return np.stack([K[0, 0] * camera[:, 0] / safe + K[0, 2], K[1, 1] * camera[:, 1] / safe + K[1, 2]], 1), z
 
 
@@ -61,9 +61,9 @@ def sparse_points(K, poses, views, count, seed):
     Args:
         K: (3, 3) intrinsics in pixels.
         poses: (views, 4, 4) camera-to-world, OpenCV axes.
-        views: Function that gives (image (h, w, 3) uint8, depth (h, w) in meters, labels (h, w)) of a view's number.
-        count: How many to draw.
-        seed: Of everything random.
+        views: Function of a view's number: (image (h, w, 3) uint8, depth (h, w) in meters, labels (h, w)).
+        count: Number of points to draw.
+        seed: Seed of everything random.
     """
     import cv2
 
@@ -74,6 +74,7 @@ def sparse_points(K, poses, views, count, seed):
         image, depth, labels = views(k)
         gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
         weight = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+        # A picture without any texture, too, has points: its weights are equal instead of 0.
         weight = ((weight + 0.1 * weight.mean() + 1e-3) * (depth > 0)).ravel().astype(np.float64)
         picked = rng.choice(weight.size, min(each, int((weight > 0).sum())), replace=False, p=weight / weight.sum())
         at = back_project(K, c2w, depth).reshape(-1, 3)[picked]
@@ -101,14 +102,15 @@ def sparse_points(K, poses, views, count, seed):
 
 
 def write_model(folder, K, poses, names, width, height, points):
-    """cameras.txt, images.txt and points3D.txt of one PINHOLE camera.
+    """Write cameras.txt, images.txt and points3D.txt of one PINHOLE camera.
 
     Args:
         folder: Existing folder.
-        K, poses: As for `sparse_points`.
+        K: (3, 3) intrinsics in pixels.
+        poses: (views, 4, 4) camera-to-world, OpenCV axes.
         names: File names of the images.
-        width, height: Of the images in pixels.
-        points: SparsePoints.
+        width, height: Size of the images in pixels.
+        points: The `SparsePoints` that the images show.
     """
     (folder / "cameras.txt").write_text(
         f"1 PINHOLE {width} {height} {K[0, 0]:.17g} {K[1, 1]:.17g} {K[0, 2]:.17g} {K[1, 2]:.17g}\n"

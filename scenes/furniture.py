@@ -67,7 +67,7 @@ def _legs(width, depth, height, thick, middle):
 
 
 def sofa(rng, color, accents):
-    """Two seats or three, and cushions."""
+    """A sofa of two seats or three, with cushions."""
     seats = int(rng.integers(2, 4))
     wide = 0.64 * seats
     fabric = fabrics.cloth(rng, color, ("plain", "checks", "plain")[rng.integers(3)], 0.85 * np.asarray(color))
@@ -87,7 +87,7 @@ def sofa(rng, color, accents):
 
 
 def coffee_table(rng, wood, clay):
-    """With books and a vase on it; its middle is at y = 0."""
+    """A low table with books and a vase on it; its middle is at y = 0."""
     wide, deep, top = rng.uniform((0.9, 0.5), (1.15, 0.62)).tolist() + [0.42]
     yield "table", slab((wide, deep, 0.035), (0, 0, top), 0.8), SATIN, wood
     yield "table", slab((wide - 0.12, deep - 0.1, 0.02), (0, 0, 0.14), 0.8), SATIN, wood
@@ -107,7 +107,7 @@ def moved_parts(parts, turn, shift):
 
 
 def vase(rng, color, height):
-    """Glazed, with bands."""
+    """A glazed vase with bands."""
     belly, neck = rng.uniform((0.26, 0.1), (0.36, 0.16))
     profile = [(0, 0), (0.2, 0), (belly, 0.35), (0.9 * belly, 0.55), (neck, 0.82), (neck + 0.06, 1.0), (neck, 0.99)]
     mesh = revolve(spline(np.array([*profile, (0.8 * neck, 0.7), (0, 0.6)]) * height, 60), segments=48)
@@ -128,7 +128,7 @@ def table(rng, wood):
 
 
 def chair(wood, seat):
-    """Its middle is at y = 0, its front toward +y."""
+    """A chair; its middle is at y = 0, its front toward +y."""
     frame = _legs(0.42, 0.42, 0.45, 0.04, 0)
     frame += [slab((0.04, 0.035, 0.5), (s * 0.19, -0.2, 0.68), 0.5) for s in (-1, 1)]
     frame += [slab((0.36, 0.025, h), (0, -0.2, z), 0.5) for z, h in ((0.88, 0.09), (0.74, 0.05), (0.62, 0.05))]
@@ -137,7 +137,7 @@ def chair(wood, seat):
 
 
 def bookcase(rng, wood, clay):
-    """Five boards, rows of books, and a vase."""
+    """A bookcase of five boards, with rows of books and a vase."""
     wide = rng.uniform(0.9, 1.25)
     deep = 0.3
     high = rng.uniform(1.85, 2.05)
@@ -184,7 +184,7 @@ def cabinet(rng, wood, clay):
 
 
 def floor_lamp(rng, at_height=1.5):
-    """A foot, a pole and a shade that glows."""
+    """A lamp of a foot, a pole and a shade that glows."""
     foot = revolve(np.array([(0.15, 0), (0.15, 0.02), (0.02, 0.035), (0.014, 0.05)]), segments=48)
     pole = tube(np.array([(0, 0, 0.03), (0, 0, 0.7), (0, 0, at_height)]), 0.013)
     yield "lamp", join([foot, pole]), METAL, (64, 54, 44)
@@ -198,7 +198,7 @@ def floor_lamp(rng, at_height=1.5):
 
 
 def pendant():
-    """A drum under the ceiling z = 0 that glows."""
+    """A lamp under the ceiling z = 0, a drum that glows."""
     drum = revolve(np.array([(0.28, -0.172), (0.29, -0.16), (0.29, -0.05), (0.27, -0.04)]), segments=64)
     yield "lamp", drum, MATTE, (236, 226, 204)
     disk = revolve(np.array([(0.0, -0.17), (0.28, -0.17)]), segments=48)
@@ -207,7 +207,7 @@ def pendant():
 
 
 def plant(rng, clay):
-    """A pot and broad leaves."""
+    """A plant of a pot and broad leaves."""
     pot = [(0, 0), (0.13, 0), (0.17, 0.3), (0.18, 0.31), (0.165, 0.31), (0.15, 0.27), (0, 0.26)]
     yield "plant", revolve(np.array(pot), segments=48), SATIN, clay
     leaves, stems = [], []
@@ -230,7 +230,7 @@ def plant(rng, clay):
 
 
 def picture(rng, kind, width, height, middle):
-    """Framed, on the wall."""
+    """A framed picture on the wall."""
     yield (
         "picture",
         slab((width + 0.07, 0.03, height + 0.07), (0, 0.015, middle), 0.4),
@@ -241,7 +241,7 @@ def picture(rng, kind, width, height, middle):
 
 
 def door(rng, color):
-    """A leaf with panels, its frame and a handle."""
+    """A door of a leaf with panels, its frame and a handle."""
     yield "door", slab((0.86, 0.03, 2.04), (0, 0.02, 1.02), 1, fit=True), SATIN, fabrics.panel(rng, color)
     frame = [slab((0.09, 0.05, 2.12), (s * 0.475, 0.025, 1.06), 1) for s in (-1, 1)]
     yield "door", join([*frame, slab((1.04, 0.05, 0.09), (0, 0.025, 2.085), 1)]), SATIN, 0.92 * np.asarray(color)
@@ -250,7 +250,7 @@ def door(rng, color):
 
 
 def window(rng, width, height, middle, glow):
-    """A frame with bars and a sill, and daylight."""
+    """A window of a frame with bars and a sill, and daylight."""
     yield "window", flat(width, height, (0, 0.012, middle)), MATTE, fabrics.outdoors(rng), False, glow
     low = middle - height / 2
     high = middle + height / 2
@@ -262,7 +262,7 @@ def window(rng, width, height, middle, glow):
 
 
 def curtain(rng, color, accent, width, top, side):
-    """One cloth in folds, from a rod at `top` nearly to the floor, left (-1) or right (1) of a window."""
+    """A curtain of one cloth in folds, from a rod at `top` nearly to the floor, left (-1) or right (1) of a window."""
     u, v = np.meshgrid(np.linspace(0, 1, 90), np.linspace(0, 1, 24))
     folds = 0.035 * np.sin(2 * np.pi * 5.5 * u + rng.uniform(0, 6) + 0.5 * v) * (0.6 + 0.4 * v)
     x = side * (width / 2 + 0.14) + (u - 0.5) * 0.44

@@ -56,15 +56,14 @@ _JELLIES = (((150, 16, 40), (214, 60, 78)), ((36, 110, 40), (120, 176, 70)), ((1
 _WOODS = (((92, 56, 32), (172, 116, 70)), ((132, 92, 56), (208, 164, 112)), ((54, 38, 30), (112, 80, 58)))
 _CLAYS = ((178, 84, 56), (150, 110, 86), (112, 122, 128))
 _WORDS = ("FLOUR", "SUGAR", "SALT", "RICE")
-_STATIONS = ((-0.285, -0.005), (0.0, -0.02), (0.285, 0.0))  # (x, y) in front
+_SPOTS = ((-0.285, -0.005), (0.0, -0.02), (0.285, 0.0))  # (x, y) in front
 _BACK = ((-0.38, 0.235), (-0.145, 0.25), (0.125, 0.25), (0.365, 0.235))  # (x, y) along the wall
 
 _FOV_X = 46.0  # degrees across the image width
-_TARGET = (0.0, 0.05, 0.085)
-# degrees, meters, degrees
-_ARC = 88.0
-_DISTANCE = 1.08
-_ELEVATIONS = (20.0, 33.0)
+_TARGET = (0.0, 0.05, 0.085)  # what all cameras look at, in meters
+_ARC = 88.0  # degrees of azimuth that they cover
+_DISTANCE = 1.08  # meters from the target
+_ELEVATIONS = (20.0, 33.0)  # degrees, of every other camera
 _EXPOSURE = 1.25
 # Samples of the lights, beside one of the surface, of each light path; the light `room` stands for further bounces.
 _LIGHT_SAMPLES = 3
@@ -72,11 +71,11 @@ _POINTS = 8000  # sparse points that are drawn
 
 
 def parts(seed):
-    """Yields what is in the kitchen: `Mover`s, and for what stands still the arguments of `scenes.shape`."""
+    """Yield what is in the kitchen: `Mover`s, and for what stands still the arguments of `scenes.shape`."""
     rng = np.random.default_rng([seed, 31])
     accents = rng.permutation(np.array(_ACCENTS))
     light = rng.permutation(np.array(_LIGHT))
-    order = list(itertools.permutations(_STATIONS))[(5 * seed + 2) % 6]  # six seeds, six arrangements
+    order = list(itertools.permutations(_SPOTS))[(5 * seed + 2) % 6]  # six seeds, six arrangements
     for_mug, for_jelly, for_tongs = (np.array(at) + rng.uniform(-0.012, 0.012, 2) for at in order)
     back = [np.array(at) + rng.uniform(-0.02, 0.02, 2) * (1, 0.5) for at in rng.permutation(np.array(_BACK))]
     word = rng.permutation(np.array(_WORDS))
@@ -123,7 +122,7 @@ class Stage:
         self._parameters = mi.traverse(self.scene)
 
     def set(self, time):
-        """Moves what moves to where it is at a time in [0, 1]."""
+        """Move what moves to where it is at a time in [0, 1]."""
         import mitsuba as mi
 
         for key, mover in self.movers.items():
@@ -176,13 +175,13 @@ def arc(cameras, seed):
 
 # ------------------------------------------------------------------------------- data set
 class _Recording:
-    """Films a kitchen into a folder, frame by frame, and makes the data set of what was filmed."""
+    """A kitchen that is filmed into a folder, frame by frame, and the data set of what was filmed."""
 
     def __init__(self, folder, poses, times, size, teacher_size, spp, seed):
         self.folder = folder
         self.poses = poses
         self.times = times
-        (self.width, self.height) = size
+        self.width, self.height = size
         self.teacher_size = teacher_size
         self.spp = scenes.strata(spp)
         self.seed = seed
@@ -211,7 +210,7 @@ class _Recording:
         )
 
     def film(self, progress):
-        """Every frame that is not finished; the image comes last, and with it the frame is.
+        """Trace every frame that is not finished; the image comes last, and with it the frame is.
 
         A camera's light paths are drawn by the same numbers at all times: where nothing changes, neither do pixels.
         """
@@ -226,7 +225,7 @@ class _Recording:
                     progress(k * len(self.poses) + c + 1, count)
 
     def _trace(self, camera, k):
-        """One frame: labels, features, image."""
+        """Trace one frame: labels, features, image."""
         import mitsuba as mi
 
         image_path, label_path, feature_path = self.paths(camera, k)
@@ -241,7 +240,8 @@ class _Recording:
         image = mi.render(self.stage.scene, sensor=sensor, integrator=integrator, spp=self.spp, seed=seed)
         output.write_png(label_path, labels)
         output.write_file(feature_path, teacher.tensor_bytes(feature))
-        output.write_png(image_path, scenes.encode_srgb(np.asarray(image) * _EXPOSURE)[..., ::-1])
+        image = scenes.encode_srgb(np.asarray(image) * _EXPOSURE)
+        output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the frame is finished
 
     def _seen(self, camera):
         """(labels, world points, depth) of the surfaces at a camera's pixel centers."""
@@ -250,7 +250,7 @@ class _Recording:
         return self.stage.table[numbers], back_project(self.K, c2w, depth), depth
 
     def finish(self):
-        """What belongs to all frames; with poses_bounds.npy, the last file, the data set is complete."""
+        """Write what belongs to all frames; with poses_bounds.npy, the last file, the data set is complete."""
         import cv2
 
         folder = self.folder
@@ -286,7 +286,7 @@ class _Recording:
         return cv2.imread(str(self.paths(camera, k)[1]), cv2.IMREAD_UNCHANGED)
 
     def _write_frame0(self, views):
-        """The COLMAP model of frame 0; views: (image, depth, labels) of each camera. cam00 stays out of the points."""
+        """Write the COLMAP model of frame 0 from each camera's (image, depth, labels); cam00 gives it no points."""
         rest = slice(1, None) if len(views) > 1 else slice(None)
         points = sparse_points(self.K, self.poses[rest], views[rest].__getitem__, _POINTS, self.seed)
         if len(views) > 1:
@@ -309,7 +309,7 @@ def generate(
     teacher_height=45,
     progress=None,
 ) -> Path:
-    """Makes the data set, unless `out_dir` already holds it; an interrupted call is continued.
+    """Make the data set, unless `out_dir` already holds it; an interrupted call is continued.
 
     Noise of a pixel at the defaults (standard deviation of the sRGB value in [0, 1], five views, two seeds of the light
     paths): 0.019 RMS, 34.6 dB. Time at the defaults: 1.0 seconds of processor a frame, of 600. 1.7 GB, nearly all of
@@ -318,17 +318,15 @@ def generate(
     Args:
         out_dir: Folder to make. Everything appears in it when it is complete; a kill loses the frame that is being
             traced. One made here with other parameters is replaced; anything else that is not empty is refused.
-        cameras: On the arc.
-        times: Frames of each camera.
-        width, height: Of the frames in pixels, even numbers.
+        cameras: Number of cameras on the arc.
+        times: Number of frames of each camera.
+        width, height: Size of the frames in pixels, even numbers.
         spp: Light paths a pixel.
-        seed: Of the things, their motions, the cameras, the light paths, the sparse points and the teacher's errors.
+        seed: Seed of things, motions, cameras, light paths, sparse points and the teacher's errors.
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the frames are.
-        progress: Called as progress(frames done, frames) after each frame.
-
+        progress: Function that is called with (frames done, frames) after each frame.
     Returns:
         `out_dir` as a Path.
-
     Raises:
         ValueError: If a number is out of range or `out_dir` holds something else.
     """

@@ -13,11 +13,10 @@ def build(parts, classes, lights=None):
     """A scene, and the class of each of its shapes.
 
     Args:
-        parts: List of the arguments of `scenes.shape`, whose names are classes; the k-th one has the identifier
-            ``part{k:03d}``.
-        classes: Names, of which labels are the numbers from 1.
-        lights: What else is in the scene, as `mi.load_dict` takes it.
-
+        parts: Arguments of `scenes.shape` of each part, whose names are classes; the k-th one has the identifier
+            `part{k:03d}`.
+        classes: Names of the classes, of which labels are the numbers from 1.
+        lights: Dict of what else is in the scene, as `mi.load_dict` takes it.
     Returns:
         The Mitsuba scene, and (numbers,) uint8 labels by Dr.Jit's number of a shape, as `scenes.first_hits` gives it;
         0 for lights and for none.

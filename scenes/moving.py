@@ -31,9 +31,9 @@ class Mover:
     """A part that moves.
 
     Attributes:
-        name: Its class.
-        at: Mesh (`scenes.grid`'s four arrays) at a time in [0, 1]; faces and texture coordinates stay the same.
-        bsdf, paint, two_sided: As for `scenes.shape`.
+        name: Class of the part.
+        at: Function of a time in [0, 1]: the mesh (`scenes.grid`'s four arrays); faces and texture coordinates stay.
+        bsdf, paint, two_sided: Arguments of `scenes.shape`.
     """
 
     name: str
@@ -70,8 +70,8 @@ def _wave(rng, low, high):
 
 
 # ---------------------------------------------------------------------------------- rigid
-def mug(rng, station, color, accent):
-    """Slides on a small ellipse around `station` (x, y) and turns, back and forth."""
+def mug(rng, spot, color, accent):
+    """A mug that slides on a small ellipse around `spot` (x, y) and turns, back and forth."""
     profile = [(0, 0), (0.036, 0), (0.043, 0.005), (0.046, 0.03), (0.045, 0.085), (0.048, 0.108), (0.046, 0.11)]
     body = revolve(spline(np.array([*profile, (0.042, 0.09), (0.041, 0.02), (0.036, 0.009), (0, 0.008)]), 80))
     curve = [(0.044, 0, 0.09), (0.07, 0, 0.092), (0.083, 0, 0.06), (0.068, 0, 0.03), (0.044, 0, 0.026)]
@@ -82,7 +82,7 @@ def mug(rng, station, color, accent):
 
     def pose(time):
         angle = np.radians(start + 130 * slide(time))
-        shift = np.array([*(station + radii * (np.cos(angle), np.sin(angle))), 0.0])
+        shift = np.array([*(spot + radii * (np.cos(angle), np.sin(angle))), 0.0])
         return _rotation(np.radians(start + 110 * spin(time)) * _UP), shift
 
     yield Mover("mug", _rigid(body, pose), GLAZE, _glaze(rng, color, accent))
@@ -114,7 +114,7 @@ def _glaze(rng, color, accent, height=256, width=512):
 
 
 def orange(rng, start, end):
-    """Rolls from `start` to `end` (x, y) and back, without slipping."""
+    """An orange that rolls from `start` to `end` (x, y) and back, without slipping."""
     phi = np.linspace(-np.pi / 2, np.pi / 2, 48)
     ball = revolve(ORANGE * np.stack([np.cos(phi), np.sin(phi)], 1), turn=(90, 25, 0), segments=64)
     start = np.asarray(start)
@@ -150,15 +150,15 @@ def _peel(rng, height=256, width=512):
 
 
 # ---------------------------------------------------------------------------- articulated
-def tongs(rng, station, accent):
-    """Two arms on a pin close on what lies at `station` (x, y), open, and are lifted a little meanwhile."""
+def tongs(rng, spot, accent):
+    """Tongs of two arms on a pin that close on what lies at `spot` (x, y), open, and are lifted a little meanwhile."""
     turn = np.radians(rng.uniform(-25, 25))
     lean = np.radians(rng.uniform(12, 26) * (1 if rng.random() < 0.5 else -1))
     base = _rotation(turn * _UP) @ _rotation((lean, 0, 0))
     grasp = _wave(rng, 1.6, 2.2)
     lift = _wave(rng, 0.8, 1.1)
     rock = _wave(rng, 0.7, 1.0)
-    tip = np.array([*station, LEMON])
+    tip = np.array([*spot, LEMON])
     closed = np.arcsin((LEMON + 0.004) / _ARM)
 
     def pose(time):
@@ -202,8 +202,8 @@ def _arm(side):
 
 
 # ------------------------------------------------------------------------------ deforming
-def jelly(rng, station, colors):
-    """Wobbles on its plate at `station` (x, y): squashed and stretched at constant volume, sheared and twisted."""
+def jelly(rng, spot, colors):
+    """A jelly that wobbles on its plate at `spot` (x, y): squashed at constant volume, sheared and twisted."""
     profile = [(0.098, 0.0), (0.1, 0.008), (0.094, 0.04), (0.083, 0.075), (0.066, 0.1), (0.045, 0.112)]
     profile = spline(np.array([*profile, (0.02, JELLY), (0, JELLY)]), 60)
     lobes = int(rng.integers(8, 13))
@@ -225,7 +225,7 @@ def jelly(rng, station, colors):
         high = z + strain * JELLY * np.where(h < 0.5, h**2, h - 0.25)  # its derivative is `stretch`: no volume is lost
         moved = c * x - s * y + much[1] * shear_x(time) * h**1.5 * high, s * x + c * y
         points = np.stack([moved[0], moved[1] + much[2] * shear_y(time) * h**1.5 * high, high], -1)
-        return grid(points.reshape(*shape, 3) + (*station, 0.012), closed=True, uv=uv)
+        return grid(points.reshape(*shape, 3) + (*spot, 0.012), closed=True, uv=uv)
 
     v = np.linspace(1, 0, 256)[:, None].repeat(512, 1)
     paint = ramp(np.clip(v + 0.25 * (noise(rng, 256, 512, 12, 4) - 0.5), 0, 1), colors[0], colors[0], colors[1])
@@ -237,7 +237,7 @@ def jelly(rng, station, colors):
 
 
 def towel(rng, middle, color, accent):
-    """Hangs from a rail, its upper edge's middle at `middle` (x, y, z), and sways before the wall."""
+    """A towel that hangs from a rail, its upper edge's middle at `middle` (x, y, z), and sways before the wall."""
     wide, long = rng.uniform((0.19, 0.2), (0.23, 0.23))
     v, u = np.meshgrid(np.linspace(0, 1, 36), np.linspace(-0.5, 0.5, 30), indexing="ij")
     waves = [_wave(rng, *r) for r in ((1.0, 1.5), (1.6, 2.2), (0.8, 1.2))]

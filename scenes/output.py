@@ -18,12 +18,11 @@ _PARTIAL = ".drgs.scene"
 
 
 def check_numbers(values, where):
-    """Refuses numbers of a data set that are none.
+    """Refuse numbers of a data set that are none.
 
     Args:
         values: Name -> number: views, seed, sizes in pixels, light paths a pixel.
-        where: Who asks, for the error.
-
+        where: Name of who asks, for the error.
     Raises:
         ValueError: If one is not an integer in its range.
     """
@@ -36,22 +35,20 @@ def check_numbers(values, where):
 
 
 def publish(out_dir, parameters, fill, where):
-    """Makes a folder whose params.json comes last: with it, the folder is complete, whenever the process dies.
+    """Make a folder whose params.json comes last: with it, the folder is complete, whenever the process dies.
 
     Until then everything lies in a hidden folder in it, `.drgs.scene`: an interrupted call with the same parameters
     goes on there, one with others starts anew.
 
     Args:
-        out_dir: Path to make. A folder published with the same parameters is kept, one published
-            with others is replaced, and one that holds anything else is refused.
+        out_dir: Folder to make. One that was published with the same parameters is kept, one that was published with
+            others is replaced, and one that holds anything else is refused.
         parameters: JSON-serializable dict that determines the content.
-        fill: Called with the hidden folder to write the content into. What an interrupted call has left
-            is still there: it must keep whatever is finished and write the rest, each file at once (`write_file`).
-        where: Who asks, for the error.
-
+        fill: Function that is called with the hidden folder to write the content into. What an interrupted call has
+            left is still there: it must keep whatever is finished and write the rest, each file at once (`write_file`).
+        where: Name of who asks, for the error.
     Returns:
         `out_dir`.
-
     Raises:
         ValueError: If `out_dir` holds something that was not published here, or was changed since.
     """
@@ -109,7 +106,7 @@ def _content(output):
 
 
 def write_file(path, content):
-    """Writes bytes under a name that appears when they are complete."""
+    """Write bytes under a name that appears when they are complete."""
     hidden = _part(path)
     try:
         hidden.write_bytes(content)
@@ -125,12 +122,12 @@ def _part(path):
 
 
 def write_png(path, picture):
-    """Writes a picture, BGR or gray, at once."""
+    """Write a picture, BGR or gray, at once."""
     import cv2
 
     write_file(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def write_depth(path, depth):
-    """Writes depth in meters as 16-bit multiples of `DEPTH_UNIT`."""
+    """Write depth in meters as 16-bit multiples of `DEPTH_UNIT`."""
     write_png(path, np.minimum(np.rint(depth / DEPTH_UNIT), 65535).astype(np.uint16))

@@ -95,7 +95,7 @@ def _pick(rng, choices):
 
 
 def parts(seed):
-    """Yields the arguments of `scenes.shape` for everything in the room; names are classes."""
+    """Yield the arguments of `scenes.shape` for everything in the room; names are classes."""
     layout = Layout(seed)
     rng, sunny, cozy = layout.rng, layout.sunny, layout.cozy
     yield from _shell(layout)
@@ -151,7 +151,7 @@ def parts(seed):
 def _shell(layout):
     """Walls with baseboards, floor and ceiling."""
     rng = layout.rng
-    (x, y, z) = layout.size
+    x, y, z = layout.size
     accent, plain = rng.permutation(len(_WALLS))[:2]
     for wall in range(4):
         color, kind = _WALLS[accent if wall == layout.cozy else plain]
@@ -219,11 +219,11 @@ def _intrinsics(width, height):
 
 
 class _Views:
-    """Traces the views of a room into a folder, and reads them again."""
+    """The views of a room in a folder: traced into it, and read again."""
 
     def __init__(self, folder, size, teacher_size, spp, seed):
         self.folder = folder
-        (self.width, self.height) = size
+        self.width, self.height = size
         self.teacher_size = teacher_size
         self.spp = scenes.strata(spp)
         self.seed = seed
@@ -242,7 +242,7 @@ class _Views:
         )
 
     def trace(self, built, table, poses, progress):
-        """Every view that is not finished; the image comes last, and with it the view is."""
+        """Trace every view that is not finished; the image comes last, and with it the view is."""
         import mitsuba as mi
 
         camera = scenes.sensor(self.K, self.width, self.height)
@@ -260,7 +260,8 @@ class _Views:
                 output.write_png(label_path, labels)
                 output.write_depth(depth_path, depth)
                 output.write_file(feature_path, teacher.tensor_bytes(feature))
-                output.write_png(image_path, scenes.encode_srgb(np.asarray(image) * _EXPOSURE)[..., ::-1])
+                image = scenes.encode_srgb(np.asarray(image) * _EXPOSURE)
+                output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the view is finished
             if progress is not None:
                 progress(k + 1, len(poses))
 
@@ -273,7 +274,7 @@ class _Views:
         return cv2.imread(image)[..., ::-1].copy(), depth, cv2.imread(labels, cv2.IMREAD_UNCHANGED)
 
     def finish(self, poses, test_every):
-        """What belongs to all views: the COLMAP model, names, and how good the teacher is."""
+        """Write what belongs to all views: the COLMAP model, names, and how good the teacher is."""
         folder = self.folder
         count = len(poses)
         names = [self.paths(k)[0].name for k in range(count)]
@@ -299,7 +300,7 @@ def generate(
     test_every=TEST_EVERY,
     progress=None,
 ) -> Path:
-    """Makes the data set, unless `out_dir` already holds it; an interrupted call is continued.
+    """Make the data set, unless `out_dir` already holds it; an interrupted call is continued.
 
     Noise of a pixel at the defaults (standard deviation of the sRGB value in [0, 1], five views, two seeds of the light
     paths): 0.017 RMS. Time at the defaults: 341 seconds of processor, 5.4 minutes by the clock on two cores that others
@@ -308,18 +309,16 @@ def generate(
     Args:
         out_dir: Folder to make. Everything appears in it when it is complete; a kill loses the view that is being
             traced. One made here with other parameters is replaced; anything else that is not empty is refused.
-        views: Cameras along the way.
+        views: Number of cameras along the way.
         width, height: Image size in pixels.
         spp: Light paths a pixel.
-        seed: Of the room, the poses, the light paths, the sparse points and the teacher's errors.
+        seed: Seed of the room, the poses, the light paths, the sparse points and the teacher's errors.
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the images are.
-        test_every: Every how many of the views, from the first, one is for testing: drawn along the same way as the
-            others. 3 gives 25 of 75.
-        progress: Called as progress(views done, views) after each view.
-
+        test_every: Distance of two test views among the views, counted from the first; they are drawn along the same
+            way as the others. 3 gives 25 of 75.
+        progress: Function that is called with (views done, views) after each view.
     Returns:
         `out_dir` as a Path.
-
     Raises:
         ValueError: If a number is out of range or `out_dir` holds something else.
     """

@@ -181,7 +181,7 @@ def _stone(rng, size=1024, tiles=14):
 
 # -------------------------------------------------------------------------------- objects
 def _room(rng):
-    """Yields the arguments of `scenes.shape` for what stands around."""
+    """Yield the arguments of `scenes.shape` for what stands around."""
     mesh = list(revolve(np.array([[1.9, 1.25], [1.9, -0.75]]), segments=128))
     mesh[2] = mesh[2] * (1, -1) + (0, 1)  # its profile runs downward because it is seen from inside
     yield "wall", mesh, _MATTE, _wallpaper(rng)
@@ -197,7 +197,7 @@ def _room(rng):
 
 
 def _objects(rng):
-    """Yields the arguments of `scenes.shape` for what stands on the table."""
+    """Yield the arguments of `scenes.shape` for what stands on the table."""
     t = np.linspace(-0.5, 0.5, 90)
     x, y = np.meshgrid(t * 0.62, t * 0.5)
     waves = np.maximum(0, np.sin(24 * x + 9 * y + 1)) ** 2
@@ -338,7 +338,7 @@ def _intrinsics(width, height):
 
 # ------------------------------------------------------------------------------- data set
 def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=None) -> Path:
-    """Makes the data set, unless `out_dir` already holds it.
+    """Make the data set, unless `out_dir` already holds it.
 
     Noise of a pixel at the defaults (standard deviation of the sRGB value in [0, 1], six views, two
     seeds of the light paths): 0.017 RMS. Time at the defaults: 77 seconds of processor; 49 to 121
@@ -347,15 +347,13 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
     Args:
         out_dir: Folder to make. It appears when it is complete. One made here with other
             parameters is replaced; anything else that is not empty is refused.
-        views: Cameras on the dome.
+        views: Number of cameras on the dome.
         width, height: Image size in pixels.
         spp: Light paths a pixel.
-        seed: Of the textures, shapes, poses and light paths.
-        progress: Called as progress(views done, views) after each view.
-
+        seed: Seed of the textures, shapes, poses and light paths.
+        progress: Function that is called with (views done, views) after each view.
     Returns:
         `out_dir` as a Path.
-
     Raises:
         ValueError: If a number is out of range or `out_dir` holds something else.
     """

@@ -113,9 +113,9 @@ def _utensil(kind, accent):
     yield "utensil", join([neck, *head]), METAL, (170, 172, 176) if kind else (62, 62, 66)
 
 
-def board(rng, station, wood):
-    """A board for cutting at `station` (x, y), 14 mm thick."""
-    yield "board", slab((0.25, 0.2, 0.014), (*station, 0.007), 0.3, rng.uniform(-18, 18)), SATIN, wood
+def board(rng, spot, wood):
+    """A board for cutting at `spot` (x, y), 14 mm thick."""
+    yield "board", slab((0.25, 0.2, 0.014), (*spot, 0.007), 0.3, rng.uniform(-18, 18)), SATIN, wood
 
 
 def lemon(rng, place, scale=1.0):
@@ -130,10 +130,10 @@ def lemon(rng, place, scale=1.0):
     yield "lemon", revolve(profile, place, (90, 0, rng.uniform(-180, 180)), segments=48), SATIN, paint
 
 
-def plate(rng, station, color, accent):
-    """Under the jelly at `station` (x, y)."""
+def plate(rng, spot, color, accent):
+    """The plate under the jelly at `spot` (x, y)."""
     profile = [(0, 0), (0.07, 0), (0.085, 0.004), (0.128, 0.013), (0.13, 0.016), (0.118, 0.0145), (0.09, 0.0115)]
-    mesh = revolve(spline(np.array([*profile, (0, 0.0115)]), 60), (*station, 0), segments=96)
+    mesh = revolve(spline(np.array([*profile, (0, 0.0115)]), 60), (*spot, 0), segments=96)
     v = np.linspace(1, 0, 256)[:, None].repeat(64, 1)
     paint = ramp(noise(rng, 256, 64, 8, 3), 0.95 * np.asarray(color), color)
     for low, high in ((0.40, 0.43), (0.50, 0.56)):

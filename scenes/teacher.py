@@ -55,10 +55,9 @@ CONFUSED = {
     "cabinet": "shelf", "shelf": "cabinet", "book": "shelf", "lamp": "vase", "vase": "lamp", "plant": "vase",
 }  # fmt: skip
 _NORM = 4.0
-# where a normal field of unit variance exceeds its 92 % and 97 % quantile
-_PATCH = 1.405
-_PLACE = 1.881
-_PATCH_ALONE = 1.239  # and 89.2 %: what both together leave right, 0.92 * 0.97
+_PATCH = 1.405  # a normal field of unit variance exceeds its 92 % quantile there
+_PLACE = 1.881  # and its 97 % quantile there
+_PATCH_ALONE = 1.239  # and its 89.2 % quantile: what both together leave right, 0.92 * 0.97
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,15 +114,16 @@ def feature_map(labels, points, names, size, seed, view, confusions=ROOM):
     Args:
         labels: (height, width) clean classes, 1-based, 0 for none.
         points: (height, width, 3) world points of the pixels in meters; None where they are not known.
-        names: of the classes.
+        names: Names of the classes.
         size: (w, h) of the map, at most the labels' own.
-        seed, view: of the errors.
-        confusions: what is taken for what.
+        seed: Seed of the embeddings and of the errors.
+        view: Number of the view, which has errors of its own.
+        confusions: What is taken for what.
     """
     import cv2
 
     rng = np.random.default_rng([seed, 13, view])
-    (w, h) = size
+    w, h = size
     count = len(names)
     vectors = embeddings(names, seed, confusions)
     height, width = labels.shape
@@ -153,7 +153,7 @@ def feature_map(labels, points, names, size, seed, view, confusions=ROOM):
 
     shares += 0.12 * _smooth(rng, h, w, 4.0, count)
     feature = shares.reshape(-1, count) @ vectors
-    feature /= np.maximum(np.linalg.norm(feature, axis=1, keepdims=True), 1e-6)
+    feature /= np.maximum(np.linalg.norm(feature, axis=1, keepdims=True), 1e-6)  # 0 where no class is
     feature += 0.4 / np.sqrt(DIMENSIONS) * rng.standard_normal(feature.shape, dtype=np.float32)
     feature *= _NORM * (1 + 0.1 * _smooth(rng, h, w, 4.0, 1).reshape(-1, 1))
     return np.ascontiguousarray(feature.T.reshape(DIMENSIONS, h, w).astype(np.float16))
@@ -188,8 +188,8 @@ def accuracy(pairs, vectors):
     """Share of the labelled pixels whose class the teacher's features give back.
 
     Args:
-        pairs: of (feature map, clean labels (height, width)).
-        vectors: embeddings (classes, 512).
+        pairs: Pairs of a feature map and clean labels (height, width).
+        vectors: (classes, 512) embeddings.
     """
     right = total = 0
     for feature, labels in pairs:

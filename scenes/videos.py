@@ -12,7 +12,7 @@ RATE = 30.0  # frames a second
 
 
 def write(path, frames):
-    """Writes frames (h, w, 3) uint8 BGR as FFV1 in an .mp4, at once: what is read again is equal to the bit.
+    """Write frames (h, w, 3) uint8 BGR as FFV1 in an .mp4, at once: what is read again is equal to the bit.
 
     Measured on 40 frames of a kitchen, 160x120: OpenCV's MPEG-4 (`mp4v`) comes back with a PSNR of 30.1 dB, its VP9
     with 31.7 dB, and neither takes a quality; FFV1 without any error, at 3/4 of PNG's size. OpenCV's wheels have no
@@ -30,7 +30,7 @@ def write(path, frames):
             codec = cv2.VideoWriter_fourcc(*"FFV1")
             writer = cv2.VideoWriter(str(hidden), cv2.CAP_FFMPEG, codec, RATE, frame.shape[1::-1])
         writer.write(frame)
-        count = count + 1
+        count += 1
         last = frame
     writer.release()
     reader = cv2.VideoCapture(str(hidden))

@@ -19,10 +19,11 @@ from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import fitted_views
 from drgs.fitting.timetable import initial_views
+from drgs.information.prior import Prior
 from drgs.train import FitConfig, Trainer, fit
 
 SIZE = 24
@@ -118,13 +119,13 @@ def lazily(folder, **options):
 
 
 def config(**fields):
-    return FitConfig(
+    return FitConfig.of(
         **{"max_steps": 16, "max_gaussians": 60, "sh_degree": 1, "test_every": 4, "save_every": 1000, **fields}
     )
 
 
 def plan(**fields):
-    return ActiveConfig(**{"policy": "farthest", "initial": 2, "add": 2, "every": 4, **fields})
+    return SelectionConfig.of(**{"policy": "farthest", "initial": 2, "add": 2, "every": 4, **fields})
 
 
 # ---- nothing is read before it is picked
@@ -135,7 +136,7 @@ def test_transforms_files_are_opened_after_the_pick(still, tmp_path, opened, pol
     """Image, mask and depth of a view are opened only once it is picked; of others never."""
     dataset = lazily(still)
     assert not reads(opened, still)
-    fit(dataset, tmp_path / "run", config(), active=plan(policy=policy), progress=False)
+    fit(dataset, tmp_path / "run", config(selection=plan(policy=policy)), progress=False)
     picks = json.loads((tmp_path / "run/selection.json").read_text())["picks"]
     names = [pick["name"] for pick in picks]
     found = reads(opened, still)
@@ -162,7 +163,7 @@ def test_colmap_files_are_opened_after_the_pick(tmp_path, opened):
     images.write_bytes(whole)
     (target / "points3D.bin").write_bytes(b"garbage")
     opened.clear()
-    fit(lazily(data), tmp_path / "run", config(), active=plan(), progress=False)
+    fit(lazily(data), tmp_path / "run", config(selection=plan()), progress=False)
     assert not [text for text in opened if "points3D" in text and str(data) in text]
     record = json.loads((tmp_path / "run/selection.json").read_text())
     assert [view["name"] for view in record["start"]] == ["im1", "im7"]
@@ -178,13 +179,13 @@ def test_views_that_are_never_picked_may_be_broken(tmp_path, kind):
     """What no hook can see, reads by native code, would stumble here: other views' files hold no image."""
     write = {"transforms": write_transforms, "llff": write_llff, "colmap": write_colmap}[kind]
     write(tmp_path / "data", count=9)
-    fit(lazily(tmp_path / "data"), tmp_path / "a", config(), active=plan(), progress=False)
+    fit(lazily(tmp_path / "data"), tmp_path / "a", config(selection=plan()), progress=False)
     seen = fitted_views(Run(tmp_path / "a"))
     dataset = lazily(tmp_path / "data")
     for view in dataset.split(4)[0]:
         if view.name not in seen:
             view.image_path.write_bytes(b"no image")
-    fit(lazily(tmp_path / "data"), tmp_path / "b", config(), active=plan(), progress=False)
+    fit(lazily(tmp_path / "data"), tmp_path / "b", config(selection=plan()), progress=False)
     assert fitted_views(Run(tmp_path / "b")) == seen
 
 
@@ -193,7 +194,7 @@ def test_broken_files_are_found_when_picked(tmp_path):
     write_transforms(tmp_path / "data", count=9)
     write_image(tmp_path / "data/images/3.png", gradient(20, 20))
     with pytest.raises(ValueError, match=r"3.png must have the shape of its camera \(24x16\), got 20x20"):
-        fit(lazily(tmp_path / "data"), tmp_path / "run", config(), active=plan(add=4, every=2), progress=False)
+        fit(lazily(tmp_path / "data"), tmp_path / "run", config(selection=plan(add=4, every=2)), progress=False)
 
 
 def test_init_points_all_leaks_and_says_so(tmp_path):
@@ -202,7 +203,7 @@ def test_init_points_all_leaks_and_says_so(tmp_path):
     whole = load(tmp_path / "data", test_every=4, lazy=True)
     for rule, leak in (("all", True), ("auto", False)):
         run = tmp_path / rule
-        fit(whole, run, config(init_points=rule), active=plan(), progress=False)
+        fit(whole, run, config(init_points=rule, selection=plan()), progress=False)
         assert Run(run).config()["pool_leak"] is leak
         assert json.loads((run / "selection.json").read_text())["pool_leak"] is leak
         assert ("COLMAP model" in Run(run).config()["points"]) is leak
@@ -211,7 +212,7 @@ def test_init_points_all_leaks_and_says_so(tmp_path):
 def test_extent_comes_from_the_initial_views(still, tmp_path):
     """A camera far away that is not picked at the start changes nothing."""
     train = lazily(still).split(4)[0]
-    result = fit(lazily(still), tmp_path / "run", config(), active=plan(), progress=False)
+    result = fit(lazily(still), tmp_path / "run", config(selection=plan()), progress=False)
     centers = np.stack([train[i].camera.center for i in initial_views([view.camera for view in train], 2)])
     expected = 1.1 * np.linalg.norm(centers[0] - centers[1]) / 2
     assert load_state(result.run.state)[1]["extent"] == pytest.approx(expected)
@@ -240,7 +241,7 @@ def test_lazy_views_take_the_stated_size_until_checked(tmp_path, opened):
     assert not reads(opened, tmp_path)
     assert (dataset.views[0].camera.width, dataset.views[0].is_checked) == (2 * WIDTH, False)
     assert dataset.views[0].checked().camera.width == WIDTH
-    views = ActiveViews(plan(), dataset.split()[0], config())
+    views = ActiveViews(dataset.split()[0], config(selection=plan()))
     assert views.frames()[0].camera.width == WIDTH
     assert views._camera(3).width == WIDTH
     np.testing.assert_allclose(views._camera(3).K, load(tmp_path).views[0].camera.K)
@@ -289,12 +290,12 @@ def test_the_seed_draws_the_first_view(still, tmp_path):
     those of a generator that the draw does not touch; selection.json and --resume know the rule.
     """
     train = lazily(still).split(4, 1)[0]
-    starts = [ActiveViews(plan(start="seed"), train, config(seed=seed)).chosen for seed in range(300)]
+    starts = [ActiveViews(train, config(seed=seed, selection=plan(start="seed"))).chosen for seed in range(300)]
     counts = np.bincount([chosen[0] for chosen in starts], minlength=len(train))
     assert counts.min() > 300 / len(train) - 4 * np.sqrt(300 / len(train)), "four standard deviations of a fair draw"
     assert all(chosen == initial_views([view.camera for view in train], 2, chosen[0]) for chosen in starts)
-    first = ActiveViews(plan(start="first"), train, config(seed=5))
-    drawn = ActiveViews(plan(start="seed"), train, config(seed=5))
+    first = ActiveViews(train, config(seed=5, selection=plan(start="first")))
+    drawn = ActiveViews(train, config(seed=5, selection=plan(start="seed")))
     assert (first.chosen[0], drawn.chosen) == (0, starts[5])
     assert torch.equal(first.state()[0]["policy_rng"], drawn.state()[0]["policy_rng"])
 
@@ -303,25 +304,25 @@ def test_the_seed_draws_the_first_view(still, tmp_path):
     run, active = tmp_path / "run", plan(start="seed")
     data = lazily(still, test_offset=1)
     assert [view.name for view in data.split()[1]] == ["1", "5"]
-    fit(data, run, config(**fields), active=active, progress=False)
+    fit(data, run, config(**fields, selection=active), progress=False)
     record = json.loads((run / "selection.json").read_text())
     assert record["start"][0]["index"] == starts[seed][0] != 0
     assert record["start"][0]["name"] == train[starts[seed][0]].name
-    assert record["start_rule"] == Run(run).config()["active"]["start"] == "seed"
-    assert Run(run).config()["fit"]["test_offset"] == 1
+    assert record["start_rule"] == Run(run).config()["fit"]["selection"]["start"] == "seed"
+    assert Run(run).config()["fit"]["data"]["test_offset"] == 1
     assert Run(run).config()["test"] == ["1", "5"]
     (run / "metrics.json").unlink()
     assert cli.main(["eval", str(run), "--quiet"]) == 0
     assert [view["name"] for view in json.loads((run / "metrics.json").read_text())["views"]] == ["1", "5"]
     for words, other in (
-        ("start was 'seed' and is 'first'", {"active": plan(), "config": config(**fields)}),
+        ("start was 'seed' and is 'first'", config(**fields, selection=plan())),
         (
             "the data set, --test-every or --test-offset has changed",
-            {"active": active, "config": config(**{**fields, "test_offset": 2})},
+            config(**{**fields, "test_offset": 2}, selection=active),
         ),
     ):
         with pytest.raises(ValueError, match=words):
-            fit(lazily(still), run, other.pop("config"), **other, resume=True, progress=False)
+            fit(lazily(still), run, other, resume=True, progress=False)
 
 
 def test_selection_json_is_complete(still, tmp_path, monkeypatch):
@@ -335,8 +336,8 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
         return choose(gaussians, candidates, train, *rest, **options)
 
     monkeypatch.setattr(drgs.select, "select", select)
-    active = plan(policy="fisher", criterion="eig", prior=1e-3, blocks=("geometry",), info_pixels=100)
-    result = fit(lazily(still), tmp_path / "run", config(), active=active, progress=False)
+    active = plan(policy="fisher", criterion="eig", prior=Prior(1e-3), blocks=("geometry",), info_pixels=100)
+    result = fit(lazily(still), tmp_path / "run", config(selection=active), progress=False)
     assert sizes == [({(10, 10)}, {(10, 10)}, 2), ({(10, 10)}, {(10, 10)}, 3)]
     record = json.loads((tmp_path / "run/selection.json").read_text())
     assert {key: record[key] for key in ("policy", "criterion", "prior", "initial", "add", "every", "info_pixels")} == {
@@ -359,7 +360,7 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
     assert fitted_views(result.run) == names == result.metrics["fitted"]
     assert cli.main(["eval", str(result.run.path), "--split", "train"]) == 0
     assert {view["name"] for view in json.loads((tmp_path / "run/metrics.json").read_text())["views"]} == set(names)
-    assert result.run.config()["active"]["criterion"] == "eig"
+    assert result.run.config()["fit"]["selection"]["scoring"]["criterion"] == "eig"
     assert set(result.run.config()["pool"]) >= set(names)
 
 
@@ -374,7 +375,7 @@ def test_scores_know_masks(still, tmp_path, monkeypatch, mask, empty):
 
     monkeypatch.setattr("drgs.select.select", spied)
     options = plan(policy="fisher", blocks=("geometry", "backdrop"), info_pixels=SIZE * SIZE // 4, add=1)
-    fit(lazily(still), tmp_path / "run", config(mask=mask), active=options, progress=False)
+    fit(lazily(still), tmp_path / "run", config(mask=mask, selection=options), progress=False)
     (_, candidates, known, *_), given = asked[0]
     assert given["empty_outside"] is empty
     assert len(given["masks"]) == len(known) == 2
@@ -397,15 +398,15 @@ def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
     fit is the same to the bit, and one that is killed between measuring and saving ends alike.
     """
     how, pick, left, own = config(deterministic=True), ActiveViews.pick, [2], []
-    plain = fit(lazily(still), tmp_path / "plain", how, active=plan(), progress=False)
-    held_out = load_frames(lazily(still).split(how.test_every)[1], how.max_pixels, how.mask)
+    plain = fit(lazily(still), tmp_path / "plain", how.replace(selection=plan()), progress=False)
+    held_out = load_frames(lazily(still).split(how.data.test_every)[1], how.data.max_pixels, how.data.mask)
 
     def measuring(self, scene, *rest):
         own.append(metrics.evaluate(scene, held_out, how.settings)["mean"])
         return pick(self, scene, *rest)
 
     monkeypatch.setattr(ActiveViews, "pick", measuring)
-    found = fit(lazily(still), tmp_path / "run", how, active=plan(measure=(2, 3)), progress=False)
+    found = fit(lazily(still), tmp_path / "run", how.replace(selection=plan(measure=(2, 3))), progress=False)
     assert plain.run.point_cloud.read_bytes() == found.run.point_cloud.read_bytes()
     assert plain.metrics["mean"] == found.metrics["mean"]
     measured = json.loads((tmp_path / "run/selection.json").read_text())["measured"]
@@ -421,9 +422,11 @@ def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
 
     monkeypatch.setattr(ActiveViews, "pick", killed)
     with pytest.raises(KeyboardInterrupt):
-        fit(lazily(still), tmp_path / "killed", how, active=plan(measure=(2, 3)), progress=False)
+        fit(lazily(still), tmp_path / "killed", how.replace(selection=plan(measure=(2, 3))), progress=False)
     monkeypatch.setattr(ActiveViews, "pick", pick)
-    again = fit(lazily(still), tmp_path / "killed", how, active=plan(measure=(2, 3)), resume=True, progress=False)
+    again = fit(
+        lazily(still), tmp_path / "killed", how.replace(selection=plan(measure=(2, 3))), resume=True, progress=False
+    )
     assert json.loads((tmp_path / "killed/selection.json").read_text())["measured"] == measured
     assert again.metrics["mean"] == found.metrics["mean"]
 
@@ -436,7 +439,7 @@ def test_a_fit_that_begins_again_goes_on_with_its_schedules(still, tmp_path, mon
     monkeypatch.setattr(ActiveViews, "new_start", lambda self: (made[0] + len(self.picks), made[1]))
     monkeypatch.setattr(ActiveViews, "points", None)
     how = config(deterministic=True, sh_every=0.01, refine_start=0.9)
-    a = fit(lazily(still), tmp_path / "a", how, active=plan(), progress=False)
+    a = fit(lazily(still), tmp_path / "a", how.replace(selection=plan()), progress=False)
     assert len(a.gaussians) == 9
     assert a.gaussians.sh.shape[1] == 4
     assert float(a.gaussians.means.min()) > 1  # those of the second pick
@@ -452,16 +455,16 @@ def test_a_fit_that_begins_again_goes_on_with_its_schedules(still, tmp_path, mon
 
     monkeypatch.setattr(Trainer, "step", killed)
     with pytest.raises(Killed):
-        fit(lazily(still), tmp_path / "b", how, active=plan(), progress=False)
+        fit(lazily(still), tmp_path / "b", how.replace(selection=plan()), progress=False)
     monkeypatch.setattr(Trainer, "step", step)
-    b = fit(lazily(still), tmp_path / "b", how, active=plan(), resume=True, progress=False)
+    b = fit(lazily(still), tmp_path / "b", how.replace(selection=plan()), resume=True, progress=False)
     assert a.run.point_cloud.read_bytes() == b.run.point_cloud.read_bytes()
 
 
 def test_picked_view_brings_points_where_nothing_is(still):
     """An even share of the budget, inside the mask; none where Gaussians cover the view, or when not wanted."""
     train = lazily(still).split(4)[0]
-    views = ActiveViews(plan(), train, config(max_gaussians=80))
+    views = ActiveViews(train, config(max_gaussians=80, selection=plan()))
     assert views.reserved == 2 * 20
     frame = views.frames()[-1]
 
@@ -477,7 +480,7 @@ def test_picked_view_brings_points_where_nothing_is(still):
     assert len(views.points(frame, one(0.0, 50.0))[0]) == 0
     for quiet in (plan(pick_points="none"), plan()):
         leak = quiet.pick_points == "auto"
-        views = ActiveViews(quiet, train, config(max_gaussians=80, init_points="all" if leak else "auto"))
+        views = ActiveViews(train, config(max_gaussians=80, init_points="all" if leak else "auto", selection=quiet))
         assert views.reserved == 0
         assert len(views.points(frame, one(1e4, 0.1))[0]) == 0
 
@@ -485,7 +488,7 @@ def test_picked_view_brings_points_where_nothing_is(still):
 def test_points_of_picked_views_keep_to_the_budget(still, tmp_path):
     """Density control leaves room for the views to come, and nothing exceeds --max-gaussians."""
     cfg = config(max_steps=30, max_gaussians=60, refine_start=0.0)
-    result = fit(lazily(still), tmp_path / "run", cfg, active=plan(add=3, every=6), progress=False)
+    result = fit(lazily(still), tmp_path / "run", cfg.replace(selection=plan(add=3, every=6)), progress=False)
     events = result.run.events()
     counts = {event["step"]: event["gaussians"] for event in events if event["event"] == "density"}
     assert max(count for step, count in counts.items() if step < 6) <= 60 - 3 * 12
@@ -499,7 +502,7 @@ def test_fitted_views_of_other_runs(still, tmp_path):
     fit(load(still, test_every=4), tmp_path / "all", config(max_steps=2), progress=False)
     assert not (tmp_path / "all/selection.json").exists()
     assert fitted_views(Run(tmp_path / "all")) == ["1", "2", "3", "5", "6", "7"]
-    fit(lazily(still), tmp_path / "run", config(), active=plan(), progress=False)
+    fit(lazily(still), tmp_path / "run", config(selection=plan()), progress=False)
     (tmp_path / "run/selection.json").write_text('{"start": 3}')
     with pytest.raises(ValueError, match="selection.json: start must be a list, got 3; move it away"):
         fitted_views(Run(tmp_path / "run"))
@@ -527,7 +530,7 @@ def without_times(path: Path) -> dict:
 def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, moment, two_threads):
     """With `deterministic`, a run killed after or during its second pick ends in the same bits."""
     active, cfg = plan(policy=policy, add=3), config(deterministic=True)
-    fit(lazily(still), tmp_path / "a", cfg, active=active, progress=False)
+    fit(lazily(still), tmp_path / "a", cfg.replace(selection=active), progress=False)
     step, state = Trainer.step, Trainer.state
 
     def killed_step(self):
@@ -543,12 +546,12 @@ def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, m
     monkeypatch.setattr(Trainer, "step", killed_step)
     monkeypatch.setattr(Trainer, "state", killed_state)
     with pytest.raises(Killed):
-        fit(lazily(still), tmp_path / "b", cfg, active=active, progress=False)
+        fit(lazily(still), tmp_path / "b", cfg.replace(selection=active), progress=False)
     monkeypatch.undo()
     header = load_state(tmp_path / "b/state.safetensors")[1]
     assert (header["step"], len(header["active"]["picks"])) == (8, 2 if moment == "between picks" else 1)
     assert len(without_times(tmp_path / "b/selection.json")["picks"]) == 2
-    fit(lazily(still), tmp_path / "b", cfg, active=active, resume=True, progress=False)
+    fit(lazily(still), tmp_path / "b", cfg.replace(selection=active), resume=True, progress=False)
     assert without_times(tmp_path / "a/selection.json") == without_times(tmp_path / "b/selection.json")
     assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
     assert not list((tmp_path / "b").rglob("*.tmp"))
@@ -556,20 +559,20 @@ def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, m
 
 def test_bad_resumes_are_refused(still, tmp_path):
     """Another policy, or all views instead, cannot continue an active run."""
-    fit(lazily(still), tmp_path / "run", config(), active=plan(), progress=False)
+    fit(lazily(still), tmp_path / "run", config(selection=plan()), progress=False)
     with pytest.raises(ValueError, match="--resume must continue the same fit, policy was 'farthest' and is 'random'"):
-        fit(lazily(still), tmp_path / "run", config(), active=plan(policy="random"), resume=True, progress=False)
+        fit(lazily(still), tmp_path / "run", config(selection=plan(policy="random")), resume=True, progress=False)
     with pytest.raises(ValueError, match="--views was 'active' and is 'all'"):
         fit(load(still, test_every=4), tmp_path / "run", config(), resume=True, progress=False)
     fit(load(still, test_every=4), tmp_path / "all", config(), progress=False)
     with pytest.raises(ValueError, match="--views was 'all' and is 'active'"):
-        fit(lazily(still), tmp_path / "all", config(), active=plan(), resume=True, progress=False)
+        fit(lazily(still), tmp_path / "all", config(selection=plan()), resume=True, progress=False)
     fewer = lazily(still)
     fewer.views = fewer.views[:7]
     with pytest.raises(
         ValueError, match="must have the same training views, the data set, --test-every or --test-offset has"
     ):
-        fit(fewer, tmp_path / "run", config(), active=plan(), resume=True, progress=False)
+        fit(fewer, tmp_path / "run", config(selection=plan()), resume=True, progress=False)
 
 
 # ---- the command, and bad input
@@ -623,8 +626,8 @@ def test_unknown_names_are_refused(still):
     """In Python, too; a policy of one's own that is not there before the first step, not at the first pick."""
     for field in ("policy", "criterion", "method"):
         with pytest.raises(ValueError, match=f"active: {field} must be one of .*, got 'best'"):
-            ActiveConfig(**{field: "best"})
+            SelectionConfig.of(**{field: "best"})
     with pytest.raises(ValueError, match="at least one training view, got none"):
-        ActiveViews(plan(), [], config())
+        ActiveViews([], config(selection=plan()))
     with pytest.raises(ValueError, match="--policy nosuch.module:fn: must be importable"):
-        ActiveViews(plan(policy="nosuch.module:fn"), lazily(still).split()[0], config())
+        ActiveViews(lazily(still).split()[0], config(selection=plan(policy="nosuch.module:fn")))

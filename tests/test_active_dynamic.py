@@ -20,7 +20,7 @@ from drgs.data import load
 from drgs.data.videos import VideoFrame
 from drgs.files import Run, load_state
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.fitting.records import fitted_views
 from drgs.fitting.timetable import Timetable
 from drgs.select import select
@@ -73,13 +73,13 @@ def lazily(folder: Path):
 
 def config(**fields) -> FitConfig:
     """8 steps of the static stage and 16 of the dynamic one."""
-    return FitConfig(
+    return FitConfig.of(
         **{"max_steps": 24, "static_share": 1 / 3, "max_gaussians": 60, "sh_degree": 1, "save_every": 1000, **fields}
     )
 
 
-def plan(**fields) -> ActiveConfig:
-    return ActiveConfig(**{"policy": "random", "schedule": "times", "every": 4, **fields})
+def plan(**fields) -> SelectionConfig:
+    return SelectionConfig.of(**{"policy": "random", "schedule": "times", "every": 4, **fields})
 
 
 def selection_of(run: Path) -> dict:
@@ -100,8 +100,8 @@ def test_numbers_are_those_of_the_paper(swing):
         for t in range(40)
     ]
     for part in (1, 10):
-        whole = FitConfig(max_steps=17_000 // part)
-        table = Timetable.of(ActiveConfig(), views, whole, moves=True)
+        whole = FitConfig(max_steps=17_000 // part, selection=SelectionConfig())
+        table = Timetable.of(views, whole, moves=True)
         assert (table.schedule, table.add, table.every, table.first) == ("times", 39, 200 // part, 3200 // part)
         assert [table.due(step // part) for step in (0, 3190, 3200, 3390, 3400, 10_790, 10_800, 17_000)] == [
             0, 0, 1, 1, 2, 38, 39, 39,
@@ -110,14 +110,14 @@ def test_numbers_are_those_of_the_paper(swing):
     for number in range(39):
         there = [views[i] for i in table.left(number, table.start)]
         assert [view.name for view in there] == [f"{c}/{number + 1}" for c in range(3)]
-    frequent = Timetable.of(ActiveConfig(every=3), views, FitConfig(max_steps=1700), moves=True)
+    frequent = Timetable.of(views, FitConfig.of(max_steps=1700, every=3), moves=True)
     assert frequent.first == 320, "the first pick waits for 200 of 17,000 steps, however often there is one"
 
 
 def test_a_schedule_follows_from_what_is_fitted(swing):
     """`auto` is `times` where a deformation is fitted and `views` where none is."""
     views = lazily(swing).split()[0]
-    assert [Timetable.of(ActiveConfig(add=2), views, FitConfig(), moves).schedule for moves in (True, False)] == [
+    assert [Timetable.of(views, FitConfig.of(add=2), moves).schedule for moves in (True, False)] == [
         "times",
         "views",
     ]
@@ -127,7 +127,7 @@ def test_one_camera_at_each_later_time(swing, tmp_path, opened):  # noqa: F811
     """All cameras at the first time, then one at each later time, in order; an image is opened once it is picked, and
     no other image of a training camera ever. What the fit found out by itself may be stated on resuming, not changed.
     """
-    fit(lazily(swing), tmp_path / "run", config(), active=plan(every=None), progress=False)
+    fit(lazily(swing), tmp_path / "run", config(selection=plan(every=None)), progress=False)
     record = selection_of(tmp_path / "run")
     assert [view["name"] for view in record["start"]] == [f"cam{c}/0" for c in range(1, CAMERAS)]
     picks = record["picks"]
@@ -144,9 +144,9 @@ def test_one_camera_at_each_later_time(swing, tmp_path, opened):  # noqa: F811
     for pick in picks:
         assert opened.index(str(swing / f"{pick['name']}.png")) > opened.index(f"picked {pick['name']}")
     stated = plan(add=TIMES - 1, every=1)
-    fit(lazily(swing), tmp_path / "run", config(), active=stated, resume=True, progress=False)
+    fit(lazily(swing), tmp_path / "run", config(selection=stated), resume=True, progress=False)
     with pytest.raises(ValueError, match="must continue the same fit, add was 3 and is 2"):
-        fit(lazily(swing), tmp_path / "run", config(), active=plan(add=2), resume=True, progress=False)
+        fit(lazily(swing), tmp_path / "run", config(selection=plan(add=2)), resume=True, progress=False)
 
 
 def test_pairs_are_picked_freely(swing, tmp_path):
@@ -164,7 +164,7 @@ def test_pairs_are_picked_freely(swing, tmp_path):
     assert len(set(names)) == 4
     assert set(names) <= later
     assert {other["name"] for other in record["picks"][3]["candidates"]} == later - set(names[:3])
-    assert Timetable.of(plan(schedule="pairs"), lazily(swing).split()[0], config(), True).add == TIMES - 1
+    assert Timetable.of(lazily(swing).split()[0], config(selection=plan(schedule="pairs")), True).add == TIMES - 1
 
 
 def test_the_first_pick_knows_of_the_field(swing, tmp_path):
@@ -172,7 +172,7 @@ def test_the_first_pick_knows_of_the_field(swing, tmp_path):
     some, in the pick and in every candidate, and the parts add up to the score.
     """
     active = plan(policy="fisher", blocks=("geometry", "deformation"), add=1, probes=2, info_pixels=100, every=1)
-    fit(lazily(swing), tmp_path / "run", config(max_steps=12, field_preset="dnerf"), active=active, progress=False)
+    fit(lazily(swing), tmp_path / "run", config(max_steps=12, field_preset="dnerf", selection=active), progress=False)
     (pick,) = selection_of(tmp_path / "run")["picks"]
     assert pick["blocks"] == ["geometry", "deformation"]
     for scored in (pick, *pick["candidates"]):
@@ -193,7 +193,7 @@ def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
     threads, cfg, active, whole = dr.thread_count(), config(deterministic=True, save_every=5), plan(), Trainer.step
 
     def run(name, resume=False):
-        fit(lazily(swing), tmp_path / name, cfg, active=active, resume=resume, progress=False)
+        fit(lazily(swing), tmp_path / name, cfg.replace(selection=active), resume=resume, progress=False)
 
     def killed(self):
         if self.step_index in deaths:
@@ -236,19 +236,19 @@ def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
 )
 def test_what_does_not_go_together_is_one_line(swing, fields, message):
     with pytest.raises(ValueError, match=message) as error:
-        ActiveViews(plan(**fields), lazily(swing).split()[0], config(), moves=True)
+        ActiveViews(lazily(swing).split()[0], config(selection=plan(**fields)), moves=True)
     assert "\n" not in str(error.value)
 
 
 def test_a_single_time_has_no_later_ones(swing):
     views = [view for view in lazily(swing).split()[0] if view.camera.time == 0.0]
     with pytest.raises(ValueError, match="--schedule times must have training views of two times or more, got one"):
-        ActiveViews(plan(), views, config())
+        ActiveViews(views, config(selection=plan()))
     timeless = [dataclasses.replace(view, camera=dataclasses.replace(view.camera, time=None)) for view in views]
     with pytest.raises(ValueError, match="must have a time of every view, 'cam1/0' has none"):
-        ActiveViews(plan(), timeless, config())
+        ActiveViews(timeless, config(selection=plan()))
     with pytest.raises(ValueError, match="must fit what moves, got --dynamics ignore"):
-        ActiveViews(plan(), views, config(dynamics="ignore"))
+        ActiveViews(views, config(dynamics="ignore", selection=plan()))
 
 
 def test_blocks_of_what_is_not_fitted_are_refused(swing, tmp_path):
@@ -257,7 +257,7 @@ def test_blocks_of_what_is_not_fitted_are_refused(swing, tmp_path):
     for block, why in (("semantic", "a fit without a teacher's maps"), ("deformation", "a fit of what is still")):
         active = plan(schedule="views", policy="fisher", add=2, blocks=("geometry", block))
         with pytest.raises(ValueError, match=f"blocks must be of what is fitted, got {block} for {why}; use geometry"):
-            fit(lazily(swing), tmp_path / "run", still, active=active, progress=False)
+            fit(lazily(swing), tmp_path / "run", still.replace(selection=active), progress=False)
         assert not (tmp_path / "run/config.json").exists()
 
 
@@ -323,7 +323,7 @@ def test_no_frame_of_a_video_is_decoded_before_it_is_picked(tmp_path, monkeypatc
     monkeypatch.setattr(VideoFrame, "read", spied)
     data = load(tmp_path / "data", lazy=True, points=False, times=3)
     assert not seen
-    fit(data, tmp_path / "run", config(max_steps=12), active=plan(every=3), progress=False)
+    fit(data, tmp_path / "run", config(max_steps=12, selection=plan(every=3)), progress=False)
     record = selection_of(tmp_path / "run")
     assert [(pick["camera"], pick["time"]) for pick in record["picks"]] == [
         (pick["name"].split("/")[0], time) for pick, time in zip(record["picks"], (0.4, 1.0), strict=True)

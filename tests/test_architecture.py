@@ -20,6 +20,7 @@ FLOORS: list[tuple[set[str], str]] = [
             "machine",
             "lenses",
             "information.choices",
+            "information.prior",
             "information.chain",
             "information.determinants",
         },
@@ -74,7 +75,7 @@ SHARED = {
 }
 
 # Rooms in which modules still know each other. None may be added.
-CIRCLES = {"data", "fitting", "cluster", "commands"}
+CIRCLES = {"data", "commands"}
 
 LINES = 600  # one subject, unpacked; above it a file is about two things
 

@@ -24,7 +24,8 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cameras")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=20))
-    line = f"select {folder}/scene.ply --train {folder}/cameras.json --candidates orbit --count 9 --up z -k 3 --quiet"
+    orbit_of = "--candidates orbit --count 9 --orbit up=z"
+    line = f"select {folder}/scene.ply --train {folder}/cameras.json {orbit_of} -k 3 --quiet"
     assert cli.main([*line.split(), "--policy", "farthest", "-o", f"{folder}/picked.json"]) == 0
     return folder
 
@@ -67,7 +68,7 @@ def test_commands_read_what_commands_write(place, tmp_path, monkeypatch, line, f
 
 def test_an_active_fit_says_where_it_looked_from(place, tmp_path, monkeypatch):
     """The views it was fitted to, from its start on, as its data set has them; `--train` takes the file for the run."""
-    fit(lazily(place / "data"), tmp_path / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(place / "data"), tmp_path / "run", config(max_steps=12, selection=plan()), progress=False)
     record = json.loads((tmp_path / "run/selection.json").read_text())
     names = [view["name"] for view in (*record["start"], *record["picks"])]
     cameras = load_cameras_json(tmp_path / "run/selection.json")
@@ -144,3 +145,13 @@ def test_a_camera_that_is_a_name_is_no_pose(tmp_path):
     path = tmp_path / "selection.json"
     path.write_text(json.dumps({"schema": 1, "command": "fit", "picks": [pick]}))
     assert read_ranking(path).cameras == ()
+
+
+def test_a_transposed_pose_is_refused(tmp_path):
+    """Its rotation is one, too, and its position would be 0."""
+    value = described(orbit((0, 0, 0), 3.0, 1, width=12, height=9)[0])
+    value["c2w"] = np.transpose(value["c2w"]).tolist()
+    path = tmp_path / "some.json"
+    path.write_text(json.dumps([value]))
+    with pytest.raises(ValueError, match=r"camera 0: the pose must be camera-to-world by rows .* is it transposed"):
+        load_cameras_json(path)

@@ -6,13 +6,14 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from drgs import cli
 from drgs.commands import cite
 from drgs.files import SCHEMA
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.semantic_record import SemanticRecord
 from drgs.settings import RenderSettings
 
@@ -33,12 +34,12 @@ def keys(text: str) -> set[str]:
 def run(tmp_path):
     """Writes the record of a fit; what it does not say is as a plain fit of a transforms.json has it."""
 
-    def write(preset: str = "fast", active: ActiveConfig | None = None, lpips: float | None = None, **fields):
-        config = FitConfig(settings=RenderSettings.preset(preset))
+    def write(preset: str = "fast", active: SelectionConfig | None = None, lpips: float | None = None, **fields):
+        config = FitConfig(settings=RenderSettings.preset(preset), selection=active)
         record = {"schema": SCHEMA, "command": "fit", "data": "scene", "format": "transforms", "train": ["a"]}
         record |= {"test": ["b"], "fit": config.to_json(), **fields}
         if active is not None:
-            record |= {"active": active.to_json(), "pool": ["a"]}
+            record |= {"pool": ["a"]}
         (tmp_path / "config.json").write_text(json.dumps(record))
         (tmp_path / "metrics.json").write_text(json.dumps({"mean": {"psnr": 20.0, "lpips": lpips}}))
         return tmp_path
@@ -75,15 +76,15 @@ def test_what_a_fit_used(run, asked, more):
 @pytest.mark.parametrize(
     ("active", "more"),
     [
-        (ActiveConfig(), {"ash2021bait"}),
-        (ActiveConfig(criterion="eig"), {"jiang2024fisherrf"}),
-        (ActiveConfig(criterion="logdet"), {"wilson2025popgs"}),
-        (ActiveConfig(criterion="block_logdet"), {"wilson2025popgs"}),
-        (ActiveConfig(policy="fisherrf"), {"jiang2024fisherrf"}),
-        (ActiveConfig(method="fisherrf"), {"ash2021bait", "jiang2024fisherrf"}),
-        (ActiveConfig(policy="moments"), {"ewen2025moments"}),
-        (ActiveConfig(policy="farthest"), set()),
-        (ActiveConfig(policy="random", method="fisherrf"), set()),
+        (SelectionConfig(), {"ash2021bait"}),
+        (SelectionConfig.of(criterion="eig"), {"jiang2024fisherrf"}),
+        (SelectionConfig.of(criterion="logdet"), {"wilson2025popgs"}),
+        (SelectionConfig.of(criterion="block_logdet"), {"wilson2025popgs"}),
+        (SelectionConfig.of(policy="fisherrf"), {"jiang2024fisherrf"}),
+        (SelectionConfig.of(method="fisherrf"), {"ash2021bait", "jiang2024fisherrf"}),
+        (SelectionConfig.of(policy="moments"), {"ewen2025moments"}),
+        (SelectionConfig.of(policy="farthest"), set()),
+        (SelectionConfig.of(policy="random", method="fisherrf"), set()),
     ],
 )
 def test_how_views_were_chosen(run, active, more):
@@ -98,16 +99,36 @@ def test_a_fit_with_a_teacher(run):
 
 
 def test_entries_are_well_formed():
-    """Each key once, every field of its kind there, braces balanced, nothing outside of ASCII."""
-    for work in cite._WORKS:
-        text = cite._entry(work)
-        assert text.isascii(), work.key
-        assert _NEEDS[work.kind] <= set(work.fields), work.key
-        assert text.count("{") == text.count("}"), work.key
-        for name, value in work.fields.items():
-            assert value, (work.key, name)
-        assert re.fullmatch(r"(20\d\d)?", work.fields.get("year", "")), work.key
-    assert len({work.key for work in cite._WORKS}) == len(cite._WORKS)
+    """Every field of its kind is there and says something, braces are balanced, nothing is outside of ASCII."""
+    for key, text in cite._entries().items():
+        comment, first, *lines, last = text.splitlines()
+        kind = re.fullmatch(rf"@(\w+)\{{{key},", first)[1]
+        fields = dict(re.fullmatch(r"  (\w+) = \{(.+)\},", line).groups() for line in lines)
+        assert comment.startswith("% "), key
+        assert last == "}", key
+        assert text.isascii(), key
+        assert text.count("{") == text.count("}"), key
+        assert _NEEDS[kind] <= set(fields), key
+        assert re.fullmatch(r"(20\d\d)?", fields.get("year", "")), key
+
+
+def test_what_is_cited_is_what_is_in_the_file():
+    """Each key that the code cites has its entry, each entry is cited by something, and none is there twice."""
+    names = re.findall(r"^@\w+\{(\w+),$", Path(cite.__file__).with_name("references.bib").read_text(), flags=re.M)
+    assert sorted(names) == sorted([*cite._EVERY_USE, *cite._RUNS])
+
+
+def test_every_entry_is_printed_as_it_stands(monkeypatch):
+    """In the order of the code, a blank line between two; the program's own has its version besides."""
+    from drgs import runtime
+
+    monkeypatch.setattr(cite, "_used", lambda folder: None)
+    monkeypatch.setattr(cite, "_RUNS", dict.fromkeys(cite._RUNS, lambda used: True))
+    version = f"  version = {{{runtime.version()}}},\n"
+    printed = cite.cited(Path("run"))
+    assert printed.count(version) == 1
+    file = Path(cite.__file__).with_name("references.bib").read_text()
+    assert printed.replace(version, "") + "\n" == file
 
 
 def test_what_is_no_run(tmp_path, capsys):

@@ -33,12 +33,12 @@ from drgs.cluster import connect, payloads
 from drgs.cluster.agreement import Disagreement, check_agreement, statement
 from drgs.cluster.cells import run_cells_on
 from drgs.cluster.connect import opened
-from drgs.cluster.payloads import Missing, Parcel, keep, opened_parcel
-from drgs.cluster.wanted import check_address
+from drgs.cluster.options import check_address
+from drgs.cluster.payloads import Missing, Payload, keep, opened_payload
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
-from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.information.pool import Scoring
+from drgs.fitting.config import FitConfig
+from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings
@@ -261,19 +261,19 @@ def _runs(pid: int) -> bool:
         return False
 
 
-# ---- parcels
+# ---- payloads
 
 
-def test_parcels_bring_closures_and_tensors():
+def test_payloads_bring_closures_and_tensors():
     """Functions without a name, parameters of networks, and what shares memory with nothing; the same bits."""
     x = torch.randn(4, 3, dtype=torch.float64).T  # not contiguous
     network = torch.nn.Linear(2, 2)
     factor = 3
-    parcel = Parcel.of({"f": lambda y: y * factor, "x": x, "network": network, "empty": torch.zeros(0, 3)})
-    for piece in parcel.pieces():
+    payload = Payload.of({"f": lambda y: y * factor, "x": x, "network": network, "empty": torch.zeros(0, 3)})
+    for piece in payload.pieces():
         keep(*piece)
-    found = opened_parcel(parcel.digest)
-    assert found is opened_parcel(parcel.digest)
+    found = opened_payload(payload.digest)
+    assert found is opened_payload(payload.digest)
     assert found["f"](2) == 6
     assert torch.equal(found["x"], x)
     assert found["empty"].shape == (0, 3)
@@ -281,25 +281,25 @@ def test_parcels_bring_closures_and_tensors():
     assert isinstance(weight, torch.nn.Parameter)
     assert weight.requires_grad
     assert torch.equal(weight, network.weight)
-    assert Parcel.of(x).digest == Parcel.of(x.clone()).digest
+    assert Payload.of(x).digest == Payload.of(x.clone()).digest
     with pytest.raises(ValueError, match="cluster: what is sent to workers must be picklable, dict is not"):
-        Parcel.of({"lock": threading.Lock()})
+        Payload.of({"lock": threading.Lock()})
 
 
 def test_a_worker_keeps_the_last_few(monkeypatch):
-    """Parcels come in pieces, in any order; those that were not used for longest make room, and are missing then."""
+    """Payloads come in pieces, in any order; those that were not used for longest make room, and are missing then."""
     monkeypatch.setattr(payloads, "_PIECE", 10)
-    made = [Parcel.of(f"parcel {i}") for i in range(payloads._KEPT + 1)]
+    made = [Payload.of(f"payload {i}") for i in range(payloads._KEPT + 1)]
     assert len(made[0].pieces()) > 1
-    for i, parcel in enumerate(made):
-        for piece in reversed(parcel.pieces()):
-            with pytest.raises(Missing, match=parcel.digest):
-                opened_parcel(parcel.digest)
+    for i, payload in enumerate(made):
+        for piece in reversed(payload.pieces()):
+            with pytest.raises(Missing, match=payload.digest):
+                opened_payload(payload.digest)
             keep(*piece)
-        assert opened_parcel(parcel.digest) == f"parcel {i}"
+        assert opened_payload(payload.digest) == f"payload {i}"
     with pytest.raises(Missing):
-        opened_parcel(made[0].digest)
-    assert opened_parcel(made[1].digest) == "parcel 1"
+        opened_payload(made[0].digest)
+    assert opened_payload(made[1].digest) == "payload 1"
 
 
 # ---- who may take part
@@ -523,12 +523,12 @@ def folder_of(folder: Path, scene: str, split: tuple[int, int]) -> Path:
 
 def study_of(folder: Path, **fields) -> Study:
     """Three policies, many short steps."""
+    few = {"initial": 2, "add": 1, "every": 3}
     return Study(
         name="tiny",
         folder=functools.partial(folder_of, folder),
         policies={name: {"policy": name} for name in ("farthest", "random", "uniform")},
-        fit=FitConfig(**{"max_steps": 12, "max_gaussians": 60, "sh_degree": 1, "save_every": 4, **fields}),
-        active=ActiveConfig(initial=2, add=1, every=3),
+        fit=FitConfig.of(**{"max_steps": 12, "max_gaussians": 60, "sh_degree": 1, "save_every": 4, **few, **fields}),
         metrics=(Metric("psnr", "PSNR", 2),),
         reference="random",
     )

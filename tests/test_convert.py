@@ -94,12 +94,17 @@ _ONLY_READ = r"must end with .ply, .spz, .glb, got .{}, a format that drgs reads
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        (("b.xyz",), r"b.xyz must end with .ply, .spz, .glb, got .xyz; rename it"),
+        (("b.xyz",), r"b.xyz must end with .ply, .spz, .glb, got .xyz; choose one of these"),
+        (("b.usdz",), r"b.usdz must end with .ply, .spz, .glb, got .usdz; choose one of these"),
         (
             ("b.splat",),
             rf"{_ONLY_READ.format('splat')}`python convert.py b.ply --output b.splat` of github.com/antimatter15",
         ),
         (("b.KSPLAT",), rf"{_ONLY_READ.format('ksplat')}`node util/create-ksplat.js b.ply b.KSPLAT` of "),
+        (
+            ("b.Compressed.ply",),
+            rf"{_ONLY_READ.format('compressed.ply')}`npx @playcanvas/splat-transform b.ply b.Compressed.ply`",
+        ),
         (("b.sog",), rf"{_ONLY_READ.format('sog')}`npx @playcanvas/splat-transform -g cpu b.ply b.sog`"),
         (
             ("c/meta.json",),
@@ -122,7 +127,7 @@ def test_what_cannot_be_is_said_before_anything_is_written(tmp_path, rng, monkey
     line = capsys.readouterr().err
     assert re.search(match, line), line
     assert line.count("\n") == 1
-    assert "rename" not in line or words == ("b.xyz",)
+    assert "rename" not in line
     assert not list(tmp_path.glob("[bc]*"))
 
 

@@ -173,7 +173,9 @@ def test_transforms_bad_frames(tmp_path):
     bad = pose.copy()
     bad[0, 3] = np.inf
     attempt("frame 1: transform_matrix must be finite", transform_matrix=bad.tolist())
-    attempt("frame 1: .*orthonormal to 1e-4", transform_matrix=(pose * 2).tolist())
+    attempt("frame 1: .*orthonormal to 1e-4", transform_matrix=(pose * [[2], [2], [2], [1]]).tolist())
+    # Without its position, a transposed pose is a rotation, too: the inverse one.
+    attempt("frame 1: transform_matrix must be .* by rows .* is it transposed", transform_matrix=pose.T.tolist())
     attempt("frame 1: transform_matrix must be 4x4", transform_matrix=[[1, 2], [3]])
     attempt("frame 1: mask_path names", FileNotFoundError, mask_path="gone.png")
     attempt("frame 1: file_path must be a text", file_path=7)

@@ -15,7 +15,7 @@ from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
 from drgs.data.points import read_point_ply
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames
 
 cv2 = pytest.importorskip("cv2")
@@ -198,11 +198,11 @@ def test_picked_views_bring_triangulated_points(tmp_path, rng):
     """
     views = plane_views(tmp_path, rng, count=5)
     views[1].image_path.unlink()
-    config = FitConfig(max_pixels=10**6, max_gaussians=600, max_steps=10)
-    plan = ActiveViews(ActiveConfig(initial=2, add=1, every=1), views, config)
+    config = FitConfig.of(max_pixels=10**6, max_gaussians=600, max_steps=10)
+    plan = ActiveViews(views, config.replace(initial=2, add=1, every=1))
     plan.chosen.append(2)
     wall = drgs.Gaussians.from_arrays([[0.0, 0, 1.5]], [[1.0, 0, 0, 0]], [[9, 9, 0.1]], [0.99], np.zeros((1, 1, 3)))
-    (frame,) = load_frames([views[2]], config.max_pixels)
+    (frame,) = load_frames([views[2]], config.data.max_pixels)
     points, colors, dense = plan.points(frame, wall)
     assert not dense
     assert len(points) == len(colors) == 200
@@ -218,8 +218,8 @@ def test_fits_begin_again_where_views_show_more(tmp_path, rng):
         assert cv2.imwrite(str(view.image_path), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
 
     def starts(restart, init_points="views"):
-        config = FitConfig(max_pixels=10**6, max_gaussians=3000, max_steps=10, init_points=init_points)
-        plan = ActiveViews(ActiveConfig(initial=2, add=3, every=1, restart=restart), views, config)
+        config = FitConfig.of(max_pixels=10**6, max_gaussians=3000, max_steps=10, init_points=init_points)
+        plan = ActiveViews(views, config.replace(initial=2, add=3, every=1, restart=restart))
         plan.chosen, found = [0, 1], []
         for index in (2, 3, 4):
             plan.chosen.append(index)
@@ -227,7 +227,7 @@ def test_fits_begin_again_where_views_show_more(tmp_path, rng):
             start = plan.new_start()
             found.append(None if start is None else len(start[0]))
             if start is not None:
-                assert len(start[0]) == len(start[1]) <= config.max_gaussians - plan.reserved
+                assert len(start[0]) == len(start[1]) <= config.density.max_gaussians - plan.reserved
                 assert float(start[0][:, 2].abs().median()) < 0.3
         return found, [pick.get("restarted") for pick in plan.picks], [pick.get("triangulated") for pick in plan.picks]
 
@@ -242,10 +242,13 @@ def test_fits_begin_again_where_views_show_more(tmp_path, rng):
 
 def test_a_sure_start_asks_for_no_guesses(tmp_path, rng, monkeypatch):
     """Where the answer is to go on, only the count that is recorded is found, the same as ever."""
-    views, config = plane_views(tmp_path, rng, count=4), FitConfig(max_pixels=10**6, max_gaussians=3000, max_steps=10)
+    views, config = (
+        plane_views(tmp_path, rng, count=4),
+        FitConfig.of(max_pixels=10**6, max_gaussians=3000, max_steps=10),
+    )
 
     def told(restart, began):
-        plan = ActiveViews(ActiveConfig(initial=2, add=2, every=1, restart=restart), views, config)
+        plan = ActiveViews(views, config.replace(initial=2, add=2, every=1, restart=restart))
         plan.chosen, plan.picks, plan._began = [0, 1, 2], [{"index": 2}], began
         return plan.new_start() is not None, plan.picks[0]
 

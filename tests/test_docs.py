@@ -20,7 +20,7 @@ from drgs import cli
 
 # What has tests of its own, which run the very blocks.
 _README = ROOT / "README.md"
-_LANGUAGES = {"bash", "python", "bibtex", "text", "json"}
+_LANGUAGES = {"bash", "toml", "python", "bibtex", "text", "json"}
 
 
 def _name(page) -> str:
@@ -60,6 +60,8 @@ def test_blocks_run(page, made, tmp_path, monkeypatch, capsys):
             for name in sorted(set(names) - before):
                 if name.startswith("test_"):
                     names[name]()
+        elif block.language == "toml":  # its first line names the file
+            (folder / block.text.splitlines()[0].removeprefix("# ")).write_text(block.text)
         elif block.language == "bash":
             for line in lines_of(block):
                 _run(line, where)
@@ -140,7 +142,7 @@ def test_commands_in_the_text_exist():
                 continue
             assert words[1] in cli._OPTIONS, f"{where}: {command}"
             fields = {field.name.replace("_", "-") for field in dataclasses.fields(cli._OPTIONS[words[1]])}
-            fields |= {"set", "class", "help"} | {f"no-{name}" for name in fields}
+            fields |= {"set", "class", "help", "help-all"} | {f"no-{name}" for name in fields}
             for word in words[2:]:
                 if re.fullmatch(r"--[a-z-]+(=.*)?", word):
                     assert word[2:].partition("=")[0] in fields, f"{where}: {command}: no option {word}"

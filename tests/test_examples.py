@@ -20,7 +20,7 @@ from test_active import write_still
 import drgs
 from drgs import cli
 from drgs.cameras import orbit
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.libllvm import require_llvm
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -347,7 +347,7 @@ def test_a_policy_that_is_none(tmp_path):
             drgs.select.select(g, views[1:], views[:1], 1, name)
         assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="active: policy must be one of fisher"):
-        ActiveConfig(policy="best")
+        SelectionConfig.of(policy="best")
 
 
 def test_a_fit_with_their_selector(tmp_path):

@@ -26,7 +26,7 @@ def place(tmp_path_factory):
     """`data`, an active run `run` on it, `scene.ply`, `cameras.json`."""
     folder = tmp_path_factory.mktemp("fisher")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
-    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12, selection=plan()), progress=False)
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 5, width=SIZE, height=20))
     return folder
 
@@ -117,7 +117,7 @@ def test_plain_ply(place, monkeypatch, capsys):
     """Without a record the cameras given are the known ones, unless --train names others."""
     report, _ = run("scene.ply --cameras cameras.json", place, monkeypatch, capsys)
     assert (len(report["known"]["names"]), len(report["views"])) == (5, 4)
-    report, _ = run("scene.ply --train cameras.json --cameras orbit --count 3 --up z", place, monkeypatch, capsys)
+    report, _ = run("scene.ply --train cameras.json --cameras orbit --count 3 --orbit up=z", place, monkeypatch, capsys)
     assert [row["name"] for row in report["views"]] == ["orbit_0000", "orbit_0001", "orbit_0002"]
     report, _ = run("run --cameras data --split test", place, monkeypatch, capsys)
     assert [row["name"] for row in report["views"]] == ["0", "4", "8"]

@@ -17,7 +17,7 @@ from drgs.cameras import orbit
 from drgs.data.views import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.files import load_ply, load_state, save_state
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.fitting.density import add_gaussians, relocate
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import Photometric
@@ -72,7 +72,7 @@ class Near:
 def trainer_of(dataset, state=None) -> Trainer:  # noqa: F811
     """A fit with both terms, features and a network: new, or from a checkpoint."""
     cfg = config(max_steps=20, refine_start=0.1, refine_every=0.1, max_gaussians=50)
-    frames, affine = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask), Affine()
+    frames, affine = load_frames(dataset.split()[0], cfg.data.max_pixels, cfg.data.mask), Affine()
     plain, network = parts_of(cfg, 3.0), Network("affine", affine, lambda part: 1e-2 * (1 - part))
     terms = [Corrected(affine), Near(), *plain.terms[1:]]
     parts = Parts(terms, {**plain.rates, "features": 1e-2}, [network])
@@ -144,7 +144,7 @@ def test_a_scene_that_moves_is_fitted_at_the_times_of_its_views(rng):
 def test_a_fit_without_networks_says_nothing_of_them(dataset):  # noqa: F811
     """Checkpoints of plain fits are what they were."""
     cfg = config()
-    frames = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask)
+    frames = load_frames(dataset.split()[0], cfg.data.max_pixels, cfg.data.mask)
     rows = GaussianRows.from_points(torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors))
     tensors, header = Trainer(cfg, frames, rows, 3.0).state()
     fields = "means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest"
@@ -288,15 +288,15 @@ def test_a_moving_fit_is_looked_at_as_it_moves(tmp_path, monkeypatch):
         networks=[Network("wind", wind, 1e-3)],
         scene=lambda rows: Drift(rows.gaussians(), wind.velocity),
     )
-    active, chosen_of = ActiveConfig(initial=3, add=1, every=3, pick_points="uncovered"), []
+    active, chosen_of = SelectionConfig.of(initial=3, add=1, every=3, pick_points="uncovered"), []
 
     def choose(scene, *arguments, **options):
         chosen_of.append(scene)
         return select(scene, *arguments, **options)
 
     monkeypatch.setattr("drgs.select.select", choose)
-    result = fit(data, tmp_path / "run", cfg, active=active, parts=parts, progress=False)
-    frames = load_frames(data.split()[1], cfg.max_pixels, cfg.mask)
+    result = fit(data, tmp_path / "run", cfg.replace(selection=active), parts=parts, progress=False)
+    frames = load_frames(data.split()[1], cfg.data.max_pixels, cfg.data.mask)
     moving = Drift(result.gaussians, wind.velocity.detach())
     shown, at_rest = (evaluate(x, frames, cfg.settings)["mean"]["psnr"] for x in (moving, result.gaussians))
     assert shown > at_rest + 1

@@ -180,6 +180,15 @@ def test_structure_from_motion(corner, tmp_path, suffix, masked):  # noqa: F811
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
+def test_without_exif(tmp_path, gradient, suffix):
+    """What messengers leave of a photograph is one, too."""
+    save(tmp_path / f"a.{suffix}", gradient)
+    (tmp_path / "b.jpg").write_bytes(heif.heif_as_jpeg(tmp_path / f"a.{suffix}", 98))
+    assert np.abs(read_image(tmp_path / "b.jpg").astype(float) - gradient).max() < 8  # 2 and 4 here, of JPEG
+    assert not Image.open(tmp_path / "b.jpg").getexif()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_focal_length_of_exif(tmp_path, suffix, rng):
     """COLMAP begins with the same focal length as of a JPEG, turned or not."""
     pycolmap = pytest.importorskip("pycolmap")

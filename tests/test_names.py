@@ -129,7 +129,7 @@ def test_names_that_no_model_can_hold(corner, tmp_path, name, capsys):  # noqa: 
     assert main(["sfm", str(photos), "-o", str(tmp_path / "out")]) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 1
-    assert "the name of a photo must be one line of UTF-8, got " in told[0]
+    assert "the name of a photo must be one line of UTF-8 without control characters, got " in told[0]
     assert not (tmp_path / "out").exists()
 
 

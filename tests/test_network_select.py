@@ -9,7 +9,7 @@ from scenes_random import camera, gaussians
 from test_network_information import swarm
 
 from drgs import fisher
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.gain import Prior, information_gain
 from drgs.information.combine import asked_of
 from drgs.information.semantics import SemanticMetric
@@ -231,7 +231,7 @@ def test_refusals(fields, message):
     with pytest.raises(ValueError, match=f"^select: .*{message}"):
         Scoring(**fields)
     with pytest.raises(ValueError, match=rf"^active: .*{message.split(', got')[0].replace('>= 1', '.*')}"):
-        ActiveConfig(**fields)
+        SelectionConfig.of(**fields)
 
 
 def test_still_scenes_have_no_such_block(views):

@@ -10,10 +10,12 @@ import typing
 import pytest
 
 from drgs import cli, fisher, gain, runtime, select
-from drgs.commands import making_options, options, orbits
+from drgs.commands import making_options, options
+from drgs.commands.option_help import options_in
 from drgs.data import sfm
-from drgs.fitting.config import ActiveConfig, FitConfig
-from drgs.information.choices import POLICY_NAMES, Policy
+from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.guards.records import hints_of, part_of, texts_of, ways_of
+from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Policy
 from drgs.settings import PRESETS, RenderSettings
 
 
@@ -22,32 +24,54 @@ def _choices(command: type, name: str) -> tuple:
     return typing.get_args(typing.get_type_hints(command)[name])
 
 
-@pytest.mark.parametrize("config", [FitConfig, ActiveConfig])
-def test_fit_options_are_those_of_its_configs(config):
-    """Every option of `fit` named as a field of FitConfig or ActiveConfig has its default and its type, choices
-    included; and every field of ActiveConfig is an option, and of FitConfig all of features.
+def _of_records(kind: type) -> dict[str, typing.Any]:
+    """Field -> default, of a record and of its parts, those that hold fields themselves aside."""
+    found = {}
+    for name, hint in hints_of(kind).items():
+        value = getattr(kind(), name)
+        found |= _of_records(part) if (part := part_of(hint)) and value is not None else {name: value}
+    return found
+
+
+def test_fit_options_are_the_fields_of_its_records():
+    """Every field of a fit's configuration is an option of `fit`, with its type, its default and its text; but for the
+    render settings, which are --preset and --set, lambda, which is a number and a flag here, and names and weights of
+    groups, which a file says.
     """
-    fields, offered = typing.get_type_hints(config), typing.get_type_hints(options.Fit)
-    shared = set(fields) & {field.name for field in dataclasses.fields(options.Fit)}
-    assert len(shared) >= 10
-    for name in shared:
-        assert getattr(options.Fit, name) == getattr(config, name), name
+    fields = _of_records(FitConfig) | _of_records(SelectionConfig)
+    offered = typing.get_type_hints(options.Fit)
+    texts = texts_of(FitConfig)
+    shown = {option.name: option for option in options_in(options.Fit)}
+    carried = {"weights", "groups"}
+    assert set(fields) - set(offered) == {"settings", "selection"}
+    for name in sorted(set(fields) & set(offered) - carried - {"prior"}):
+        assert getattr(options.Fit, name) == fields[name], name
         # Help shows the names of policies; a config may hold the name of somebody's own.
-        assert offered[name] == (Policy | str if name == "policy" else fields[name]), name
-    if config is ActiveConfig:
-        assert shared == set(fields)
-    assert {name for name in fields if "feature" in name or "decoder" in name} <= shared
+        assert offered[name] == (Policy | str if name == "policy" else _type_of(name)), name
+        assert shown[name].text == texts[name], name
+    assert not carried & set(shown)
+    assert options.Fit(data="x", output="y").given_prior() is fields["prior"] is None
+
+
+def _type_of(name: str) -> typing.Any:
+    kind = FitConfig
+    *ways, last = ways_of(FitConfig)[name]
+    for step in ways:
+        kind = part_of(hints_of(kind)[step])
+    return hints_of(kind)[last]
 
 
 @pytest.mark.parametrize("command", [options.Select, options.Fisher])
 def test_information_options_are_those_of_an_active_fit(command):
-    """`select` and `fisher` weigh views as an active fit does; Python's `Scoring()` agrees."""
-    for name in ("method", "prior", "relative_prior", "info_pixels", "policy", "criterion"):
-        if hasattr(command, name):
-            assert getattr(command, name) == getattr(ActiveConfig, name)
+    """`select` and `fisher` weigh views as an active fit does, and as Python's `Scoring()`: it is one record."""
     scoring = select.Scoring()
-    assert gain.Prior.given(command.prior, command.relative_prior) == scoring.prior
-    assert (command.method, ActiveConfig.criterion) == (scoring.method, scoring.criterion)
+    shared = {*hints_of(select.Scoring)} & {field.name for field in dataclasses.fields(command)}
+    assert {"method", "blocks", "probes"} <= shared
+    for name in shared - {"weights", "groups"}:
+        assert getattr(command, name) == getattr(scoring, name)
+    assert SelectionConfig().scoring == scoring
+    if command is options.Select:
+        assert options.Select(scene="x", candidates="y").scoring() == scoring
 
 
 def test_choices_are_what_there_is():
@@ -60,10 +84,9 @@ def test_choices_are_what_there_is():
     for command in (options.Fit, options.Select):
         named, _ = _choices(command, "policy")
         assert typing.get_args(named) == tuple(select.POLICIES) == POLICY_NAMES
-        assert _choices(command, "criterion") == gain.CRITERIA
+        assert _choices(command, "criterion") == CRITERION_NAMES == gain.CRITERIA
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
-    assert _choices(options.Render, "up") == ("auto", *orbits.UP)
     parameters = inspect.signature(sfm.run_sfm).parameters
     assert _choices(making_options.Sfm, "camera_model") == sfm.CAMERA_MODELS
     assert _choices(making_options.Sfm, "matcher") == sfm.MATCHING

@@ -184,7 +184,7 @@ def test_wishes(rng):
     made, _ = capture_orbit(photos, 4, **SIZE, wish=Wish(up=(1, 0, 0)))
     assert all(-camera.c2w[0, 1] > 0.3 for camera in made)
     drive = [photo((0, i, 1), (0, i + 9, 1)) for i in range(12)]
-    with pytest.raises(ValueError, match="must have --center X Y Z here"):
+    with pytest.raises(ValueError, match="must have center=X,Y,Z in --orbit here"):
         capture_orbit(drive, 5, **SIZE, wish=Wish(distance=2.0))
     made, _ = capture_orbit(drive, 5, **SIZE, wish=Wish(center=(0, 20, 1), distance=5.0))
     assert all(np.linalg.norm(camera.center - (0, 20, 1)) == pytest.approx(5) for camera in made)
@@ -221,12 +221,12 @@ def test_floaters_do_not_move_the_camera_away(rng):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"center": (0.0, np.nan, 0.0)}, "--center must be three finite numbers"),
-        ({"distance": 0.0}, "--distance must be positive and finite, got 0.0"),
-        ({"distance": np.inf}, "--distance must be positive and finite, got inf"),
-        ({"span": 361.0}, r"--span must be in \[0, 360\] degrees, got 361.0"),
-        ({"elevation": 90.0}, r"--elevation must be in \[-89, 89\] degrees, got 90.0"),
-        ({"fov": 0.5}, r"--fov must be in \[1, 170\] degrees, got 0.5"),
+        ({"center": (0.0, np.nan, 0.0)}, "--orbit center must be three finite numbers"),
+        ({"distance": 0.0}, "--orbit distance must be positive and finite, got 0.0"),
+        ({"distance": np.inf}, "--orbit distance must be positive and finite, got inf"),
+        ({"span": 361.0}, r"--orbit span must be in \[0, 360\] degrees, got 361.0"),
+        ({"elevation": 90.0}, r"--orbit elevation must be in \[-89, 89\] degrees, got 90.0"),
+        ({"fov": 0.5}, r"--orbit fov must be in \[1, 170\] degrees, got 0.5"),
     ],
 )
 def test_options_out_of_range(fields, message):

@@ -16,6 +16,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.commands import orbits
+from drgs.commands.orbit_keys import UP
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display import pictures
 from drgs.files import save_ply
@@ -136,7 +137,7 @@ def test_turntable(scene, tmp_path, capsys):
     import cv2
 
     out = tmp_path / "out"
-    line = f"render {scene} --frames 3 --width 33 --height 21 --format webm --preset fast -o {out} --up z"
+    line = f"render {scene} --frames 3 --width 33 --height 21 --format webm --preset fast -o {out} --orbit up=z"
     assert cli.main(line.split()) == 0
     assert sorted(path.name for path in out.glob("[!.]*")) == ["cameras.json", "render.json", "turntable.webm"]
     video = cv2.VideoCapture(str(out / "turntable.webm"))
@@ -234,10 +235,10 @@ def test_lens(scene, gaussians, tmp_path, capsys):
         ("{scene} --width 0", "--width must be in [1, 16384], got 0"),
         ("{scene} --frames 0", "--frames must be in [1, 100000], got 0"),
         ("{scene} --limit 0", "--limit must be in"),
-        ("{scene} --fov 180", "--fov must be in [1, 170] degrees, got 180"),
-        ("{scene} --elevation 90", "--elevation must be in [-89, 89] degrees, got 90"),
-        ("{scene} --distance 0", "--distance must be positive and finite, got 0"),
-        ("{scene} --span 400", "--span must be in [0, 360] degrees, got 400"),
+        ("{scene} --orbit fov=180", "--orbit fov must be in [1, 170] degrees, got 180"),
+        ("{scene} --orbit elevation=90", "--orbit elevation must be in [-89, 89] degrees, got 90"),
+        ("{scene} --orbit distance=0", "--orbit distance must be positive and finite, got 0"),
+        ("{scene} --orbit span=400", "--orbit span must be in [0, 360] degrees, got 400"),
         ("{scene} --fps 0", "--fps must be in (0, 240], got 0"),
         ("{scene} -o {scene}", "-o must be a folder that can be written"),
         ("{scene} -o {scene}/inside", "-o must be a folder that can be written"),
@@ -348,7 +349,7 @@ def test_wolf(data_dir, tmp_path):
     if not path.is_file():
         pytest.skip(f"no {path}")
     g = drgs.load_ply(path)
-    for camera in orbits.scene_orbit(g, 3, width=96, height=72, wish=orbits.Wish(up=orbits.UP["y"])):
+    for camera in orbits.scene_orbit(g, 3, width=96, height=72, wish=orbits.Wish(up=UP["y"])):
         alpha = drgs.render(g, camera, drgs.RenderSettings.preset("fast")).alpha.numpy()
         rows, columns = np.nonzero(alpha > 0.5)
         assert rows.min() > 3

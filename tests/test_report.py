@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import html.parser
 import json
 import re
@@ -27,7 +26,8 @@ from drgs.commands.repeat import fit_command
 from drgs.commands.report import report_of
 from drgs.display.pictures import file_names
 from drgs.files import Run
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.information.prior import Prior
 from drgs.report import pictures
 from drgs.report.account import account_of
 from drgs.settings import RenderSettings
@@ -196,7 +196,7 @@ def test_without_matplotlib(run, tmp_path, monkeypatch):
         ("metrics.json", lambda x: x.pop("mean"), r"metrics\.json: it must have the key 'mean'"),
         ("selection.json", lambda x: x["picks"][0].update(score=[]), r"selection\.json: picks\[0\]\.score must be"),
         ("selection.json", lambda x: x["picks"][0]["parts"].update(means="?"), r"selection\.json: means must be"),
-        ("config.json", lambda x: x["active"].update(every="soon"), r"config\.json: active: .*every must be"),
+        ("config.json", lambda x: x["fit"]["selection"].update(every="soon"), r"config\.json: fit: every must be"),
     ],
 )
 def test_damaged_files_are_named(run, tmp_path, capsys, file, change, expected):
@@ -309,33 +309,37 @@ def test_stills_show_their_times():
 
 FAST = RenderSettings.preset("fast")
 CONFIGS = [
-    (FitConfig(), None),
-    (FitConfig(max_steps=12, sh_degree=1, deterministic=True, seed=7, mask="ignore"), ActiveConfig()),
-    (FitConfig(settings=FAST.replace(extent=4.5, background=(1.0, 0.5, 0.25)), grid_rate=(0.1, 1e-5)), None),
-    (FitConfig(settings=RenderSettings.preset("gsplat", max_hits=5), test_cameras=("cam00", "cam 07")), None),
-    (
-        FitConfig(settings=RenderSettings.preset("exact"), test_cameras=(), couple_features=True),
-        ActiveConfig(policy="random", add=3, every=5, blocks=("geometry", "backdrop"), measure=(3, 4), prior=1e-3),
+    FitConfig(),
+    FitConfig.of(max_steps=12, sh_degree=1, deterministic=True, seed=7, mask="ignore", selection=SelectionConfig()),
+    FitConfig.of(settings=FAST.replace(extent=4.5, background=(1.0, 0.5, 0.25)), grid_rate=(0.1, 1e-5), dc_rate=0.5),
+    FitConfig.of(settings=RenderSettings.preset("gsplat", max_hits=5), test_cameras=("cam00", "cam 07")),
+    FitConfig.of(
+        settings=RenderSettings.preset("exact"),
+        test_cameras=(),
+        couple_features=True,
+        policy="random",
+        add=3,
+        every=5,
+        blocks=("geometry", "backdrop"),
+        measure=(3, 4),
+        prior=Prior(1e-3),
     ),
 ]
 
 
-@pytest.mark.parametrize(("config", "active_config"), CONFIGS)
-def test_the_command_repeats_the_fit(config, active_config):
+@pytest.mark.parametrize("config", CONFIGS)
+def test_the_command_repeats_the_fit(config):
     """The program reads from the line the same fit."""
-    line, beyond = fit_command(config, active_config, Path("my data"), Path("runs/a b"))
+    line, beyond = fit_command(config, Path("my data"), Path("runs/a b"))
     args = cli._parse_arguments(shlex.split(line)[1:])
-    names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
-    given = {name: getattr(args, name) for name in names if hasattr(args, name)}
-    assert FitConfig(settings=args.settings(), **given) == config
-    assert args.active() == active_config
+    assert args.fit_config() == config
     assert (args.data, args.output) == (Path("my data"), Path("runs/a b"))
     assert not beyond
 
 
 def test_what_no_option_sets_is_said(run):
-    """A fit from Python may have fields that the command line has not."""
-    assert fit_command(FitConfig(dc_rate=0.5), None, run, run)[1] == ["dc_rate=0.5"]
+    """A fit from Python or a file may have fields that the command line has not."""
+    assert fit_command(FitConfig.of(weights={"sh": 0.5}), run, run)[1] == ['weights={"sh": 0.5}']
 
 
 # The number of words in tables, and those of them that do not stand on one line.

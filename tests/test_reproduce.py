@@ -76,26 +76,27 @@ def test_cells_of_made_scenes(name, tmp_path, monkeypatch):
         scenes = {"static": 1 if scale == "tiny" else 2}.get(plan.experiment.study, 1)
         assert [cell.policy for cell in plan.cells] == 2 * scenes * labels
         assert len({cell.name for cell in plan.cells}) == len(plan.cells)
-        assert len({repr(plan.study.configs(cell)) for cell in plan.cells[: len(labels)]}) == len(labels)
-        assert {plan.study.configs(cell)[0].init_points for cell in plan.cells} == {"all"}
+        assert len({repr(plan.study.config_of(cell)) for cell in plan.cells[: len(labels)]}) == len(labels)
+        assert {plan.study.config_of(cell).data.init_points for cell in plan.cells} == {"all"}
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
 
 
 def test_protocols(tmp_path):
     """What a name does to the two configs of a cell, and that pool leaks are marked."""
     study = study_of("static", "paper", tmp_path)
-    found = {name: study.configs(Cell("room-1", (3, 0), "seed", "fisherrf", name, 0)) for name in PROTOCOLS}
-    assert {name: fit.init_points for name, (fit, _) in found.items()} == {
+    found = {name: study.config_of(Cell("room-1", (3, 0), "seed", "fisherrf", name, 0)) for name in PROTOCOLS}
+    assert {name: fit.data.init_points for name, fit in found.items()} == {
         "blind": "views",
         "paper": "all",
         "fisherrf": "views",
         "nbv-gym": "views",
     }
     assert [name for name, x in PROTOCOLS.items() if x.leaks] == ["paper"]
-    fit, active = found["paper"]
+    fit, active = found["paper"], found["paper"].selection
     assert (fit.max_steps, active.initial, active.every, active.add, active.restart) == (7000, 2, 200, None, "auto")
-    assert found["fisherrf"][1].restart == "always"
-    assert (found["nbv-gym"][1].initial, found["nbv-gym"][1].every) == (10, 200)
+    assert found["fisherrf"].selection.restart == "always"
+    few = found["nbv-gym"].selection
+    assert (few.initial, few.every) == (10, 200)
 
 
 def test_data_that_is_given(still, tmp_path):
@@ -270,12 +271,12 @@ def test_what_is_refused_leaves_nothing(still, tmp_path, capsys):
 def test_workers_get_whole_paths(tmp_path, monkeypatch):
     """What is sent to workers, which have working directories of their own, does not depend on this one."""
     pytest.importorskip("cloudpickle")
-    from drgs.cluster.payloads import Parcel
+    from drgs.cluster.payloads import Payload
 
     sent = []
 
     def run_cells(study, *rest):
-        sent.append(Parcel.of(study))
+        sent.append(Payload.of(study))
         return [], {}
 
     monkeypatch.setattr("drgs.commands.reproduce.run_cells", run_cells)

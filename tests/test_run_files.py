@@ -29,7 +29,7 @@ from drgs.features.decoder import save_decoder
 from drgs.files import save_ply
 from drgs.lab.rows import Crop
 from drgs.testing import random_scene
-from drgs.train import ActiveConfig, fit
+from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
     "config.json": {"frames", "absent", "semantics", "times"},
@@ -58,7 +58,7 @@ def place(tmp_path_factory):
     write_still(folder / "data")
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=20))
     fit(load(folder / "data"), folder / "all", config(max_steps=20), progress=False)
-    fit(lazily(folder / "data"), folder / "active", config(max_steps=12), active=plan(measure=(3,)), progress=False)
+    fit(lazily(folder / "data"), folder / "active", config(max_steps=12, selection=plan(measure=(3,))), progress=False)
     run = str(folder / "all")
     assert cli.main(["fisher", run, "--limit", "1", "--pose", "--quiet", "-o", str(folder / "out")]) == 0
     candidates = ["--candidates", str(folder / "cameras.json"), "-o", str(folder / "selection.json")]
@@ -112,7 +112,7 @@ def test_selections(place):
     """Of `drgs select` and of an active fit, down to a pick and a candidate."""
     chosen, active = _read(place / "selection.json"), _read(place / "active/selection.json")
     title = "selection.json"
-    own = set(active) - set(ActiveConfig().to_json())
+    own = set(active) - set(SelectionConfig().flat())
     assert set(chosen) | own | {"start"} == _fields(title) | {"schema", "measured"}
     assert active["measured"]
     for record in (chosen["picks"][0], active["picks"][0], *active["picks"][0]["candidates"], chosen["candidates"][0]):
@@ -156,13 +156,11 @@ _OTHERS = {
     "commands/info.py",  # stdout
     "commands/repeat.py",  # options on a line of a report
     "data/reader_process.py",  # between processes
-    "fitting/config.py",  # plain values
     "guards/json_files.py",  # a message
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
     "report/page.py",  # a cell of the report
-    "studies/cells.py",  # plain values
 }
 """Modules that make JSON which is no file of the page."""
 

@@ -25,7 +25,7 @@ def place(tmp_path_factory):
     """`data`, an active run `run` on it (views 1, 5 and two more), `scene.ply`, `cameras.json`."""
     folder = tmp_path_factory.mktemp("select")
     save_ply(write_still(folder / "data"), folder / "scene.ply")
-    fit(lazily(folder / "data"), folder / "run", config(max_steps=12), active=plan(), progress=False)
+    fit(lazily(folder / "data"), folder / "run", config(max_steps=12, selection=plan()), progress=False)
     save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 4, width=SIZE, height=SIZE))
     return folder
 
@@ -120,7 +120,7 @@ def test_made_candidates_have_the_lens_of_the_known_views(place, monkeypatch, ca
 
 def test_made_candidates_where_they_are_wished(place, monkeypatch, capsys):
     """The point, the distance and the span that are asked for hold, for pictures of the run as for candidates."""
-    where = "--center 0.1 -0.2 0.3 --distance 2.5 --span 40"
+    where = "--orbit center=0.1,-0.2,0.3 --orbit distance=2.5,span=40"
     report, _ = select(f"run --candidates orbit --count 4 --policy farthest -k 4 {where}", place, monkeypatch, capsys)
     candidates = np.array([pick["camera"]["c2w"] for pick in report["picks"]])
     assert cli.main(f"render run --preset fast --frames 4 --width 16 -o pictures {where}".split()) == 0
@@ -137,7 +137,7 @@ def test_made_candidates_where_they_are_wished(place, monkeypatch, capsys):
 
 def test_plain_ply_with_a_list_of_cameras(place, monkeypatch, capsys):
     """No training record: H from the cameras given; a cameras.json is a list of candidates as well."""
-    line = "scene.ply --train cameras.json --candidates orbit --count 5 --up z --policy coverage"
+    line = "scene.ply --train cameras.json --candidates orbit --count 5 --orbit up=z --policy coverage"
     report, text = select(line, place, monkeypatch, capsys)
     assert len(report["known"]["names"]) == 4
     assert (report["gaussians"], len(report["candidates"])) == (30, 5)
@@ -191,9 +191,12 @@ def test_dome_is_even(count):
         ("run --candidates data --prior -1", "lambda (value) must be in [0, inf), got -1"),
         ("run --candidates orbit --split test", "--split test must have --candidates DATA, an orbit has no split"),
         ("run --candidates orbit --count 0", "--count must be in [1, 10000], got 0"),
-        ("run --candidates orbit --elevation 90", "--elevation must be in [-89, 89] degrees, got 90"),
-        ("run --candidates orbit --distance -1", "--distance must be positive and finite, got -1"),
-        ("run --candidates dome --span 90", "--span must have --candidates orbit, a dome goes all the way round"),
+        ("run --candidates orbit --orbit elevation=90", "--orbit elevation must be in [-89, 89] degrees, got 90"),
+        ("run --candidates orbit --orbit distance=-1", "--orbit distance must be positive and finite, got -1"),
+        (
+            "run --candidates dome --orbit span=90",
+            "--orbit span must have --candidates orbit, a dome goes",
+        ),
         ("run --candidates nowhere", "nowhere: must be a data set, found no such file or folder"),
         ("data --candidates orbit", "must be a run folder, found no config.json"),
         ("run --candidates empty.json", "must be a list of at least one camera"),

@@ -24,7 +24,7 @@ from drgs.files import Run
 from drgs.fitting import semantics
 from drgs.fitting import trainer as trainer_module
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import load_run
@@ -82,9 +82,9 @@ def taught(dataset, tmp_path_factory):  # noqa: F811
 def semantic_trainer(data, **fields):
     """A fit of features at its first step."""
     cfg = config(**{**SHORT, "max_steps": 40, **fields})
-    frames = load_frames(data.split()[0], cfg.max_pixels, cfg.mask)
+    frames = load_frames(data.split()[0], cfg.data.max_pixels, cfg.data.mask)
     points, colors = torch.from_numpy(data.points), torch.from_numpy(data.colors)
-    rows = GaussianRows.from_points(points, colors, features=cfg.feature_width)
+    rows = GaussianRows.from_points(points, colors, features=cfg.features.feature_width)
     return Trainer(cfg, frames, rows, 3.0, parts_of(cfg, 3.0, CHANNELS))
 
 
@@ -354,9 +354,9 @@ def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkey
 
     monkeypatch.setattr(torch, "load", load)
     data = dataclasses.replace(taught, semantics=dataclasses.replace(taught.semantics))  # nothing cached
-    active = ActiveConfig(policy="random", add=2, every=2)
-    done = fit(data, tmp_path / "run", config(**FIT, test_every=0), active=active, progress=False)
-    plan = ActiveViews(active, data.split(0)[0], config(**FIT))
+    active = SelectionConfig.of(policy="random", add=2, every=2)
+    done = fit(data, tmp_path / "run", config(**FIT, test_every=0, selection=active), progress=False)
+    plan = ActiveViews(data.split(0)[0], config(**FIT, selection=active))
     assert len(plan.views) == 9
     assert opened == set(done.metrics["fitted"])
     assert load_run(done.run).decoder is not None
@@ -388,8 +388,8 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
         return real(*rest, scoring=scoring, **options)
 
     monkeypatch.setattr(drgs.select, "select", watched)
-    active = ActiveConfig(policy="fisher", add=2, every=2, info_pixels=100)
-    done = fit(taught, tmp_path / "run", config(**FIT), active=active, progress=False)
+    active = SelectionConfig.of(policy="fisher", add=2, every=2, info_pixels=100)
+    done = fit(taught, tmp_path / "run", config(**FIT, selection=active), progress=False)
     assert len(metrics_of) == 2
     last = load_run(done.run).decoder.metric()
     assert all(x.shape == last.shape for x in metrics_of)
@@ -405,9 +405,9 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
 def test_blocks_that_the_fit_does_not_have(taught, tmp_path, monkeypatch):
     """Semantic information of a fit without features is refused before the first step, not at the first pick."""
     monkeypatch.setattr("drgs.train.Trainer", lambda *arguments: pytest.fail("it began"))
-    active = ActiveConfig(policy="fisher", add=2, every=2, blocks=("geometry", "semantic"))
+    active = SelectionConfig.of(policy="fisher", add=2, every=2, blocks=("geometry", "semantic"))
     with pytest.raises(ValueError, match="active: blocks must be of what is fitted, got semantic for a fit without"):
-        fit(taught, tmp_path / "run", config(semantics="ignore", **FIT), active=active, progress=False)
+        fit(taught, tmp_path / "run", config(semantics="ignore", **FIT, selection=active), progress=False)
 
 
 def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, capsys):

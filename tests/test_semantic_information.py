@@ -18,7 +18,7 @@ from drgs import cli, fisher, reference
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import load_state, save_ply
 from drgs.fisher import SemanticMetric
-from drgs.fitting.config import ActiveConfig
+from drgs.fitting.config import SelectionConfig
 from drgs.information.moments import moments_map
 from drgs.oracle import sh_colors
 from drgs.select import CRITERIA, POLICIES, Cache, select
@@ -280,7 +280,10 @@ def test_the_cache_knows_the_metric(world):
         (lambda g, c: select(g, c, c, blocks=("geometry",), groups=("features",)), "groups must have one that blocks"),
         (lambda g, c: select(g, c, c, blocks=("semantic",), groups=["sh"]), "groups must have one that blocks"),
         (lambda g, c: select(g, c, c, blocks=("semantic",), method="fisherrf"), "select: blocks must be geometry with"),
-        (lambda g, c: ActiveConfig(blocks=("semantic",), method="fisherrf"), "active: blocks must be geometry with m"),
+        (
+            lambda g, c: SelectionConfig.of(blocks=("semantic",), method="fisherrf"),
+            "active: blocks must be geometry with m",
+        ),
         (lambda g, c: select(g, c, c, semantics=metric(4)), "must be of the width of the features, 3, got 4"),
         (lambda g, c: fisher.blocks(g, c, semantics=metric(4)), "fisher.blocks: semantics must be of the width"),
         (lambda g, c: fisher.variance_map(g, c[0], {}, semantics=metric(4)), "fisher.variance_map: semantics must be"),

@@ -19,7 +19,7 @@ from test_dynamic_data import cameras, coded, write_poses, write_video
 
 from drgs import train
 from drgs.files import write_json
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig
 from drgs.guards.locks import InUse
 from drgs.studies import cells as engine
 from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
@@ -52,8 +52,7 @@ def small(folder: Path, **fields) -> Study:
         name="tiny",
         folder=lambda scene, split: folder,
         policies={"farthest": {"policy": "farthest"}, "Random, 1": {"policy": "random"}},
-        fit=FitConfig(**config),
-        active=ActiveConfig(initial=2, add=2, every=3),
+        fit=FitConfig.of(**{"initial": 2, "add": 2, "every": 3, **config}),
         metrics=METRICS,
         reference="Random, 1",
     )
@@ -71,23 +70,24 @@ def faked(monkeypatch):
     """`fit` is replaced by one that writes what a run folder has at the end; the configs that it was given."""
     seen = []
 
-    def fit(dataset, folder, config, *, active, resume, progress):
-        seen.append((config, active))
-        fakes(folder, config, active, *([view.name for view in part] for part in dataset.split()))
+    def fit(dataset, folder, config, *, resume, progress):
+        seen.append(config)
+        fakes(folder, config, *([view.name for view in part] for part in dataset.split()))
 
     monkeypatch.setattr(engine, "fit", fit)
     return seen
 
 
-def fakes(folder, config, active, train=("a", "b", "c"), test=("t",)):
-    """The files of a finished run; without `active`, of a fit to all views."""
+def fakes(folder, config, train=("a", "b", "c"), test=("t",)):
+    """The files of a finished run; without a selection, of a fit to all views."""
+    active = config.selection
     schema = {"schema": 1, "command": "fit"}
     recorded = {"data": "x", "train": train[:2] if active else train, "test": test, "fit": config.to_json()}
-    write_json(folder / "config.json", {**schema, **recorded, **({"active": active.to_json()} if active else {})})
+    write_json(folder / "config.json", {**schema, **recorded})
     write_json(folder / "env.json", {"schema": 1, "commit": "0123456789", "drgs": "9"})
     picks = [{"index": 2, "name": train[2], "seconds": 0.5}]
     start = [{"index": i, "name": name} for i, name in enumerate(train[:2])]
-    leak = config.init_points == "all"
+    leak = config.data.init_points == "all"
     if active:
         write_json(folder / "selection.json", {**schema, "start": start, "picks": picks, "pool_leak": leak})
     mean = {"psnr": 20.0 + config.seed, "flip": None}
@@ -119,10 +119,10 @@ def test_a_cell_says_what_its_fit_is_told(still, faked, tmp_path):
     study = small(still)
     for cell in study.cells(units((5,)))[::2]:
         row = run_cell(study, cell, tmp_path)
-        config, active = faked[-1]
-        assert (config.seed, config.test_every, config.test_offset) == (5, 4, 1)
-        assert (active.start, active.policy) == ("seed", "farthest")
-        assert config.init_points == {"blind": "views", "paper": "all"}[cell.protocol]
+        config, selection = faked[-1], faked[-1].selection
+        assert (config.seed, config.data.test_every, config.data.test_offset) == (5, 4, 1)
+        assert (selection.start, selection.policy) == ("seed", "farthest")
+        assert config.data.init_points == {"blind": "views", "paper": "all"}[cell.protocol]
         assert row["pool_leak"] is (cell.protocol == "paper")
         assert row["initial"] == ["0", "2"]
         assert (row["picks"], row["views"], row["gaussians"]) == (["3"], 2, 3)
@@ -135,11 +135,11 @@ def test_a_folder_of_another_fit_is_refused(still, faked, tmp_path):
     study = small(still)
     cell = study.cells(units())[0]
     run_cell(study, cell, tmp_path)
-    run_cell(dataclasses.replace(study, fit=dataclasses.replace(study.fit, save_every=9)), cell, tmp_path)
-    other = dataclasses.replace(study, fit=dataclasses.replace(study.fit, max_steps=11))
+    run_cell(dataclasses.replace(study, fit=study.fit.replace(save_every=9)), cell, tmp_path)
+    other = dataclasses.replace(study, fit=study.fit.replace(max_steps=11))
     with pytest.raises(ValueError, match="must be the run of this cell, max_steps was 10 and is 11; give the study"):
         run_cell(other, cell, tmp_path)
-    other = dataclasses.replace(study, active=dataclasses.replace(study.active, every=4))
+    other = dataclasses.replace(study, fit=study.fit.replace(every=4))
     with pytest.raises(ValueError, match="must be the run of this cell, every was 3 and is 4"):
         run_cell(other, cell, tmp_path)
     assert len(faked) == 1
@@ -176,9 +176,7 @@ def test_seeds_are_of_different_initial_views(still):
     views = study.dataset(study.cells(units())[0]).split()[0]
     sets = []
     for seed in range(seeds[-1] + 1):
-        plan = engine.ActiveViews(
-            dataclasses.replace(study.active, start="seed"), views, dataclasses.replace(study.fit, seed=seed)
-        )
+        plan = engine.ActiveViews(views, study.fit.replace(start="seed", seed=seed))
         sets.append(frozenset(plan.chosen))
     assert [sets.index(chosen) for chosen in dict.fromkeys(sets)] == seeds
     with pytest.raises(ValueError, match="must have 1000 sets of initial views"):
@@ -197,11 +195,10 @@ def test_seeds_are_of_the_protocols_initial_views(tmp_path):
     for protocol in ("blind", "nbv-gym"):
         for seed in distinct_seeds(study, "still", SPLIT, 8, protocol):
             cell = Cell("still", SPLIT, "seed", "farthest", "nbv-gym", seed)
-            config, active = study.configs(cell)
-            sets.setdefault(protocol, set()).add(frozenset(engine.ActiveViews(active, train, config).chosen))
+            sets.setdefault(protocol, set()).add(frozenset(engine.ActiveViews(train, study.config_of(cell)).chosen))
     assert len(sets["nbv-gym"]) == 8
     assert len(sets["blind"]) < 8, "else this test tells nothing"
-    many = dataclasses.replace(study, active=dataclasses.replace(study.active, add=None))
+    many = dataclasses.replace(study, fit=study.fit.replace(add=None))
     with pytest.raises(ValueError, match="still: must have 20 training views for protocol nbv-gym, 10 at the start"):
         distinct_seeds(many, "still", SPLIT, 2, "nbv-gym")
 
@@ -221,9 +218,8 @@ def test_units_of_held_out_cameras(filmed, faked, tmp_path):
     and two cameras are two units; a policy that picks nothing has no active config and no seconds a pick.
     """
     study = dataclasses.replace(
-        small(filmed, times=3),
+        small(filmed, times=3, schedule="times"),
         policies={"farthest": {"policy": "farthest"}, "all": None},
-        active=ActiveConfig(schedule="times", add=2, every=3),
     )
     cells = study.cells([("film", camera, "first", "blind", 0) for camera in ("cam01", "cam02")])
     assert [cell.name for cell in cells[::2]] == [f"film-{name}-first0-blind-farthest" for name in ("cam01", "cam02")]
@@ -234,8 +230,8 @@ def test_units_of_held_out_cameras(filmed, faked, tmp_path):
         study.dataset(dataclasses.replace(cells[0], camera="cam9"))
     rows = tmp_path / "rows.jsonl"
     assert run_cells(study, cells, tmp_path, rows, str) == ([], {})
-    assert [config.test_cameras for config, _ in faked] == [("cam01",), ("cam01",), ("cam02",), ("cam02",)]
-    assert [active and active.schedule for _, active in faked] == ["times", None, "times", None]
+    assert [config.data.test_cameras for config in faked] == [("cam01",), ("cam01",), ("cam02",), ("cam02",)]
+    assert [config.selection and config.selection.schedule for config in faked] == ["times", None, "times", None]
     found = read_study(rows)
     assert [cell_of(row)[1] for row in found] == cells
     assert [(row["picks"], row["pick_seconds"]) for row in found[:2]] == [(["cam00/0005"], 0.5), ([], None)]
@@ -391,7 +387,7 @@ def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
 def test_a_killed_cell_goes_on(still, tmp_path, monkeypatch):
     """A fit that is killed after a pick is resumed from its checkpoint and ends as one that was not."""
     study = small(still, deterministic=True)
-    study = dataclasses.replace(study, active=dataclasses.replace(study.active, measure=(2, 3)))
+    study = dataclasses.replace(study, fit=study.fit.replace(measure=(2, 3)))
     cell = study.cells(units((3,)))[1]
     whole = run_cell(study, cell, tmp_path / "whole")
 
@@ -712,7 +708,7 @@ def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
             assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 10]}) == 1
         assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
         assert {cell.scene for cell in cells if cell.protocol == "paper"} == {"room-1"}
-        assert len({repr(study.configs(cell)) for cell in cells[:10]}) == 10
+        assert len({repr(study.config_of(cell)) for cell in cells[:10]}) == 10
         assert {policy for pair in study.comparisons for policy in pair} <= set(study.policies)
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
 
@@ -729,8 +725,8 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
         count = len(study.policies)
         assert len(cells) == len({cell.name for cell in cells}) == 3 * count
         assert [cell.policy for cell in cells] == 3 * list(study.policies)
-        assert len({repr(study.configs(cell)) for cell in cells[:count]}) == count
-        assert {study.configs(cell)[0].test_cameras for cell in cells} == {("cam00",)}
+        assert len({repr(study.config_of(cell)) for cell in cells[:count]}) == count
+        assert {study.config_of(cell).data.test_cameras for cell in cells} == {("cam00",)}
         rows = [
             {
                 **row_of(cell.scene, (0, 0), cell.policy, psnr=number),

@@ -66,13 +66,13 @@ def masked(dataset):
 def config(**fields):
     """A short fit: rates are higher than the defaults, which are made for thousands of steps."""
     short = {"max_steps": 60, "max_gaussians": 80, "sh_degree": 1, "save_every": 25, "dc_rate": 0.03}
-    return FitConfig(**{**short, "means_rate": (1e-3, 1e-4), **fields})
+    return FitConfig.of(**{**short, "means_rate": (1e-3, 1e-4), **fields})
 
 
 def trainer_of(dataset, cfg):
-    frames = load_frames(dataset.split()[0], cfg.max_pixels, cfg.mask)
+    frames = load_frames(dataset.split()[0], cfg.data.max_pixels, cfg.data.mask)
     points, colors = torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors)
-    return Trainer(cfg, frames, GaussianRows.from_points(points, colors, cfg.initial_opacity), 3.0)
+    return Trainer(cfg, frames, GaussianRows.from_points(points, colors, cfg.density.initial_opacity), 3.0)
 
 
 def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
@@ -257,7 +257,7 @@ def test_bad_configs_are_refused(dataset, tmp_path):
     """Options out of range, unknown fields of a config.json, and data without views or points."""
     for field, value in {"max_steps": 0, "mask": "soft", "init_points": "x", "sh_degree": 4, "seed": -1}.items():
         with pytest.raises(ValueError, match=f"fit: {field} must be"):
-            FitConfig(**{field: value})
+            FitConfig.of(**{field: value})
     with pytest.raises(ValueError, match="config must hold known fields, got 'foo'"):
         FitConfig.from_json({"foo": 1})
     assert FitConfig.from_json(config().to_json()) == config()

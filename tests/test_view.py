@@ -38,7 +38,7 @@ from drgs.files import load_state, save_state
 from drgs.viewing import panel
 from drgs.viewing.drawing import bands, drawn, stages
 from drgs.viewing.layers import layers_of, tinted
-from drgs.viewing.placed_views import Ranking, Score, Sight, Station, read_ranking, score_colors, stations_of
+from drgs.viewing.placed_views import PlacedView, Ranking, Score, Sight, placed_views_of, read_ranking, score_colors
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.server import Viewer
 from drgs.viewing.splats import ClientGaussians
@@ -71,7 +71,7 @@ def subject(means, **fields) -> Subject:
         "times": (),
         "settings": drgs.RenderSettings.preset,
         "layers": layers_of({}, None, 10_000),
-        "stations": (),
+        "placed_views": (),
         "ranking": None,
         "uncertainty": None,
         "first": FirstView(pose_of(camera, np.zeros(3)), np.zeros(3), np.array([0.0, -1.0, 0.0])),
@@ -302,14 +302,14 @@ def test_worker_leaves_what_is_no_longer_wanted():
 # ------------------------------------------------------------------------------------------------ cameras of a run
 
 
-def test_stations_of_a_run(place):  # noqa: F811
+def test_placed_views_of_a_run(place):  # noqa: F811
     """Views that were fitted to, and the others with the scores, parts and ranks that a selection states."""
     selection = json.loads((place / "run/selection.json").read_text())
     looked = subject_of(View(scene=place / "run"), SceneInput.of(View(scene=place / "run")))
-    by_name = {station.camera.name: station for station in looked.stations}
+    by_name = {placed.camera.name: placed for placed in looked.placed_views}
     assert sorted(by_name) == list("012345678")
     fitted = {view["name"] for key in ("start", "picks") for view in selection[key]}
-    assert {name for name, station in by_name.items() if station.kind == "training"} == fitted
+    assert {name for name, placed in by_name.items() if placed.kind == "training"} == fitted
     last = selection["picks"][-1]
     for row in last["candidates"]:
         sight = by_name[row["name"]].best
@@ -329,7 +329,7 @@ def test_stations_of_a_run(place):  # noqa: F811
     np.testing.assert_allclose(looked.first.up, (0, 0, 1), atol=0.05)
 
 
-def test_stations_of_drgs_select(place, monkeypatch, capsys):  # noqa: F811
+def test_placed_views_of_drgs_select(place, monkeypatch, capsys):  # noqa: F811
     """Candidates on an orbit are of no data set: the file has their cameras, and `--selection` shows them."""
     monkeypatch.chdir(place)
     line = "select run --candidates orbit --count 5 -k 2 --criterion eig --blocks geometry -o orbit.json"
@@ -338,9 +338,9 @@ def test_stations_of_drgs_select(place, monkeypatch, capsys):  # noqa: F811
     assert (ranking.title, len(ranking.cameras), len(ranking.picked)) == ("fisher, eig", 5, 2)
     args = View(scene=place / "run", selection=place / "orbit.json")
     looked = subject_of(args, SceneInput.of(args))
-    candidates = [station for station in looked.stations if station.kind == "candidate"]
+    candidates = [placed for placed in looked.placed_views if placed.kind == "candidate"]
     assert len(candidates) == 5
-    best = max(candidates, key=lambda station: station.best.score.total)
+    best = max(candidates, key=lambda placed: placed.best.score.total)
     assert (best.best.score.rank, best.best.score.of, best.best.pick, best.best.photograph) == (1, 5, 1, None)
     colors, (low, high) = score_colors(candidates)
     assert high == best.best.score.total > low
@@ -389,8 +389,8 @@ def test_synchronous_cameras_are_one_station_each():
         for k, camera in enumerate((still, other))
     ]
     scores = {"1_0.5": Score(2.0, {}, 1, 2), "1_0.0": Score(1.0, {}, 2, 2)}
-    found = stations_of(views, ["0_0.0"], Ranking("fisher", scores, ("1_0.5",)))
-    assert [station.kind for station in found] == ["training", "candidate"]
+    found = placed_views_of(views, ["0_0.0"], Ranking("fisher", scores, ("1_0.5",)))
+    assert [placed.kind for placed in found] == ["training", "candidate"]
     assert [sight.camera.time for sight in found[1].sights] == [0.0, 0.5, 1.0]
     assert found[1].at(0.9).camera.name == "1_1.0"
     assert found[1].at(None) is found[1].best is found[1].sights[1]
@@ -406,10 +406,10 @@ def test_what_files_say_is_escaped():
     """A scene, a view, a group, a note and a policy named like a program are text in the page."""
     camera = dataclasses.replace(orbit((0, 0, 0), 3.0, 1, width=8, height=8)[0], name=EVIL)
     score = Score(1.0, {EVIL: 1.0}, 1, 1)
-    station = Station("candidate", (Sight(camera, None, score, 1),))
+    placed = PlacedView("candidate", (Sight(camera, None, score, 1),))
     looked = subject(torch.zeros(1, 3), name=EVIL, state=EVIL, notes=(EVIL,))
-    texts = [panel.header(looked), panel.status(EVIL), panel.legend([station], EVIL)]
-    texts.append(panel.photograph(station, station.best))
+    texts = [panel.header(looked), panel.status(EVIL), panel.legend([placed], EVIL)]
+    texts.append(panel.photograph(placed, placed.best))
     for text in texts:
         assert "<script" not in text
         assert "<img" not in text
@@ -600,20 +600,20 @@ def test_a_click_flies_to_a_camera(place, viewers):  # noqa: F811
     args = View(scene=place / "run", preset="fast")
     looked = subject_of(args, SceneInput.of(args))
     viewer = viewers(looked)
-    number = next(k for k, station in enumerate(looked.stations) if station.best.score and station.kind == "candidate")
-    station = looked.stations[number]
+    number = next(k for k, placed in enumerate(looked.placed_views) if placed.best.score and placed.kind == "candidate")
+    placed = looked.placed_views[number]
     with Client(viewer.port) as client:
         client.look(looked.first.pose.wxyz, looked.first.pose.position)
         client.picture()
         at = len(client.heard)
         client.click(number)
         moved = client.wait(lambda m: m["type"] == "SetCameraPositionMessage", after=at)
-        np.testing.assert_allclose(moved["position"], station.camera.center, atol=1e-6)
-        html(client, f"rank {station.best.score.rank} of {station.best.score.of}", after=at)
+        np.testing.assert_allclose(moved["position"], placed.camera.center, atol=1e-6)
+        html(client, f"rank {placed.best.score.rank} of {placed.best.score.of}", after=at)
         client.wait(lambda m: "_data" in str(m.get("updates", {}).keys()), after=at)
         picture = client.picture(after=at)
         camera = dataclasses.replace(
-            station.camera, K=intrinsics(*[station.camera.K[1, 1] * 5] * 2, 80, 60), width=160, height=120
+            placed.camera, K=intrinsics(*[placed.camera.K[1, 1] * 5] * 2, 80, 60), width=160, height=120
         )
         wanted = (255 * drgs.render(looked.scene, camera, FAST).rgb.clamp(0, 1)).round().numpy()
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0  # the same picture as where it flew to

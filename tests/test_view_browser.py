@@ -148,9 +148,9 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     noticed and shown, with its step."""
     args = View(scene=place / "run", preset="fast")
     looked = subject_of(args, SceneInput.of(args))
-    station = next(station for station in looked.stations if station.kind == "candidate")
-    tip, middle = station.camera.center, looked.first.target
-    body = tip + station.camera.c2w[:3, :3] @ np.array([0.0, 0.0, 0.1])
+    placed = next(placed for placed in looked.placed_views if placed.kind == "candidate")
+    tip, middle = placed.camera.center, looked.first.target
+    body = tip + placed.camera.c2w[:3, :3] @ np.array([0.0, 0.0, 0.1])
     # From behind it, so that it is at the left and below, where neither the panel nor a word about WebGL is.
     eye = middle + 1.5 * (tip - middle)
     behind = Camera(K=intrinsics_from_fov(60, 4, 3), w2c=look_at(eye, tip, looked.first.up), width=4, height=3)
@@ -167,8 +167,8 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     page.mouse.click(*where)
     page.wait_for_function("(document.getElementById('drgs-photograph') || {}).innerText")
     shown_text = text(page, "photograph")
-    assert shown_text.startswith(station.camera.name)
-    assert f"rank {station.best.score.rank} of {station.best.score.of}" in shown_text
+    assert shown_text.startswith(placed.camera.name)
+    assert f"rank {placed.best.score.rank} of {placed.best.score.of}" in shown_text
     # What the browser had sent before may come after the click, and once more moves the camera for a moment.
     end = time.monotonic() + 30
     while np.abs(session_of(viewer).pose.position - tip).max() > 1e-3 and time.monotonic() < end:

@@ -28,7 +28,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("given")
     gaussians = write_still(folder / "data")
     run = Run(folder / "run")
-    config = FitConfig(settings=RenderSettings.preset("fast", background=SKY), test_every=3, max_pixels=100)
+    config = FitConfig.of(settings=RenderSettings.preset("fast", background=SKY), test_every=3, max_pixels=100)
     train = [name for i, name in enumerate(NAMES) if i % 3]
     recorded = {"data": str(folder / "data"), "train": train, "test": ["0", "3", "6"], "fit": config.to_json()}
     run.start({"command": "fit", **recorded})
@@ -162,7 +162,7 @@ def test_a_split_is_the_runs_offset_included(place, tmp_path):
     shutil.copytree(place / "run", tmp_path / "run")
     path = tmp_path / "run/config.json"
     config = json.loads(path.read_text())
-    config["fit"]["test_offset"] = 2
+    config["fit"]["data"]["test_offset"] = 2
     path.write_text(json.dumps(config))
     args, its = given(tmp_path)
     for text in (place / "data", tmp_path / "run"):

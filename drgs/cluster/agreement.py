@@ -57,7 +57,7 @@ def _code() -> str:
 
 
 def worker_statement() -> Callable[[], dict]:
-    """A function that says the same of the process that it is sent to, whatever drgs that has.
+    """A function that makes the statement of the process that it is sent to, whatever drgs that has.
 
     It travels by its value, not by its name, and needs nothing of this module.
     """
@@ -81,13 +81,13 @@ def worker_statement() -> Callable[[], dict]:
 
 
 def worker_name(address: str, name: object) -> str:
-    """Of a worker, for people: `0 (127.0.0.1:40123)`, or its address if it has no other name."""
+    """A worker's name for people: `0 (127.0.0.1:40123)`, or its address if it has no other."""
     place = address.removeprefix("tcp://")
     return place if name in (None, "", address) else f"{name} ({place})"
 
 
 def this_worker() -> dict[str, str]:
-    """Of the worker that runs the task that calls this: `worker`, its name, its `address` and its `host`."""
+    """The worker that runs the task that calls this: `worker`, its name, its `address` and its `host`."""
     from distributed import get_worker
 
     this = get_worker()
@@ -98,8 +98,8 @@ def check_agreement(worker: str, theirs: Mapping[str, Any], ours: Mapping[str, s
     """Refuse a worker that differs.
 
     Args:
-        worker: Its name, for messages.
-        theirs: Its statement.
+        worker: Name of the worker, for messages.
+        theirs: Statement of the worker, as `worker_statement` returns it.
         ours: What this process must agree with, `statement()["must"]`.
     Raises:
         Disagreement: In one line, with what both have.

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.cluster.agreement import check_agreement, statement, this_worker
-from drgs.cluster.payloads import Missing, opened_parcel
+from drgs.cluster.payloads import Missing, opened_payload
 from drgs.files import atomic_write
 from drgs.guards.locks import InUse, host_of
 from drgs.guards.writing import is_full
@@ -26,7 +26,7 @@ from drgs.studies.rows import Cell, append_row, is_done, read_study
 if TYPE_CHECKING:
     from distributed import Future
 
-    from drgs.cluster.connect import Cluster
+    from drgs.cluster.workers import Cluster
 
 __all__ = ["do_cell", "run_cells_on"]
 
@@ -53,7 +53,7 @@ def run_cells_on(
     Args:
         cluster: The workers.
         study: What to do. Workers call its `folder`: its data sets must lie under the same paths for all of them.
-        cells: In the order in which they are begun.
+        cells: Cells of the study, in the order in which they are begun.
         runs: Folder of all runs, which all workers must see under this path.
         rows: The JSON-lines file, of this machine alone; cells that it has are skipped.
         say: Takes a line whenever a cell begins or ends.
@@ -128,7 +128,7 @@ class _Round:
         self.rows = rows
         self.token = token
         self.say = say
-        self.parcel = cluster.send(study)
+        self.payload = cluster.send(study)
         self.topic = _TOPIC + uuid.uuid4().hex
         self.news: queue.Queue = queue.Queue()
         self.begun: dict[int, tuple[str, str]] = {}  # number of the cell -> name and address of who has begun it
@@ -139,7 +139,7 @@ class _Round:
         self.failed: dict[Cell, str] = {}
 
     def all(self) -> tuple[list[Cell], dict[Cell, str]]:
-        """Until every cell is done, taken or failed."""
+        """Hand out the cells and wait until every one is done, taken or failed."""
         named = dict(self.cells)
         client = self.cluster.client
         client.subscribe_topic(self.topic, lambda event: self.news.put(("begun", event[1])))
@@ -164,16 +164,16 @@ class _Round:
         return self.taken, self.failed
 
     def hand_out(self, number: int, cell: Cell, workers: list[str] | None = None) -> None:
-        """To the next worker that is free; preferably to one of `workers`, if they are named."""
+        """Hand a cell to the next worker that is free; preferably to one of `workers`, if they are named."""
         where = {"workers": workers, "allow_other_workers": True} if workers else {}
-        arguments = (self.cluster.ours, self.parcel, cell, str(self.runs), str(self.token), self.topic, number)
+        arguments = (self.cluster.ours, self.payload, cell, str(self.runs), str(self.token), self.topic, number)
         # An earlier cell first, also where it comes again because its worker has gone.
         future = self.cluster.client.submit(do_cell, *arguments, pure=False, priority=-number, **where)
         self.pending[number] = future
         future.add_done_callback(lambda _: self.news.put(("done", number)))
 
     def tell(self, number: int, cell: Cell, worker: str, address: str) -> None:
-        """That a worker has begun with a cell, and whether it has the cell of one that is gone."""
+        """Tell that a worker has begun with a cell, and whether it has the cell of one that is gone."""
         before = self.begun.get(number)
         self.begun[number] = (worker, address)
         again = "" if before is None else ", again"
@@ -182,7 +182,7 @@ class _Round:
         self.say(f"{number} of {self.count}: {cell.name} on worker {worker}{again}")
 
     def take_in(self, number: int, cell: Cell) -> None:
-        """What has become of a cell."""
+        """Take in what has become of a cell: its row, a reason why there is none, or one to hand it out again."""
         future = self.pending.pop(number)
         try:
             found = self.cluster.finished(future, f"cell {cell.name}")
@@ -195,7 +195,7 @@ class _Round:
             self.tries[number] = self.tries.get(number, 0) + 1
             if self.tries[number] > _TRIES:
                 raise ConnectionError(f"cluster: worker {found['worker']} must keep what it is sent, but forgets it")
-            self.cluster.send_again([self.parcel], [found["address"]])
+            self.cluster.send_again([self.payload], [found["address"]])
             self.hand_out(number, cell)
         elif "unseen" in found:
             raise ValueError(_not_shared(found["worker"], self.runs))
@@ -235,14 +235,16 @@ def sees(token: str) -> bool:
 def do_cell(
     ours: Mapping[str, str], study: str, cell: Cell, runs: str, token: str, topic: str, number: int
 ) -> dict[str, Any]:
-    """Runs on a worker: one cell.
+    """Do one cell, on a worker.
 
     Args:
         ours: What the worker must agree with.
-        study: Digest of the parcel.
-        cell, runs: As `run_cell` takes them.
+        study: Digest of the payload that holds the study.
+        cell: The cell to do.
+        runs: Folder of all runs.
         token: A file that must be seen.
-        topic, number: That the beginning is told by.
+        topic: Topic of Dask's events under which the worker says that it has begun.
+        number: Number of the cell in that event.
     Returns:
         `row`, or why there is none: `failed`, `taken` (the host that has it), `missing`, `unseen`; always `worker`,
         its `address` and its `host`.
@@ -252,7 +254,7 @@ def do_cell(
     said: dict[str, Any] = {**this_worker()}
     check_agreement(said["worker"], statement(), ours)
     try:
-        whole = opened_parcel(study)
+        whole = opened_payload(study)
     except Missing as missing:
         return said | {"missing": str(missing)}
     until = time.monotonic() + _APPEARING
@@ -266,7 +268,7 @@ def do_cell(
         try:
             return said | {"row": run_cell(whole, cell, Path(runs))}
         except InUse as busy:
-            # Of a process that was killed just now, or of one that works.
+            # The lock is that of a process that was killed just now and is about to go, or of one that works: wait.
             if time.monotonic() > until:
                 return said | {"taken": host_of(Path(runs) / whole.name / cell.name), "why": str(busy)}
             time.sleep(1.0)

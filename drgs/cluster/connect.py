@@ -13,46 +13,29 @@ import asyncio
 import contextlib
 import logging
 import multiprocessing
-import os
-import platform
 import signal
-import threading
-import time
 import warnings
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drgs import runtime
-from drgs.cluster.agreement import Disagreement, check_agreement, statement, worker_name, worker_statement
-from drgs.cluster.payloads import Parcel, keep
-from drgs.cluster.views import answers
-from drgs.cluster.wanted import check_wanted
+from drgs.cluster.options import check_options
+from drgs.cluster.workers import WORKER_SECONDS, Cluster
 from drgs.display.progress import Bar
 from drgs.guards.memory import available, is_out_of_memory
 from drgs.guards.unfinished import temporary_folder
 
 if TYPE_CHECKING:
-    import torch
-    from distributed import Client, Future, LocalCluster
-
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
-    from drgs.gain import Information
-    from drgs.information.pool import Question
+    from distributed import Client, LocalCluster
 
 __all__ = ["CONNECT_SECONDS", "WORKER_SECONDS", "Cluster", "opened"]
 
 CONNECT_SECONDS = 10.0
-"""Within which a scheduler must answer."""
-WORKER_SECONDS = 60.0
-"""That a cluster may be without any worker."""
+"""Time within which a scheduler must answer."""
 
-_START_SECONDS = 300  # for a local worker to come up, on a busy machine
+_START_SECONDS = 300  # seconds that a local worker takes at most to come up on a busy machine
 _RUN_AGAIN = 64  # exit code of a worker that has found itself running its parent's script (EX_USAGE)
-_LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
-_log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
@@ -73,7 +56,7 @@ def opened(scheduler: str | None = None, workers: int | None = None) -> Iterator
         return
     if getattr(multiprocessing.current_process(), "_inheriting", False):  # as multiprocessing asks itself
         raise SystemExit(_RUN_AGAIN)  # a worker to be, which runs the script of its parent; that says so
-    address = check_wanted(scheduler, workers)
+    address = check_options(scheduler, workers)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silent())
         if address is not None:
@@ -156,7 +139,7 @@ def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
                 memory_limit=0,  # nothing is spilled, paused or restarted for its memory
                 local_directory=folder,
                 silence_logs=logging.CRITICAL,
-                preload=["drgs.cluster.worker"],
+                preload=["drgs.cluster.preload"],
                 env=environ,
                 death_timeout=_START_SECONDS,
             )
@@ -221,162 +204,3 @@ def _silent() -> Iterator[None]:
         finally:
             for name, level in before.items():
                 logging.getLogger(name).setLevel(level)
-
-
-class Cluster:
-    """Workers behind a scheduler, as `drgs.select` takes them; `opened` makes one.
-
-    Attributes:
-        client: Dask's.
-        ours: What every worker must have in common with this process.
-        sent_bytes, sent_seconds: To each worker, and for all of them, so far.
-        views: Worker -> how many views it has answered for.
-        view_seconds: Of each of these, on its worker.
-        cpu_seconds: Of all of these together.
-        received_bytes: Of all answers.
-    """
-
-    def __init__(self, client: Client, local: LocalCluster | None = None) -> None:
-        self.client = client
-        self._local = local
-        self.ours = {**statement()["must"], "threads": "1"}
-        self.sent_bytes = 0
-        self.sent_seconds = 0.0
-        self.received_bytes = 0
-        self.views: Counter[str] = Counter()
-        self.view_seconds: list[float] = []
-        self.cpu_seconds = 0.0
-        self._parcels: dict[str, Parcel] = {}  # of the call that is being answered
-        self._is_there = time.monotonic()  # when a worker was seen last
-
-    def each(
-        self, scene: Scene, views: Sequence[tuple[Question, Camera, torch.Tensor | None]]
-    ) -> Iterator[Information]:
-        """What views say, in their order; see `drgs.cluster.views`."""
-        return answers(self, scene, views)
-
-    def workers(self) -> dict[str, str]:
-        """Address -> name of each worker there is now."""
-        found = self.client.scheduler_info(n_workers=-1)["workers"]
-        return {address: worker_name(address, one["name"]) for address, one in found.items()}
-
-    def workers_of(self, host: str | None) -> list[str]:
-        """Addresses of those that run on a machine."""
-        nodes = self.client.run(platform.node, on_error="ignore")
-        return [address for address, node in nodes.items() if node == host]
-
-    def check(self) -> None:
-        """Ask every worker what it computes with.
-
-        Raises:
-            Disagreement: If one differs in what must agree.
-        """
-        info = self.client.scheduler_info(n_workers=-1)["workers"]
-        found = self.client.run(worker_statement(), on_error="return")
-        machines = set()
-        for address, said in sorted(found.items()):
-            name = worker_name(address, info[address]["name"] if address in info else address)
-            if isinstance(said, OSError):
-                continue  # it has gone
-            if isinstance(said, BaseException):
-                raise Disagreement(
-                    f"cluster: worker {name} must be able to load drgs, cannot: {said}; install it there"
-                )
-            check_agreement(name, said, self.ours)
-            if (threads := info.get(address, {}).get("nthreads", 1)) != 1:
-                raise Disagreement(
-                    f"cluster: worker {name} must do one task at a time, does {threads}; start it with --nthreads 1"
-                )
-            machines.add((said["may"].get("processor"), said["may"].get("LLVM")))
-        if len(machines) > 1:
-            shown = "; ".join(f"{processor}, LLVM {llvm}" for processor, llvm in sorted(machines, key=str))
-            _log.warning("cluster: workers are unlike each other (%s): last digits depend on which gets a view", shown)
-
-    def send(self, thing: object) -> str:
-        """See to it that all workers have something; the digest under which they know it."""
-        parcel = Parcel.of(thing)
-        if parcel.digest not in self._parcels:
-            self._parcels[parcel.digest] = parcel
-            self.send_again([parcel.digest])
-        return parcel.digest
-
-    def send_again(self, digests: Sequence[str], workers: list[str] | None = None) -> None:
-        """Send what has been sent before, to some workers; None: to all."""
-        began = time.perf_counter()
-        for digest in digests:
-            for piece in self._parcels[digest].pieces():
-                # A worker that cannot be reached will say that it misses something, or never say anything again.
-                self.client.run(keep, *piece, workers=workers, on_error="ignore")
-            self.sent_bytes += len(self._parcels[digest].data) if workers is None else 0
-        self.sent_seconds += time.perf_counter() - began
-
-    def forget(self, keeping: Sequence[str] = ()) -> None:
-        """Drop the bytes of what was sent, which would be kept for workers that come later."""
-        self._parcels = {digest: self._parcels[digest] for digest in keeping if digest in self._parcels}
-
-    def submit(self, function: Callable, *args: Any) -> Future:
-        """A task for whichever worker is free."""
-        return self.client.submit(function, *args, pure=False)
-
-    def result(self, future: Future, what: str) -> Any:
-        """What a task returned, or raised; `what` it is, for messages.
-
-        Raises:
-            ConnectionError: If the scheduler or all workers have gone, or workers die of it.
-        """
-        done = threading.Event()
-        future.add_done_callback(lambda _: done.set())
-        while not done.wait(_LOOK):
-            self.check_alive()
-        return self.finished(future, what)
-
-    def finished(self, future: Future, what: str) -> Any:
-        """`result` of a task that is done."""
-        from concurrent.futures import CancelledError
-
-        from distributed.scheduler import KilledWorker
-
-        try:
-            return future.result()
-        except CancelledError:
-            raise ConnectionError(f"cluster: the scheduler must stay until {what} is done, it has gone") from None
-        except KilledWorker as error:
-            raise ConnectionError(
-                f"cluster: workers must survive {what}, {error.allowed_failures + 1} of them died of it; look at their "
-                "logs, they may need more memory"
-            ) from None
-
-    def check_alive(self) -> None:
-        """Find out whether there is still somebody who works.
-
-        Raises:
-            ConnectionError: If the scheduler has gone, or there have been no workers for `WORKER_SECONDS`.
-        """
-        now = time.monotonic()
-        if self.client.status != "running":
-            raise ConnectionError("cluster: the scheduler must stay until all is done, it has gone; start it again")
-        if self.client.scheduler_info(n_workers=-1)["workers"]:
-            self._is_there = now
-        elif now - self._is_there > WORKER_SECONDS:
-            raise ConnectionError(
-                f"cluster: there must be a worker, there was none for {WORKER_SECONDS:.0f} s; start some, then do it "
-                "again"
-            )
-
-    def close(self) -> None:
-        """Leave the cluster; workers of this machine end at once, whatever they do."""
-        self.forget()
-        if self._local is not None:
-            from distributed.core import Status
-
-            for nanny in list(self._local.workers.values()):
-                pid = nanny.pid
-                nanny.status = Status.closing_gracefully  # else it would start another one
-                if pid:
-                    with contextlib.suppress(OSError):
-                        os.kill(pid, signal.SIGKILL)
-        with contextlib.suppress(Exception):
-            self.client.close(timeout=2)
-        if self._local is not None:
-            with contextlib.suppress(Exception):
-                self._local.close(timeout=5)

@@ -1,6 +1,6 @@
 """What is sent to workers, as bytes: pickled once, sent once to each worker in pieces, opened there when first used.
 
-Tensors travel as NumPy arrays. A worker keeps the last few parcels, so that a scene is there for all of its views.
+Tensors travel as NumPy arrays. A worker keeps the last few payloads, so that a scene is there for all of its views.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["Missing", "Parcel", "keep", "opened_parcel"]
+__all__ = ["Missing", "Payload", "keep", "opened_payload"]
 
-_KEPT = 4  # parcels of a worker: one scene, what its views were asked, and a few of the call before
-_UNFINISHED = 8  # parcels that pieces are missing of
+_KEPT = 4  # payloads of a worker: one scene, what its views were asked, and a few of the call before
+_UNFINISHED = 8  # payloads that pieces are missing of
 _PIECE = 64 << 20  # bytes of a message
 
 
 class Missing(LookupError):
-    """A worker that has not got a parcel: it has started since, or has dropped it."""
+    """A worker that has not got a payload: it has started since, or has dropped it."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Parcel:
+class Payload:
     """Something that was pickled.
 
     Attributes:
@@ -38,7 +38,7 @@ class Parcel:
     data: bytes
 
     @classmethod
-    def of(cls, thing: object) -> Parcel:
+    def of(cls, thing: object) -> Payload:
         """Of anything that can be pickled, closures included.
 
         Raises:
@@ -68,6 +68,7 @@ def _pickler() -> type[pickle.Pickler]:
     class Pickler(cloudpickle.Pickler):
         def reducer_override(self, x: Any) -> Any:
             if isinstance(x, torch.Tensor) and x.dtype != torch.bfloat16:  # which NumPy does not have
+                # NumPy sees values only: whether the tensor has a gradient is said beside them, and set again there.
                 array = np.ascontiguousarray(x.detach().cpu().numpy())
                 return _tensor, (array, tuple(x.shape), x.requires_grad, isinstance(x, torch.nn.Parameter))
             return super().reducer_override(x)
@@ -85,25 +86,25 @@ def _tensor(array: np.ndarray, shape: tuple[int, ...], has_gradient: bool, is_pa
 # --------------------------------------------------------------------------------------------------- on the worker
 
 _pieces: dict[str, dict[int, bytes]] = {}
-_parcels: dict[str, bytes] = {}  # whole, not opened yet
+_payloads: dict[str, bytes] = {}  # whole, not opened yet
 _things: dict[str, Any] = {}  # opened; the one that was used last comes last
 
 
 def keep(digest: str, number: int, count: int, data: bytes) -> None:
-    """Take a piece of a parcel; only the worker's event loop calls it."""
-    if digest in _parcels or digest in _things:
+    """Take a piece of a payload; only the worker's event loop calls it."""
+    if digest in _payloads or digest in _things:
         return
     found = _pieces.setdefault(digest, {})
     found[number] = data
     if len(found) == count:
-        _parcels[digest] = b"".join(found[i] for i in range(count))
+        _payloads[digest] = b"".join(found[i] for i in range(count))
         del _pieces[digest]
     for old in list(_pieces)[:-_UNFINISHED]:  # of a client that has gone
         del _pieces[old]
 
 
-def opened_parcel(digest: str) -> Any:
-    """What a parcel holds, the same object each time.
+def opened_payload(digest: str) -> Any:
+    """What a payload holds, the same object each time.
 
     Raises:
         Missing: If the worker has not got it.
@@ -111,11 +112,11 @@ def opened_parcel(digest: str) -> Any:
     if digest in _things:
         _things[digest] = _things.pop(digest)
         return _things[digest]
-    data = _parcels.pop(digest, None)
+    data = _payloads.pop(digest, None)
     if data is None:
         raise Missing(digest)
-    for old in (*_things, *_parcels)[: max(len(_things) + len(_parcels) + 1 - _KEPT, 0)]:
+    for old in (*_things, *_payloads)[: max(len(_things) + len(_payloads) + 1 - _KEPT, 0)]:
         _things.pop(old, None)
-        _parcels.pop(old, None)
+        _payloads.pop(old, None)
     _things[digest] = pickle.loads(data)
     return _things[digest]

@@ -43,6 +43,7 @@ _MADE_BY = {
     ".splat": "`python convert.py {ply} --output {path}` of github.com/antimatter15/splat, or SuperSplat "
     "(superspl.at/editor)",
     ".ksplat": "`node util/create-ksplat.js {ply} {path}` of github.com/mkkellogg/GaussianSplats3D",
+    ".compressed.ply": "`npx @playcanvas/splat-transform {ply} {path}`, or SuperSplat (superspl.at/editor)",
 }
 """What makes a file that is only read of a PLY."""
 _log = logging.getLogger(__name__)
@@ -140,15 +141,16 @@ def check_suffix(where: str, path: Path) -> str:
     Raises:
         ValueError: If no such format is written; of those that are only read it says which program makes one.
     """
-    suffix = path.suffix.lower()
+    # A PLY as it is under SuperSplat's name for what it compresses would be taken for compressed.
+    suffix = ".compressed.ply" if path.name.lower().endswith(".compressed.ply") else path.suffix.lower()
     if suffix in WRITTEN:
         return suffix
     known = f"{where}: {path.name} must end with {', '.join(WRITTEN)}, got {suffix or 'no suffix'}"
     if path.name.lower() == "meta.json":
         suffix = ".sog"  # the index of the same, in a folder
     if suffix not in _MADE_BY:
-        raise ValueError(f"{known}; rename it")
-    ply = path.with_name(("scene" if path.stem == "meta" else path.stem) + ".ply")
+        raise ValueError(f"{known}; choose one of these")
+    ply = path.with_name(("scene" if path.name.lower() == "meta.json" else path.name[: -len(suffix)]) + ".ply")
     raise ValueError(
         f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
         f"{_MADE_BY[suffix].format(ply=ply, path=path)}"

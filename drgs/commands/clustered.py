@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drgs.cluster.connect import Cluster
+    from drgs.cluster.workers import Cluster
     from drgs.commands.option_groups import Clustered
 
 __all__ = ["workers_of"]

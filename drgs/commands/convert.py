@@ -74,7 +74,7 @@ def still(args: Convert, given: SceneInput) -> Gaussians:
         raise ValueError(
             f"{args.scene}: moves, so that --time must say when; `drgs render --format ply` writes a PLY for each time"
         )
-    return given.moving.at(args.time).detach()  # a file holds values
+    return given.moving.at(args.time).detach()  # a file holds values: NumPy takes no tensor with a gradient
 
 
 def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.ndarray]:
@@ -84,12 +84,12 @@ def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.
     deviation of the mean in scene units, of log scales, and so on.
 
     Args:
-        path: `information.safetensors` of `drgs fisher`.
-        g: The Gaussians that it is about.
-        prior: lambda.
+        path: File `information.safetensors` that `drgs fisher` wrote.
+        g: Gaussians that it is about.
+        prior: Prior lambda.
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is none, or about other Gaussians.
+        ValueError: If it is no such file, or about other Gaussians.
     """
     information, _ = load_state(path)
     known = {name: information[name] for name in GROUPS if name in information}
@@ -112,9 +112,9 @@ def label_column(path: Path, given: SceneInput, g: Gaussians) -> tuple[np.ndarra
     """(N,) class 1..K of each Gaussian, that of the largest cosine, and a line of the header for each name.
 
     Args:
-        path: What was named, for the message.
-        given: The run.
-        g: Its Gaussians.
+        path: Path that was named, for the message.
+        given: The run, with its decoder and its classes.
+        g: Gaussians of the run.
     Raises:
         ValueError: If it has no classes with embeddings, or no features.
     """

@@ -30,6 +30,7 @@ from drgs.guards.outputs import Claim, claim
 from drgs.integrator import render
 from drgs.report.write import FILE
 from drgs.settings import RenderSettings
+from drgs.sizes import cropped
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ _PRESETS = {
     "gsplat": "gsplat's rasterizer, its cut-offs",
     "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
 }
-_GAIN = 8  # of difference pictures
+_GAIN = 8  # factor of difference pictures
 _OWN = ("demo", "eval", "report")  # commands whose files in the run may be replaced
 _TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
 _DISTANCE = 1.1
@@ -56,11 +57,14 @@ class Plan:
     """How much of everything; the defaults take minutes.
 
     Attributes:
-        views, width, height, spp: Of the still life.
-        steps, gaussians: Of the fit.
+        views: Number of photographs of the still life.
+        width, height: Size of these in pixels.
+        spp: Light paths a pixel.
+        steps: Number of steps of the fit.
+        gaussians: Largest number of Gaussians of the fit.
         crop: Width and height of the part that the float64 oracle renders.
-        repeats: Rounds of interleaved timing.
-        frames: Of the turntable.
+        repeats: Number of rounds of interleaved timing.
+        frames: Number of frames of the turntable.
     """
 
     views: int = 28
@@ -84,10 +88,12 @@ class PresetRow:
     """One preset on the held-out views.
 
     Attributes:
-        preset, what: Its name, and its rules in words.
-        psnr_to_photographs: Mean, in dB.
-        psnr_to_exact, max_difference: Between its images and those of `exact`; None of `exact` itself.
-        seconds: A view, median.
+        preset: Name of the preset.
+        what: Rules of the preset in words.
+        psnr_to_photographs: Mean PSNR to the photographs in dB.
+        psnr_to_exact: Mean PSNR to the images of `exact` in dB; None of `exact` itself.
+        max_difference: Largest difference from the images of `exact`; None of `exact` itself.
+        seconds: Median time of a view.
         time_of_exact: Median ratio to the time of `exact` in the same round.
     """
 
@@ -111,8 +117,8 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
     Args:
         out_dir: Its folders `still_life` (kept if it is there) and `run` (replaced) belong to the demo; a folder of
             that name that an earlier demo did not make is refused.
-        plan: How much.
-        progress: Say what comes out, on stdout, and how far it is, on stderr.
+        plan: How much of everything.
+        progress: Whether to say what comes out, on stdout, and how far it is, on stderr.
     Returns:
         What demo.json holds.
     Raises:
@@ -150,14 +156,14 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
 
     start = time.perf_counter()
     dataset = load(data)
-    config = FitConfig(
+    config = FitConfig.of(
         max_steps=plan.steps, max_gaussians=plan.gaussians, max_pixels=plan.width * plan.height, save_every=plan.steps
     )
     run_folder.clear(_OWN)
     fitted = fit(dataset, out_dir / "run", config, progress=progress)
     lap("fit", start)
     g, mean = fitted.gaussians, fitted.metrics["mean"]
-    frames = load_frames(dataset.split()[1], config.max_pixels, config.mask)
+    frames = load_frames(dataset.split()[1], config.data.max_pixels, config.data.mask)
     say(
         f"2. Fit: {len(g)} Gaussians, {plan.steps} steps in {fitted.seconds:.0f} s; {len(frames)} views that it never "
         f"saw: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}, FLIP {mean['flip']:.3f}"
@@ -246,7 +252,7 @@ def _draw(g: Gaussians, camera: Camera, settings: RenderSettings) -> torch.Tenso
     """(H, W, 3) on the CPU, computed when this returns."""
     import drjit as dr
 
-    with torch.no_grad():  # a picture
+    with torch.no_grad():  # a picture is looked at only
         image = render(g, camera, settings, outputs=()).rgb.cpu()
     dr.sync_thread()
     return image
@@ -261,11 +267,9 @@ def _seconds(work: Callable) -> float:
 def _check(g: Gaussians, frame: Frame, image: torch.Tensor, crop: tuple[int, int]) -> dict:
     """The middle of an `exact` image against the float64 oracle."""
     camera = frame.camera
-    (width, height) = crop
+    width, height = crop
     x, y = (camera.width - width) // 2, (camera.height - height) // 2
-    K = camera.K.copy()
-    K[:2, 2] -= x, y
-    part = dataclasses.replace(camera, K=K, width=width, height=height)
+    part = cropped(camera, x, y, width, height)
     with torch.no_grad():  # compared, not optimized
         truth = reference.render(g, part, RenderSettings.preset("exact"))
     error = (image[y : y + height, x : x + width].double() - truth.rgb).abs()
@@ -301,7 +305,7 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
         return _draw(g, camera, settings).numpy()
 
     theirs = peer()[..., :3]
-    mse = float(np.mean((np.clip(theirs, 0, 1) - np.clip(ours(), 0, 1)) ** 2))
+    mse = float(np.mean((np.clip(theirs, 0, 1) - np.clip(ours(), 0, 1)) ** 2))  # as pictures are shown
     times = [(_seconds(ours), _seconds(peer)) for _ in range(repeats)]
     return {
         "fast": statistics.median(a for a, _ in times),
@@ -343,7 +347,7 @@ def _turntable(g: Gaussians, path: Path, plan: Plan, progress: bool) -> None:
 
 
 def _table(rows: list[PresetRow]) -> None:
-    """On stdout."""
+    """Print the rows on stdout."""
     cells = []
     for row in rows:
         same = row.psnr_to_exact is None

@@ -31,10 +31,10 @@ def run(args: Eval) -> None:
 
 
 def print_table(metrics: dict, *, lpips: bool = False) -> None:
-    """The metrics of `write_metrics` as tables on stdout, reasons of missing ones below, and what viewers show.
+    """Print metrics as tables on stdout, reasons of missing ones below, and what viewers show.
 
     Args:
-        metrics: As written.
+        metrics: Content of metrics.json.
         lpips: Whether LPIPS was asked for; otherwise nothing is said of it, as it is null for a reason that is known.
     """
     digits = {"psnr": ".2f", "psnr_moving": ".2f"}
@@ -71,7 +71,7 @@ def _motion_line(moved: dict, count: int) -> str:
 
 
 def _print_segmentation(metrics: dict, found: dict) -> None:
-    """How well labels agree with their reference; the teacher's own beside it where that is the data set's."""
+    """Print how well labels agree with their reference, and the teacher's own where that is the data set's."""
     names = {"labels": "the data set's labels", "teacher": "the teacher's labels, not the truth"}
     shown = {
         "pixel_accuracy": "pixel\naccuracy",

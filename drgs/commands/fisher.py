@@ -62,7 +62,7 @@ def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
     check_counts(args)
     settings = args.settings()  # refuses what cannot be, before anything is read
-    prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
+    prior = args.given_prior() or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)

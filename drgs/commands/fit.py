@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING
 
 from drgs.commands.clustered import workers_of
@@ -12,7 +11,7 @@ from drgs.files import Run
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.resume import claim_run
 from drgs.report.write import FILE
-from drgs.train import FitConfig, fit
+from drgs.train import fit
 
 if TYPE_CHECKING:
     from drgs.commands.options import Fit
@@ -22,23 +21,20 @@ __all__ = ["run"]
 
 def run(args: Fit) -> None:
     """`drgs fit DATA -o RUN`."""
-    names = {field.name for field in dataclasses.fields(FitConfig)} - {"settings"}
-    config = FitConfig(settings=args.settings(), **{n: getattr(args, n) for n in names if hasattr(args, n)})
-    active = args.active()
+    config = args.fit_config()
+    is_active = config.selection is not None
     # Before minutes of reading images and triangulating points.
     claim_run(Run(args.output), "fit", args.resume, [args.data])
     dataset = load_dataset(
         args.data,
         config,
-        lazy=active is not None,
-        points=active is None or config.init_points == "all",
+        lazy=is_active,
+        points=not is_active or config.data.init_points == "all",
         strict=args.strict,
-        semantics=config.semantics != "ignore",
+        semantics=config.features.semantics != "ignore",
     )
     with workers_of(args) as workers:
-        result = fit(
-            dataset, args.output, config, active=active, resume=args.resume, progress=not args.quiet, workers=workers
-        )
+        result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet, workers=workers)
     page = result.run.path / FILE
     if args.report:
         report_of(result.run, page, dataset)

@@ -1,8 +1,7 @@
-"""How long rendering will take, found out on a few bands of the first view."""
+"""A forecast of how long rendering will take, made on a few bands of the first view."""
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import torch
 
 from drgs.display.progress import Bar
 from drgs.integrator import render
+from drgs.sizes import cropped
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -18,25 +18,26 @@ if TYPE_CHECKING:
 
 __all__ = ["forecast"]
 
-_BANDS = (0.125, 0.375, 0.625, 0.875)  # where they are, in parts of the height: one in each quarter
-_SHARE = 1 / 32  # of the height, each
+_BANDS = (0.125, 0.375, 0.625, 0.875)  # places of the bands in parts of the height: one in each quarter
+_SHARE = 1 / 32  # height of each band, in parts of the view's
 
 
 def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> float:
     """Seconds that all views will take, kernels compiled; finding out takes about a fifth of one view.
 
     Args:
-        gaussians, cameras, settings: As for `drgs.render`, at least one camera.
+        gaussians: Gaussians to be rendered.
+        cameras: Views to be rendered, at least one.
+        settings: Settings that they are rendered by.
     """
     first = cameras[0]
     rows = max(2, round(first.height * _SHARE))
 
     def seconds(place: float, height: int) -> float:
-        K = first.K.copy()
-        K[1, 2] -= int(place * max(first.height - height, 0))
+        band = cropped(first, 0, int(place * max(first.height - height, 0)), first.width, height)
         began = time.perf_counter()
-        with torch.no_grad():  # drawn to be timed
-            render(gaussians, dataclasses.replace(first, K=K, height=height), settings, ()).rgb.cpu().numpy()
+        with torch.no_grad():  # as views are drawn: a graph would take time of its own
+            render(gaussians, band, settings, ()).rgb.cpu().numpy()
         return time.perf_counter() - began
 
     with Bar("how long it will take", len(_BANDS)) as bar:

@@ -112,5 +112,7 @@ class Reproduce(Common, Clustered):
     """Index of the first of them."""
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16, for LPIPS beside FLIP; needs pip install 'drgs[lpips]'."""
+    config: Path | None = None
+    """A TOML or JSON file of the configuration, or a run, over the fits of the scale (docs/configuration.md)."""
     figures: bool = True
     """Draw the comparison sheet and the maps at the end, unless --no-figures is given, which saves their seconds."""

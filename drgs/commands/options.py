@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -20,28 +20,18 @@ from drgs.commands.option_groups import (
     Comparing,
     Data,
     Moments,
-    Moving,
     OutputPath,
     SceneFile,
     Seen,
     Settings,
     Split,
-    Taught,
     Views,
 )
 from drgs.commands.overrides import check_color
+from drgs.commands.record_options import options_of
 from drgs.commands.view_options import View
-from drgs.fitting.config import (
-    ActiveConfig,
-    Degree,
-    FitConfig,
-    InitPoints,
-    MaskUse,
-    PickPoints,
-    Restart,
-    Schedule,
-    Start,
-)
+from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.guards.records import ways_of
 from drgs.settings import Preset, RenderSettings
 
 __all__ = [
@@ -85,8 +75,6 @@ class Render(Settings, Around, Views, Moments):
     """Image height in pixels; default the camera's."""
     frames: int = 60
     """Views of an orbit, or of one camera over a range of --time."""
-    fov: float | None = None
-    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     format: str = "png"
     """Comma-separated list of png, exr, webm, and ply: all Gaussians as they are at each time."""
     fps: float = 24.0
@@ -105,8 +93,13 @@ class Render(Settings, Around, Views, Moments):
     """At most this many views."""
 
 
+_ON_THE_WAY = ("schedule", "initial", "start", "add", "every", "pick_points", "restart", "measure")
+_Fitted: Any = options_of(FitConfig, without=("settings", "selection"))
+_Selecting: Any = options_of(SelectionConfig, only=_ON_THE_WAY)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(Choosing, Clustered, Data, Taught, Moving):
+class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
@@ -115,50 +108,12 @@ class Fit(Choosing, Clustered, Data, Taught, Moving):
     """The run folder."""
     preset: Preset = "fast"
     """Render settings of a named system. Train with what will be rendered with: gsplat for viewers of PLY files."""
-    max_steps: int = FitConfig.max_steps
-    """Optimizer steps."""
-    max_pixels: int = FitConfig.max_pixels
-    """Images are reduced to at most this many pixels."""
-    max_gaussians: int = FitConfig.max_gaussians
-    """How many Gaussians there may be."""
-    init_points: InitPoints = FitConfig.init_points
-    """Initial points: of the training views (views) or of the data set (all); auto: all, or views if --views active."""
-    test_every: int = FitConfig.test_every
-    """Every n-th view, by name, is held out; 0 holds out none."""
-    test_offset: int = FitConfig.test_offset
-    """Index of the first of them, below --test-every; a split that the data set itself states wins over both."""
-    sh_degree: Degree = FitConfig.sh_degree
-    """Highest degree of the view-dependent color."""
-    deterministic: bool = FitConfig.deterministic
-    """Same seed, same bits; slower. (Images drawn again without gradients differ by 1e-7: docs/numerics.md.)"""
     resume: bool = False
     """Continue from the last checkpoint in the run folder."""
-    save_every: int = FitConfig.save_every
-    """Steps between checkpoints."""
-    save_minutes: float = FitConfig.save_minutes
-    """Minutes after which one is written all the same."""
-    mask: MaskUse = FitConfig.mask
-    """Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files."""
     background: tuple[float, float, float] = RenderSettings.background
     """RGB in [0, 1] behind everything."""
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
-    schedule: Schedule = ActiveConfig.schedule
-    """Pick view by view (views), one camera at each later time (times), or any camera at any (pairs); auto: by data."""
-    initial: int = ActiveConfig.initial
-    """Views at the start: that of --start, then those farthest away."""
-    start: Start = ActiveConfig.start
-    """The first of the initial views: the first training view by name, or one that the seed draws."""
-    add: int | None = ActiveConfig.add
-    """Views to be chosen on the way, others are not read; default 10, or one for every time after the first."""
-    every: int | None = ActiveConfig.every
-    """Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of 17,000."""
-    pick_points: PickPoints = ActiveConfig.pick_points
-    """Points that a picked view adds: triangulated, and where nothing is yet; auto: none with --init-points all."""
-    restart: Restart = ActiveConfig.restart
-    """After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never."""
-    measure: tuple[int, ...] = ActiveConfig.measure
-    """Numbers of training views at which the held-out views are measured, too, just before the next pick."""
     report: bool = True
     """Write report.html into the run folder at the end, unless --no-report is given, which saves its seconds."""
 
@@ -169,25 +124,32 @@ class Fit(Choosing, Clustered, Data, Taught, Moving):
         check_color("--background", self.background)
         return super().settings().replace(background=self.background)
 
-    def active(self) -> ActiveConfig | None:
-        """The `ActiveConfig` of --views active, else None.
+    def fit_config(self) -> FitConfig:
+        """What these options say of the fit, its selection with --views active.
 
         Raises:
             ValueError: If an option is out of range, or belongs to --views active and that is missing.
         """
-        fields = dataclasses.fields(ActiveConfig)
+        names = {*ways_of(FitConfig)} & {field.name for field in dataclasses.fields(_Fitted)}
+        config = FitConfig.of(settings=self.settings(), **{name: getattr(self, name) for name in names})
         if self.views != "active" and (self.scheduler, self.workers) != (None, None):
             raise ValueError(
                 "fit: --scheduler and --workers must have --views active, got --views all; workers compute what "
                 "candidates tell, the fit itself is one process"
             )
+        selection = {name: getattr(self, name) for name in ("policy", "info_pixels", *_ON_THE_WAY)}
         if self.views == "active":
-            return ActiveConfig(**{field.name: getattr(self, field.name) for field in fields})
-        for field in fields:
-            if getattr(self, field.name) != field.default:
+            return config.replace(selection=SelectionConfig.of(scoring=self.scoring(), **selection))
+        names = {*ways_of(SelectionConfig), "relative_prior"}
+        for field in dataclasses.fields(self) if self.config is None else ():  # a file may well say more
+            if field.name in names and getattr(self, field.name) != _default(field):
                 option = "--" + field.name.replace("_", "-")
                 raise ValueError(f"fit: {option} must have --views active, got --views all; add it or drop {option}")
-        return None
+        return config
+
+
+def _default(field: dataclasses.Field) -> Any:
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -280,8 +242,6 @@ class Query(Settings, Around, Views):
     """Masks of at most this many views, evenly spaced."""
     max_pixels: int | None = None
     """Views are reduced to at most this many pixels; default as in the fit."""
-    fov: float | None = None
-    """Horizontal field of view of an orbit in degrees; default the photographs', else 45."""
     output: OutputPath = Path("out/query")
     """Folder for the masks, pictures, query.json, and selected.ply or (--remove) rest.ply."""
 

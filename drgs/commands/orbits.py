@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
+from drgs.commands.orbit_keys import UP, parsed_orbit
 from drgs.data.capture import Focus, path, upright
 from drgs.integrator import render
 from drgs.settings import RenderSettings
@@ -30,17 +31,7 @@ if TYPE_CHECKING:
     from drgs.commands.option_groups import Around
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["UP", "Wish", "capture_orbit", "dome", "scene_orbit", "seen_distance"]
-
-UP = {
-    "x": (1.0, 0.0, 0.0),
-    "y": (0.0, 1.0, 0.0),
-    "z": (0.0, 0.0, 1.0),
-    "minus-x": (-1.0, 0.0, 0.0),
-    "minus-y": (0.0, -1.0, 0.0),
-    "minus-z": (0.0, 0.0, -1.0),
-}
-"""World directions by their names on the command line (a name must not begin with a dash)."""
+__all__ = ["Wish", "capture_orbit", "dome", "scene_orbit", "seen_distance"]
 
 _ELEVATION = 20.0
 _FOV = 45.0
@@ -79,23 +70,25 @@ class Wish:
 
     def __post_init__(self):
         if self.center is not None and not np.isfinite(self.center).all():
-            raise ValueError(f"--center must be three finite numbers, got {self.center}; correct it")
+            raise ValueError(f"--orbit center must be three finite numbers, got {self.center}; correct it")
         if self.distance is not None and not 0 < self.distance < math.inf:
-            raise ValueError(f"--distance must be positive and finite, got {self.distance}; correct it")
+            raise ValueError(f"--orbit distance must be positive and finite, got {self.distance}; correct it")
         for option, value, low, high in (
-            ("--elevation", self.elevation, -89, 89),
-            ("--span", self.span, 0, 360),
-            ("--fov", self.fov, 1, 170),
+            ("--orbit elevation", self.elevation, -89, 89),
+            ("--orbit span", self.span, 0, 360),
+            ("--orbit fov", self.fov, 1, 170),
         ):
             if value is not None and not low <= value <= high:
                 raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
 
     @classmethod
     def of(cls, args: Around) -> Wish:
-        """Of a command's options: `up`, `center`, `distance`, `elevation`, `span` and, if it has one, `fov`."""
-        up = None if args.up == "auto" else UP[args.up]
-        fields = {name: getattr(args, name) for name in ("center", "distance", "elevation", "span")}
-        return cls(up=up, fov=getattr(args, "fov", None), **fields)
+        """What `--orbit` of a command says.
+
+        Raises:
+            ValueError: If it names what there is not, or a value is out of range.
+        """
+        return cls(**parsed_orbit(args.orbit, args.orbit_keys))
 
     @property
     def moves(self) -> bool:
@@ -174,7 +167,7 @@ def capture_orbit(
         poses = [] if beyond else path(cameras, frames)
         if poses and wish.moves:
             raise ValueError(
-                "orbit: --up, --distance, --elevation and --span must have --center X Y Z here, the photographs look "
+                "orbit: up, distance, elevation and span must have center=X,Y,Z in --orbit here, the photographs look "
                 "at no common point; add it, or drop them to follow the photographs' path"
             )
         made = [lens.camera(w2c, index) for index, w2c in enumerate(poses)]

@@ -9,7 +9,7 @@ from typing import Any
 
 from drgs.settings import RenderSettings
 
-__all__ = ["check_color", "parsed", "parsed_size"]
+__all__ = ["check_color", "override", "parsed", "parsed_size"]
 
 
 def parsed(texts: Sequence[str]) -> dict[str, Any]:
@@ -29,6 +29,15 @@ def parsed(texts: Sequence[str]) -> dict[str, Any]:
     if "background" in values:
         check_color("--set background", values["background"])
     return values
+
+
+def override(name: str, value: Any) -> str:
+    """The text that `parsed` reads a field from."""
+    if isinstance(value, tuple):
+        return f"{name}={','.join(map(repr, value))}"
+    if isinstance(value, bool):
+        return f"{name}={str(value).lower()}"
+    return f"{name}={value!r}" if isinstance(value, float) else f"{name}={value}"
 
 
 def check_color(option: str, color: tuple[float, ...]) -> None:

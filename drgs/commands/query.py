@@ -57,7 +57,7 @@ def run(args: Query) -> None:
     largest = float(score.max()) if len(g) else 0.0
     _refuse_nothing(len(g), count, largest, query, args.remove, _too_short(given))
     cameras, source = seen_views(args, given)
-    pixels = args.max_pixels or (given.record.config.max_pixels if given.record else None)
+    pixels = args.max_pixels or (given.record.config.data.max_pixels if given.record else None)
     if pixels is not None:
         cameras = [at_most(camera, pixels) for camera in cameras]
     names = pictures.file_names([camera.name for camera in cameras])
@@ -144,7 +144,7 @@ def _too_short(given: SceneInput) -> str:
     if given.record is None:
         return ""
     done = given.record.config.max_steps if given.step is None else given.step
-    rate = given.record.config.feature_rate
+    rate = given.record.config.features.feature_rate
     if rate <= 0 or done >= (needed := math.ceil(1 / rate)):
         return ""
     return (
@@ -177,7 +177,7 @@ def _view(
     name: str,
 ) -> dict:
     """Mask and picture of a view, and its row of query.json."""
-    with torch.no_grad():  # a picture
+    with torch.no_grad():  # a picture is looked at only
         out = render(g, camera, settings, ())
     _, selected = query.score(out.features, decoder)
     mask = (selected & (out.alpha.cpu() >= OPAQUE)).numpy()

@@ -9,37 +9,41 @@ from pathlib import Path
 from typing import Any
 
 from drgs.commands.options import Fit
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.commands.overrides import override
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.settings import RenderSettings
 
 __all__ = ["fit_command"]
 
 
-def fit_command(config: FitConfig, active: ActiveConfig | None, data: Path, output: Path) -> tuple[str, list[str]]:
+def fit_command(config: FitConfig, data: Path, output: Path) -> tuple[str, list[str]]:
     """`drgs fit ...` with every option that is not the default's.
 
     Args:
-        config, active: Of the fit; None: it was fitted to all views.
-        data, output: The data set and the run folder.
+        config: Configuration of the fit.
+        data: Folder of the data set.
+        output: Folder of the run.
     Returns:
-        The line for a shell, and the fields of `config` that no option sets, as `name=value`: these need Python.
+        The line for a shell, and the fields that no option sets, as `name=value`: these need a file (--config).
     """
-    options = {field.name: field.default for field in dataclasses.fields(Fit)}
-    words = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings)]
-    beyond = []
     usual = FitConfig()
-    for field in dataclasses.fields(FitConfig):
-        value = getattr(config, field.name)
-        if field.name == "settings":
-            continue
-        if field.name in options:
-            words += _option(field.name, value, options[field.name])
-        elif value != getattr(usual, field.name):
-            beyond.append(f"{field.name}={json.dumps(value)}")
-    if active is not None:
+    words = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings)]
+    for name in ("max_steps", "seed", "sh_degree", "deterministic"):
+        words += _option(name, getattr(config, name), getattr(usual, name))
+    for part in ("data", "density", "rates", "loss", "features", "motion", "saving"):
+        mine = getattr(config, part)
+        for field in dataclasses.fields(mine):
+            words += _option(field.name, getattr(mine, field.name), field.default)
+    beyond = []
+    if (selection := config.selection) is not None:
         words += ["--views", "active"]
-        for field in dataclasses.fields(ActiveConfig):
-            words += _option(field.name, getattr(active, field.name), options[field.name])
+        fields = selection.flat()
+        carried = {name: fields.pop(name) for name in ("weights", "groups")}
+        carried["prior.groups"] = dict(selection.scoring.prior.groups) if selection.scoring.prior else {}
+        beyond = [f"{name}={json.dumps(value)}" for name, value in carried.items() if value]
+        default = SelectionConfig().flat()
+        for name, value in fields.items():
+            words += _option(name, value, default[name])
     return shlex.join(words), beyond
 
 
@@ -48,7 +52,7 @@ def _settings(settings: RenderSettings) -> list[str]:
     nearest, differences = settings.nearest_preset()
     words = [] if nearest == Fit.preset else ["--preset", nearest]
     for name, value in differences.items():
-        words += ["--set", f"{name}={_value(value)}"]
+        words += ["--set", override(name, value)]
     return words + _option("background", settings.background, RenderSettings.background)
 
 
@@ -65,7 +69,7 @@ def _option(name: str, value: Any, default: Any) -> list[str]:
 
 
 def _value(value: Any) -> str:
-    """As the command line reads it."""
+    """A value as the command line reads it."""
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if isinstance(value, float) else str(value)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from drgs.commands.repeat import fit_command
 from drgs.files import Run
 from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import active_record, fit_record
+from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
 from drgs.guards.outputs import check_file
 from drgs.report.page import GENERATOR
@@ -50,15 +50,15 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
     """Write the page of a run.
 
     Args:
-        run: The run folder.
-        path: The HTML file.
-        dataset: What was fitted; None where it is no longer there.
+        run: Folder of the run.
+        path: HTML file to write.
+        dataset: Data set that was fitted; None where it is no longer there.
     """
     record = fit_record(run)
-    command, beyond = fit_command(record.config, active_record(run), record.data, run.path)
+    command, beyond = fit_command(record.config, record.data, run.path)
     text = "The command that repeats this fit, in another folder:"
     if beyond:
-        text = f"Fitted from Python: FitConfig({', '.join(beyond)}), beside what this command says:"
+        text = f"What no option says ({', '.join(beyond)}) needs a file of --config; this command says the rest:"
     write_report(run, path, command, text, dataset)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.commands import fisher
 from drgs.commands.clustered import workers_of
+from drgs.commands.config_file import config_fields
 from drgs.commands.options import Fisher
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -25,7 +26,7 @@ from drgs.studies.rows import Cell, cell_of, read_study
 from drgs.studies.sheets import comparison_sheet
 
 if TYPE_CHECKING:
-    from drgs.cluster.connect import Cluster
+    from drgs.cluster.workers import Cluster
     from drgs.commands.making_options import Reproduce
 
 __all__ = ["run"]
@@ -56,6 +57,7 @@ def run(args: Reproduce) -> None:
             args.policies,
             (args.test_every, args.test_offset),
             weights,
+            {} if args.config is None else config_fields(args.config),
         )
         write_json(out / _GIVEN, known)
         for note in plan.notes:
@@ -173,6 +175,8 @@ def _command(args: Reproduce) -> str:
         words += ["--policy", label]
     if args.data:
         words += ["--test-every", str(args.test_every), "--test-offset", str(args.test_offset)]
+    if args.config:
+        words += ["--config", str(args.config)]
     if args.lpips_weights:
         words += ["--lpips-weights", str(args.lpips_weights)]
     return shlex.join(words if args.figures else [*words, "--no-figures"])

@@ -15,9 +15,8 @@ from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
-from drgs.gain import Prior
 from drgs.guards.outputs import check_file
-from drgs.select import Scoring, Selection, select
+from drgs.select import Selection, select
 
 if TYPE_CHECKING:
     from drgs.commands.options import Select
@@ -37,21 +36,10 @@ def run(args: Select) -> None:
     check_counts(args)
     settings = args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
-    prior = Prior.given(args.prior, args.relative_prior)
+    wanted = args.scoring()  # before files are read, too
     given = SceneInput.of(args)
     settings = given.over_background(settings)
-    semantics = given.semantics()
-    scoring = Scoring(
-        args.criterion,
-        settings,
-        args.method,
-        prior,
-        blocks=args.blocks,
-        semantics=semantics,
-        network=args.network,
-        combine=args.combine,
-        probes=args.probes,
-    )
+    scoring = dataclasses.replace(wanted, settings=settings, semantics=given.semantics())
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     candidates = timed(candidates, args, given)

@@ -26,7 +26,7 @@ from drgs.data.semantics import LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
 from drgs.features.encoders import TEMPLATES, ClipEncoder
 from drgs.files import SCHEMA, atomic_write, write_json
-from drgs.fitting.config import FitConfig
+from drgs.fitting.config import DataConfig
 from drgs.guards.json_files import read_json
 from drgs.guards.outputs import Claim, claim
 
@@ -57,7 +57,7 @@ def run(args: Teach) -> None:
     output.sweep(_FOLDER)
     _refuse_others(output)
     names = _names(args, output)
-    times = FitConfig.times if args.times is None else args.times
+    times = DataConfig.times if args.times is None else args.times
     files = _files(data.load(args.data, points=False, strict=args.strict, semantics=False, times=times).views)
     with Bar("loading the model", show=not args.quiet):
         on_cuda = args.variant != "llvm_ad_rgb" and torch.cuda.is_available()

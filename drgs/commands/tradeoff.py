@@ -111,15 +111,18 @@ class _Report:
     """What tables and page show.
 
     Attributes:
-        scene, gaussians: Path and number.
-        source: Where the views come from, in words.
-        views: As errors were measured on them.
+        scene: Path of the scene.
+        gaussians: Number of its Gaussians.
+        source: Source of the views, in words.
+        views: Views as errors were measured on them.
         full: Clock -> what was timed at full size.
         fields: Settings that hold in every row.
-        seed, budgets: As given.
-        measured: The rows.
-        recommended: For every use and budget.
-        date, env: When and where.
+        seed: Seed of the measurement.
+        budgets: Largest errors that are allowed.
+        measured: The rows, and how they were measured.
+        recommended: Advice for every use and budget.
+        date: Date of the measurement.
+        env: Machine and versions that it was measured with.
     """
 
     scene: str
@@ -136,7 +139,7 @@ class _Report:
     env: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """As tradeoff.json holds it."""
+        """The report as tradeoff.json holds it."""
         return {
             "schema": SCHEMA,
             "command": "tradeoff",
@@ -159,7 +162,7 @@ class _Report:
 
 
 def _print(report: _Report) -> None:
-    """Tables for a terminal."""
+    """Print the report as tables for a terminal."""
     measured = report.measured
     title = f"time and error relative to exact: {report.gaussians} Gaussians, {len(report.views)} views"
     rows = []
@@ -278,7 +281,7 @@ def _full_lines(report: _Report) -> list[str]:
 
 
 def _full_table(report: _Report) -> list[str]:
-    """The same for the page."""
+    """Times at full size as a table of the page."""
     lines = []
     rows = {row.name: row for row in report.measured.rows}
     lines.append("| at the size of the views as drawn | size | rounds | setting | seconds | times exact's |")

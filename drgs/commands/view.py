@@ -25,9 +25,8 @@ __all__ = ["run"]
 
 _EVERY = 2.0  # seconds between two looks at the files
 _LAST = 0.5  # seconds that what is being computed is given to end
-# pixels of our pictures
-_LEAST = 100
-_MOST = 1 << 24
+_LEAST = 100  # pixels of our pictures
+_MOST = 1 << 24  # and at most so many
 
 
 def run(args: View) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from tyro.conf import Positional
 
-from drgs.commands.option_groups import BLOCKS_TEXT, Around, Informed, Views
+from drgs.commands.option_groups import Around, Informed, Views
+from drgs.commands.orbit_keys import ORBIT_KEYS
+from drgs.commands.record_options import BLOCKS_TEXT
 from drgs.information.choices import Block
 
 __all__ = ["View"]
@@ -36,3 +38,4 @@ class View(Informed, Around, Views):
     """What a browser must know; default nothing on this machine, else one that is made up and printed."""
     open: bool = False
     """Open the page in a browser, too."""
+    orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")  # the browser has its own

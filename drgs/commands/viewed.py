@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.commands.fisher import MAP_PRIOR, Told, added
-from drgs.commands.orbits import UP, Wish, capture_orbit, scene_orbit, seen_distance
+from drgs.commands.orbit_keys import UP
+from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
@@ -16,10 +17,9 @@ from drgs.data.capture import Focus, upright
 from drgs.ellipsoids import Gaussians
 from drgs.files import Run, state_header
 from drgs.fitting.records import fitted_views
-from drgs.gain import Prior
 from drgs.guards.foreign import refuse_foreign
 from drgs.viewing.layers import layers_of
-from drgs.viewing.placed_views import Ranking, Station, read_ranking, stations_of
+from drgs.viewing.placed_views import PlacedView, Ranking, placed_views_of, read_ranking
 from drgs.viewing.poses import pose_of
 from drgs.viewing.subject import FirstView, Subject
 from drgs.viewing.uncertainty import Uncertainty
@@ -57,13 +57,13 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     notes: list[str] = []
     known = _known(args, given, notes)
     ranking = _ranking(args, given)
-    stations = _stations(args, given, ranking, notes)
+    placed_views = _placed_views(args, given, ranking, notes)
     uncertainty = _uncertainty(args, given, known)
     origin = np.array(given.gaussians.origin, np.float64)
     first = before.first if before else _first(args, given.gaussians, known.cameras if known else [])
     pixels = known.pixels if known else args.max_pixels
-    if before is not None and _same(before.stations, stations) and before.ranking == ranking:
-        stations = before.stations
+    if before is not None and _same(before.placed_views, placed_views) and before.ranking == ranking:
+        placed_views = before.placed_views
     return Subject(
         name="/".join(args.scene.resolve().parts[-2:]),
         state=_state(given),
@@ -73,7 +73,7 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
         times=_times(given),
         settings=given.settings,
         layers=layers_of(_paint(args, given), uncertainty, pixels),
-        stations=stations,
+        placed_views=placed_views,
         ranking=ranking,
         uncertainty=uncertainty,
         first=first,
@@ -128,14 +128,14 @@ def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
         return None
 
 
-def _stations(args: View, given: SceneInput, ranking: Ranking | None, notes: list[str]) -> tuple[Station, ...]:
+def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes: list[str]) -> tuple[PlacedView, ...]:
     """Where photographs were taken or could be."""
     if args.train is None and given.run is None:
-        return stations_of([], (), ranking)
+        return placed_views_of([], (), ranking)
     source = Source.known(args.train, given)
     if source.kind == "list":
         views = [DataView(camera, camera.name) for camera in source.listed()]
-        return stations_of(views, [view.name for view in views], ranking)
+        return placed_views_of(views, [view.name for view in views], ranking)
     try:
         views = source.dataset(args, given).views
         fitted = [view.name for view in views]
@@ -144,8 +144,8 @@ def _stations(args: View, given: SceneInput, ranking: Ranking | None, notes: lis
     except (OSError, ValueError):
         if args.train is not None:
             raise
-        return stations_of([], (), ranking)  # `_known` has said why
-    return stations_of(views, fitted, ranking)
+        return placed_views_of([], (), ranking)  # `_known` has said why
+    return placed_views_of(views, fitted, ranking)
 
 
 def _ranking(args: View, given: SceneInput) -> Ranking | None:
@@ -169,7 +169,7 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
     if not cameras:
         return None
     told = Told.of(given, args, given.settings("fast"), cameras)
-    prior = Prior.given(args.prior, args.relative_prior) or MAP_PRIOR
+    prior = args.given_prior() or MAP_PRIOR
     return Uncertainty(
         cameras,
         lambda camera: added(told.said(camera)),
@@ -202,11 +202,11 @@ def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstVie
     return FirstView(pose, target, up / np.linalg.norm(up))
 
 
-def _same(before: tuple[Station, ...], after: tuple[Station, ...]) -> bool:
+def _same(before: tuple[PlacedView, ...], after: tuple[PlacedView, ...]) -> bool:
     """Whether both are the same places with the same names: then a browser need not draw them again."""
-    return [_key(station) for station in before] == [_key(station) for station in after]
+    return [_key(placed) for placed in before] == [_key(placed) for placed in after]
 
 
-def _key(station: Station) -> tuple:
-    camera = station.camera
-    return station.kind, camera.name, np.asarray(camera.w2c).tobytes(), len(station.sights)
+def _key(placed: PlacedView) -> tuple:
+    camera = placed.camera
+    return placed.kind, camera.name, np.asarray(camera.w2c).tobytes(), len(placed.sights)

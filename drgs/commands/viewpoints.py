@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Literal
 
 from drgs import data
 from drgs.codecs.folders import cameras_of_model
+from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_distance
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.files import Run
@@ -132,8 +133,8 @@ class Source:
             points=False,
             strict=args.strict,
             semantics=False,
-            times=config.times if args.times is None else args.times,
-            test_cameras=config.test_cameras if args.test_cameras is None else args.test_cameras,
+            times=config.data.times if args.times is None else args.times,
+            test_cameras=config.data.test_cameras if args.test_cameras is None else args.test_cameras,
         )
 
     def split(self, dataset: Dataset, part: str, given: SceneInput) -> list[View]:
@@ -144,7 +145,7 @@ class Source:
             ValueError: If there is none.
         """
         record = self.record or given.record
-        held_out = (record.config.test_every, record.config.test_offset) if record else ()
+        held_out = (record.config.data.test_every, record.config.data.test_offset) if record else ()
         train, test = dataset.split(*held_out)
         views = {"all": sorted(train + test, key=lambda view: view.name), "train": train, "test": test}[part]
         if not views:
@@ -209,14 +210,15 @@ def _drawn_orbit(
     captured = _captured(given)
     shape = captured[0].height / captured[0].width if captured else 0.75
     width, height = _size(*size, shape)
-    how = {"width": width, "height": height, "wish": Wish.of(args), "returns": returns}
+    wish = Wish.of(args)
+    how = {"width": width, "height": height, "wish": wish, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
     if cameras:
         _say(args, source)
         return cameras, source
-    up = "minus-y" if args.up == "auto" else args.up
-    if args.up == "auto":
-        _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --up")
+    if wish.up is None:
+        _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
+    up = next(name for name, direction in UP.items() if direction == (wish.up or UP["minus-y"]))
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
 
@@ -277,7 +279,7 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
             "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json"
         )
     source = Source.known(text, given)
-    pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.max_pixels)
+    pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
         return Known([at_most(camera.undistorted(), pixels) for camera in source.listed()], where, pixels)
@@ -320,9 +322,10 @@ def other_views(
     if source.kind == "orbit":
         return _compared_orbit(Wish.of(args), given, known, args.count), f"orbit of {args.count}"
     if source.kind == "dome":
-        if args.span is not None:
-            raise ValueError(f"--span must have {option} orbit, a dome goes all the way round; drop it")
-        circle = dataclasses.replace(Wish.of(args), elevation=0.0, span=360.0)
+        wish = Wish.of(args)
+        if wish.span is not None:
+            raise ValueError(f"--orbit span must have {option} orbit, a dome goes all the way round; drop it")
+        circle = dataclasses.replace(wish, elevation=0.0, span=360.0)
         return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
     if source.kind == "list":
         return [at_most(camera.undistorted(), known.pixels) for camera in source.listed()], text

@@ -27,6 +27,7 @@ from drgs.guards.foreign import refuse_foreign
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "check_last_row",
     "check_npz",
     "image_size",
     "file_inside",
@@ -328,16 +329,24 @@ def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
     `Camera` then refuses what is no rotation.
 
     Raises:
-        ValueError: a number is not finite or beyond reason.
+        ValueError: a number is not finite or beyond reason, or a fourth row is not 0 0 0 1.
     """
     c2w = np.asarray(c2w, np.float64)
     if not np.isfinite(c2w).all():
         raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; drop this view")
     check_distance(where, c2w)
+    check_last_row(f"{where}: the pose", c2w)
     w2c = np.eye(4)
     w2c[:3, :3] = c2w[:3, :3].T
     w2c[:3, 3] = -c2w[:3, :3].T @ c2w[:3, 3]
     return w2c
+
+
+def check_last_row(what: str, c2w: np.ndarray) -> None:
+    """Raise ValueError unless a pose of 4 rows ends in 0 0 0 1, which one that is written by columns does not."""
+    if not np.allclose(c2w[3:], (0, 0, 0, 1)):
+        last = " ".join(f"{x:g}" for x in c2w[3])
+        raise ValueError(f"{what} must be camera-to-world by rows and end in 0 0 0 1, got {last}; is it transposed?")
 
 
 def repaired_pose(pose: np.ndarray) -> np.ndarray:

@@ -62,7 +62,7 @@ def encoded_jpeg(path: Path, quality: int, tell: Any) -> np.ndarray:
         ValueError: Damaged, or too large.
     """
     image = _shown(path)
-    exif = image.info.get("exif", b"")
+    exif = image.info.get("exif") or b""  # None of an HEIC without, as messengers make it
     if exif and not exif.startswith(_EXIF):
         exif = _EXIF + exif
     exif = exif if len(exif) <= _MARKER else b""

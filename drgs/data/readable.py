@@ -25,8 +25,9 @@ _log = logging.getLogger(__name__)
 
 
 def check_names(folder: Path, names: list[str], masked: bool = False) -> None:
-    """Refuse names that a COLMAP model cannot hold: several lines, or bytes that are not UTF-8; with masks, whose names
-    are those and `.png`, also too long ones. Say which photographs are hidden, and left out.
+    """Refuse names that a COLMAP model cannot hold: with line breaks or other control characters, or bytes that are not
+    UTF-8; with masks, whose names are those and `.png`, also too long ones. Say which photographs are hidden, and left
+    out.
 
     Raises:
         ValueError: There is one.
@@ -34,7 +35,8 @@ def check_names(folder: Path, names: list[str], masked: bool = False) -> None:
     for name in names:
         if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
             raise ValueError(
-                f"{folder}: the name of a photo must be one line of UTF-8, got {name[:80]!r}; rename this photo"
+                f"{folder}: the name of a photo must be one line of UTF-8 without control characters, got "
+                f"{name[:80]!r}; rename this photo"
             )
         if masked and len(name.encode()) > _LONGEST:
             raise ValueError(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, file_inside, image_size, inverse_pose, repaired_pose
+from drgs.data.checks import IMAGE_SUFFIXES, check_last_row, file_inside, image_size, inverse_pose, repaired_pose
 from drgs.data.points import read_point_ply
 from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
@@ -285,6 +285,7 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
         raise ValueError(f"{where}: transform_matrix must be 4x4 or 3x4 numbers, got shape {c2w.shape}; correct it")
     if not np.isfinite(c2w).all():
         raise ValueError(f"{where}: transform_matrix must be finite, got NaN or Inf; drop this frame")
+    check_last_row(f"{where}: transform_matrix", c2w)
     pose = np.eye(4)
     pose[:3] = c2w[:3]
     check_handedness(where, pose[:3, :3], "(+x right, +y up, looking along -z)", "3 of transform_matrix")

@@ -38,10 +38,9 @@ __all__ = [
 _INK = (235, 235, 235)
 _UNKNOWN = 0.25  # gray of depth where nothing is
 _NOTHING = 64  # gray of pixels whose value is 0
-_DECADES = 3.0  # at most so many are told apart by color
-# what holds all of a WebM file, and where it begins
-_WEBM_SEGMENT = bytes.fromhex("18538067")
-_WEBM_HEAD = 1024
+_DECADES = 3.0  # decades that are told apart by color, at most
+_WEBM_SEGMENT = bytes.fromhex("18538067")  # id of what holds all of a WebM file
+_WEBM_HEAD = 1024  # bytes of the file within which that begins
 _NAME = 100  # bytes of a view's name in the name of a file
 _OPAQUE = 0.5  # depth is shown where at least this much of the light stops
 
@@ -78,7 +77,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     import cv2
 
     pixels = image if image.dtype == np.uint8 else to_bytes(image)
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))  # as BGR, which OpenCV writes
     return encoded.tobytes()
 
 
@@ -86,8 +85,8 @@ def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) 
     """Write a float32 OpenEXR file, values untouched.
 
     Args:
-        rgb: (H, W, 3).
-        channels: (H, W) each, by their names in the file: `A` for alpha, `Z` for depth.
+        rgb: (H, W, 3) colors.
+        channels: (H, W) channels by their names in the file: `A` for alpha, `Z` for depth.
     """
     from drgs import runtime
 
@@ -136,7 +135,7 @@ def map_picture(values: np.ndarray) -> np.ndarray:
     The scale ends at the largest value and covers what lies between it and the 1st percentile, at most three decades.
 
     Args:
-        values: (H, W), finite, >= 0.
+        values: (H, W) values, finite and >= 0.
     """
     picture, (low, top) = map_colors(values)
     return _with_bar(picture, ((1.0, top), (0.5, math.sqrt(low * top)), (0.0, low)), ".2g")
@@ -157,6 +156,7 @@ def inferno(shares: np.ndarray) -> np.ndarray:
     """(..., 3) uint8 colors of shares in [0, 1], dark to bright; what is beyond is clamped."""
     import cv2
 
+    # OpenCV's colors are BGR; contiguous, as it takes no arrays that are read backwards.
     return np.ascontiguousarray(cv2.applyColorMap(to_bytes(shares), cv2.COLORMAP_INFERNO)[..., ::-1])
 
 
@@ -164,9 +164,9 @@ def _with_bar(picture: np.ndarray, labels: tuple[tuple[float, float], ...], digi
     """The picture with a color bar at its right, bright above.
 
     Args:
-        picture: (H, W, 3) uint8.
-        labels: Of the upper end, of the middle and of the lower end: share of the scale, and the value there.
-        digits: How values are printed.
+        picture: (H, W, 3) uint8 picture.
+        labels: Share of the scale, and the value there, of its upper end, its middle and its lower end.
+        digits: Format in which values are printed.
     """
     import cv2
 
@@ -198,7 +198,7 @@ class Video:
     """A WebM file (VP9), a frame at a time; it appears when the `with` block ends without an error.
 
     Args:
-        path: The file.
+        path: File to write.
         fps: Frames a second.
     """
 

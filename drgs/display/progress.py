@@ -26,11 +26,11 @@ class Bar:
     """How far something is, for the length of a `with` block.
 
     Args:
-        label: What is going on.
-        total: How many steps; None: nobody knows.
+        label: Name of what is going on.
+        total: Number of steps; None: nobody knows.
         show: Whether it is shown; None: if the bar around it is, so that library functions may have bars.
-        done: Steps done before, which took no time.
-        lines_only: Not drawn on a terminal.
+        done: Number of steps done before, which took no time.
+        lines_only: Whether it is left out on a terminal.
     """
 
     def __init__(
@@ -65,7 +65,9 @@ class Bar:
         """Set what is given.
 
         Args:
-            done, total, label: As at the start. Another label is another stage, whose time starts now.
+            done: Number of steps done.
+            total: Number of steps.
+            label: Name of what is going on. Another one is another stage, whose time starts now.
             text: What else to say, e.g. how good the result is so far.
         """
         if label is not None and label != self.label:
@@ -108,7 +110,7 @@ class Bar:
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """For a program that waits for others: no bar says how long that takes, neither those there are nor new ones."""
+    """Show no bar within the block, neither those there are nor new ones: the program only waits for another one."""
     shown = [bar for bar in _bars if bar.is_shown]
     with Bar("", show=False):
         for bar in shown:

@@ -23,11 +23,11 @@ def lines(
     """The lines of a table.
 
     Args:
-        title: Above it; may be empty.
-        columns: Headings; one may have several lines.
-        rows: Cells, as many as there are columns. A first cell that is too long stands on a line of its own.
+        title: Text above the table; may be empty.
+        columns: Headings of the columns; one may have several lines.
+        rows: Cells of each row, as many as there are columns. A first cell that is too long has a line of its own.
         texts: Headings of the columns that hold text, besides the first; the others hold numbers.
-        width: Characters a line.
+        width: Largest number of characters a line.
     """
     heads = [name.split("\n") for name in columns]
     tall = max(map(len, heads))

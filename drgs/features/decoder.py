@@ -1,4 +1,4 @@
-"""From the features of Gaussians to those of the teacher: one 1x1 convolution, as in Feature 3DGS.
+"""The decoder of features: one 1x1 convolution from those of Gaussians to those of the teacher, as in Feature 3DGS.
 
 A pixel's feature is a weighted sum, F = sum_i w_i f_i with sum_i w_i = alpha, and its decoded feature is W F + b. The
 same decoder applied to a Gaussian gives W f_i + b, what a pixel shows that this Gaussian fills alone. Compositing
@@ -31,8 +31,8 @@ class Decoder(torch.nn.Module):
     Its state is that of a `Conv2d(D, C, 1)`: `conv.weight` (C, D, 1, 1) and `conv.bias` (C,), torch's initial values.
 
     Args:
-        width: D.
-        channels: C.
+        width: Number D of features of a Gaussian.
+        channels: Number C of features of the teacher.
     Reference:
         Zhou et al. 2024 (Feature 3DGS), section 3.3, the convolutional speed-up module.
     """
@@ -50,7 +50,7 @@ class Decoder(torch.nn.Module):
 
         Args:
             state: `conv.weight` and `conv.bias`, e.g. of a file of Feature 3DGS.
-            where: What holds it, for the message.
+            where: Name of what holds it, for the message.
         Raises:
             ValueError: If it is no state of a decoder, or holds a value that is not finite.
         """
@@ -100,11 +100,11 @@ class Decoder(torch.nn.Module):
         """Decode.
 
         Args:
-            features: (..., D).
+            features: (..., D) features of Gaussians or pixels.
         Returns:
-            (..., C), differentiable in features and weights.
+            (..., C) features of the teacher, differentiable in features and weights.
         Raises:
-            ValueError: If the last axis is no D.
+            ValueError: If the last axis has another length than D.
         """
         if features.shape[-1] != self.width:
             raise ValueError(
@@ -152,5 +152,5 @@ def load_decoder(path: str | os.PathLike) -> Decoder:
 def save_decoder(decoder: Decoder, path: str | os.PathLike) -> None:
     """Write a decoder's state as Feature 3DGS does, atomically."""
     with atomic_write(check_path("save_decoder", path)) as file:
-        # A file holds values.
+        # A file holds values: torch would save the weights' gradients and their device, too.
         torch.save({key: x.detach().cpu() for key, x in decoder.state_dict().items()}, file)

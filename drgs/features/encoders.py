@@ -14,7 +14,7 @@ trained. What comes out is a vector a patch that a text embedding can be compare
 
 Nothing is downloaded and no pickle is run: weights are safetensors, or torch files read with `weights_only`.
 
-References:
+Reference:
     Radford et al. 2021 (CLIP); Zhou, Loy, Dai 2022, "Extract Free Dense Labels from CLIP" (MaskCLIP), section 3.
 """
 
@@ -53,9 +53,9 @@ class ClipEncoder:
     """A CLIP model (transformers' `CLIPModel`) from a folder.
 
     Args:
-        folder: With config.json, the weights, preprocessor_config.json (its mean and standard deviation of colors;
-            CLIP's own without it), and for `texts` the tokenizer.
-        device: Where it runs.
+        folder: Folder with config.json, the weights, preprocessor_config.json (its mean and standard deviation of
+            colors; CLIP's own without it), and for `texts` the tokenizer.
+        device: torch device that it runs on.
     Raises:
         FileNotFoundError: If transformers is not installed, or there is no such folder, config or weights.
         ValueError: If it is another kind of model, a file is damaged, or weights are missing in it.
@@ -113,8 +113,8 @@ class ClipEncoder:
         Args:
             image: (H, W, 3) float in [0, 1].
             size: (w, h) of the map.
-            scales: Of the photograph, one or more.
-            flip: Also the mirrored photograph.
+            scales: Sizes of the photograph that are averaged, one or more.
+            flip: Whether the mirrored photograph is averaged, too.
         Returns:
             (C, h, w) float32, on the CPU.
         Raises:
@@ -126,7 +126,7 @@ class ClipEncoder:
             pixels = self._pixels(image, scale)
             found = self.patches(pixels)
             if flip:
-                mirrored = self.patches(pixels.flip(3)).flip(2)
+                mirrored = self.patches(pixels.flip(3)).flip(2)  # back again, so that patches lie on one another
                 found = torch.stack([_unit(found), _unit(mirrored)]).mean(0)
             resized = torch.nn.functional.interpolate(_unit(found)[None], (height, width), mode="bilinear")[0]
             total += resized.cpu()

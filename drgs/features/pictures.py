@@ -23,10 +23,9 @@ _PERCENTILES = 1.0, 99.0
 _ROWS = 5000  # samples of a basis: 20 MB of 512 channels in float64
 _INK = (235, 235, 235)
 _BACK = (18, 18, 18)
-# pixels of a legend's line and of its square; characters of a name at most
-_LINE = 17
-_SWATCH = 12
-_CHARACTER = 34
+_LINE = 17  # pixels of a legend's line
+_SWATCH = 12  # pixels of its square's side
+_CHARACTER = 34  # characters of a name, at most
 _EDGE = 0.35  # how much darker the border between two classes is
 
 
@@ -38,7 +37,7 @@ class FeatureColors:
     1st percentile (0) to its 99th (255).
 
     Attributes:
-        mean: (C,) float32.
+        mean: (C,) float32 mean of the unit features.
         axes: (C, 3) float32, orthonormal, by falling variance; the largest entry of each is positive, so that the same
             features always have the same colors.
         low, high: (3,) float32, the percentiles.
@@ -54,16 +53,16 @@ class FeatureColors:
         """The basis of some maps.
 
         Args:
-            maps: (..., C) each, channels last; of all pixels of one map, evenly spaced ones are taken, and features
-                that are 0 or not finite are left out.
-            rows: Samples a map, at most; of many maps as many in all.
+            maps: Feature maps (..., C), channels last; of all pixels of one map, evenly spaced ones are taken, and
+                features that are 0 or not finite are left out.
+            rows: Largest number of samples of a map, and of all maps together.
         Raises:
             ValueError: If there is no feature to look at.
         """
         sample = _sample(maps, rows)
         mean = sample.mean(0)
         covariance = (sample - mean).T @ (sample - mean) / len(sample)
-        axes = torch.linalg.eigh(covariance).eigenvectors.flip(1)[:, :3]
+        axes = torch.linalg.eigh(covariance).eigenvectors.flip(1)[:, :3]  # `eigh` sorts by rising variance
         if axes.shape[1] < 3:  # of fewer channels: the others stay in the middle
             axes = torch.nn.functional.pad(axes, (0, 3 - axes.shape[1]))
         largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))
@@ -75,10 +74,11 @@ class FeatureColors:
     def picture(self, features: torch.Tensor, decoder: Decoder | None = None) -> np.ndarray:
         """(H, W, 3) uint8 of (H, W, C) features (with a decoder: of (H, W, D) features before it); black where 0."""
         rows = []
-        with torch.no_grad():  # a picture
-            for row in features.detach():
+        with torch.no_grad():  # a picture is looked at only; the decoder's graph would keep every row
+            for row in features.detach():  # as NumPy wants it below
                 decoded = (row if decoder is None else decoder(row.to(decoder.matrix))).cpu().float()
                 length = decoded.norm(dim=1, keepdim=True)
+                # An empty pixel is 0 / 0, and is left out below.
                 parts = (decoded / length.clamp_min(1e-30) - self.mean) @ self.axes
                 span = (self.high - self.low).clamp_min(1e-12)  # of one color only, too, there is a span
                 rows.append(torch.where(length > 0, (parts - self.low) / span, 0.0))
@@ -89,7 +89,7 @@ def _sample(maps: Iterable[torch.Tensor], rows: int) -> torch.Tensor:
     """(n, C) float64 unit features, at most `rows` of each map and of all; ValueError if there is none."""
     parts = []
     for features in maps:
-        flat = features.detach().reshape(-1, features.shape[-1])
+        flat = features.detach().reshape(-1, features.shape[-1])  # the basis is a choice of colors, no function
         flat = flat[:: max(1, -(-len(flat) // rows))].cpu().float()
         length = flat.norm(dim=1)
         good = torch.isfinite(length) & (length > 0)
@@ -97,7 +97,7 @@ def _sample(maps: Iterable[torch.Tensor], rows: int) -> torch.Tensor:
     sample = torch.cat(parts) if parts else torch.empty(0, 1)
     if not len(sample):
         raise ValueError("FeatureColors: maps must hold a feature that is finite and not 0, hold none")
-    return sample[:: -(-len(sample) // rows)].double()
+    return sample[:: -(-len(sample) // rows)].double()  # eigenvectors of a covariance of nearly equal colors
 
 
 @functools.cache
@@ -132,10 +132,10 @@ def overlay(image: np.ndarray, labels: np.ndarray, count: int, strength: float =
     """The photograph with its labels over it, and dark lines between classes; it stays as it is where there is none.
 
     Args:
-        image: (H, W, 3), uint8 or float in [0, 1].
-        labels: (H, W) in 0..count.
-        count: Of classes.
-        strength: Of the labels' colors, in [0, 1].
+        image: (H, W, 3) photograph, uint8 or float in [0, 1].
+        labels: (H, W) labels in 0..count.
+        count: Number of classes.
+        strength: Share of the labels' colors, in [0, 1].
     """
     labels = np.asarray(labels)
     photo = (image if image.dtype == np.uint8 else to_bytes(image)).astype(np.float32)
@@ -151,9 +151,9 @@ def mask_picture(image: np.ndarray, mask: np.ndarray, color: tuple[int, int, int
     """The picture with what a mask has in a color, and the rest darker and gray.
 
     Args:
-        image: (H, W, 3), uint8 or float in [0, 1].
-        mask: (H, W) bool.
-        color: What is mixed in.
+        image: (H, W, 3) picture, uint8 or float in [0, 1].
+        mask: (H, W) bool, what is shown in the color.
+        color: RGB that is mixed in.
     """
     photo = (image if image.dtype == np.uint8 else to_bytes(image)).astype(np.float32)
     gray = 0.7 * photo.mean(2, keepdims=True).repeat(3, 2)
@@ -165,9 +165,9 @@ def with_legend(picture: np.ndarray, names: Sequence[str], labels: Iterable[int]
     """The picture with colors and names of classes at its right, in as many columns as its height asks for.
 
     Args:
-        picture: (H, W, 3) uint8.
-        names: Of all classes.
-        labels: Which ones are named, e.g. those that occur; default all. 0 is named "no label".
+        picture: (H, W, 3) uint8 picture.
+        names: Names of all classes.
+        labels: Labels that are named, e.g. those that occur; default all. 0 is named "no label".
     """
     import cv2
 

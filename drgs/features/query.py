@@ -35,10 +35,10 @@ class TextQuery:
     """Vectors that are wanted, and what else something could be.
 
     Attributes:
-        wanted: (Q, C) float32 of length 1.
-        others: (O, C) alike, or None: the score is the cosine, not the probability.
-        threshold: Of the score; None: the largest cosine of all must be a wanted one.
-        temperature: Of the softmax.
+        wanted: (Q, C) float32 vectors of length 1.
+        others: (O, C) vectors alike, or None: the score is the cosine, not the probability.
+        threshold: Least score that is selected; None: the largest cosine of all must be a wanted one.
+        temperature: Temperature of the softmax.
     """
 
     wanted: torch.Tensor
@@ -97,9 +97,9 @@ class TextQuery:
         """Text embeddings: with a threshold by their cosine; without one against the classes.
 
         Args:
-            vectors: (C,) or (Q, C).
-            classes: What competes, but for those that mean the same (cosine >= 0.999).
-            threshold, temperature: See `TextQuery`.
+            vectors: (C,) or (Q, C) text embeddings.
+            classes: Classes that compete, but for those that mean the same (cosine >= 0.999).
+            threshold, temperature: Fields of a `TextQuery`.
         Raises:
             ValueError: If there is neither a threshold nor a class that competes.
         """
@@ -134,15 +134,15 @@ class TextQuery:
             return f"cosine >= {self.threshold:g}"
         if self.threshold is None:
             return f"largest cosine of {len(self.wanted) + len(self.others)} texts"
-        rivals = len(self.wanted) + len(self.others)
-        return f"probability >= {self.threshold:g} (softmax over {rivals} texts, temperature {self.temperature:g})"
+        count = len(self.wanted) + len(self.others)
+        return f"probability >= {self.threshold:g} (softmax over {count} texts, temperature {self.temperature:g})"
 
     def score(self, features: torch.Tensor, decoder: Decoder | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """The score of each feature, and whether it is selected.
 
         Args:
-            features: (..., C); with a decoder (..., D) before it.
-            decoder: What takes D to C.
+            features: (..., C) features; with a decoder the (..., D) features before it.
+            decoder: Decoder of D features to C.
         Returns:
             (...) float32 and (...) bool, on the CPU.
         Raises:

@@ -37,7 +37,7 @@ class Classes:
     """What pixels can be called.
 
     Attributes:
-        names: Of classes 1..K; class k is `names[k - 1]`.
+        names: Names of classes 1..K; class k is `names[k - 1]`.
         embeddings: (K, C) float32 rows of length 1, the names in the teacher's space; whatever lengths are given are
             divided out. None: names only.
     """
@@ -78,7 +78,7 @@ class Classes:
         """The embeddings.
 
         Args:
-            channels: What they must have.
+            channels: Number of channels that they must have.
         Raises:
             ValueError: If there are none, or they have another number of channels.
         """
@@ -120,8 +120,8 @@ def classify(features: torch.Tensor, classes: Classes, decoder: Decoder | None =
 
     Args:
         features: (..., C) in the teacher's space; with a decoder (..., D) before it.
-        classes: With embeddings.
-        decoder: What takes D to C.
+        classes: Classes that have embeddings.
+        decoder: Decoder of D features to C.
     Returns:
         (...) int64 labels 1..K, on the CPU; of equal cosines the smaller label.
     Raises:
@@ -132,7 +132,7 @@ def classify(features: torch.Tensor, classes: Classes, decoder: Decoder | None =
     offset = None
     if decoder is not None:
         _check_width("classify", features, decoder.width)
-        # A label has no derivative.
+        # A label has no derivative; with the weights' graph every chunk of scores would be kept until the end.
         weight, bias = (x.detach().cpu().float() for x in (decoder.matrix, decoder.bias))
         matrix, offset = matrix @ weight, matrix @ bias
     parts = []
@@ -147,9 +147,9 @@ def cosines(features: torch.Tensor, vectors: torch.Tensor, decoder: Decoder | No
     """Cosine of every feature with every vector.
 
     Args:
-        features: (..., C); with a decoder (..., D) before it.
-        vectors: (K, C), of any length but 0.
-        decoder: What takes D to C, a few pixels at a time.
+        features: (..., C) features; with a decoder the (..., D) features before it.
+        vectors: (K, C) vectors, of any length but 0.
+        decoder: Decoder of D features to C, asked for a few pixels at a time.
     Returns:
         (..., K) float32 on the CPU; 0 where a feature is 0.
     Raises:
@@ -166,6 +166,7 @@ def cosines(features: torch.Tensor, vectors: torch.Tensor, decoder: Decoder | No
         for chunk in _chunks(features, max(channels, *rows.shape)):
             decoded = chunk if decoder is None else decoder(chunk.to(decoder.matrix)).cpu().float()
             _check_finite("cosines", decoded)
+            # torch's own 1e-12 would shorten features that are merely small; 0 stays 0.
             parts.append(torch.nn.functional.normalize(decoded, dim=1, eps=1e-30) @ rows.T)
     return torch.cat(parts).reshape(*features.shape[:-1], len(rows))
 
@@ -197,9 +198,10 @@ def scores(pairs: Iterable[tuple[Any, Any]], classes: int) -> dict[str, Any]:
     Pixels where the reference is 0 are left out. A prediction of 0 where the reference has a label is wrong.
 
     Args:
-        pairs: Of (predicted, reference) label maps of one shape, integers in 0..classes; an image at a time, so that
-            they may be made on the way. What the reference is (labels of the data set, or a teacher's) the caller says.
-        classes: K.
+        pairs: Pairs of label maps (predicted, reference) of one shape, integers in 0..classes; an image at a time, so
+            that they may be made on the way. What the reference is (labels of the data set, or a teacher's) the caller
+            says.
+        classes: Number K of classes.
     Returns:
         JSON-serializable: the entries of `SCORE_DEFINITIONS` (`iou` a list of K), and `images` and `pixels`, how many
         there were with a label.
@@ -261,6 +263,6 @@ def _top(confusion: np.ndarray) -> float:
     """The average IoU of the labels of an image that are most frequent in prediction and reference together."""
     right, union, _ = _overlaps(confusion)
     often = confusion.sum(1)[1:] + confusion.sum(0)[1:]
-    top = np.argsort(-often, kind="stable")[:_TOP]
+    top = np.argsort(-often, kind="stable")[:_TOP]  # stable: of equally frequent labels the smaller number first
     top = top[often[top] > 0]
     return float((right[top] / union[top]).mean())

@@ -34,7 +34,7 @@ _finite: set[tuple[Path, int, int]] = set()  # files (path, size, time of change
 
 
 def map_name(path: str | os.PathLike) -> str | None:
-    """The image's stem that a file's name says it is the map of, ``rgb_000`` of ``rgb_000_fmap_CxHxW.pt``.
+    """The image's stem that a file's name says it is the map of, `rgb_000` of `rgb_000_fmap_CxHxW.pt`.
 
     Returns:
         None if it is not named as a map.
@@ -50,9 +50,9 @@ def read_map(path: str | os.PathLike) -> torch.Tensor:
     executed: only tensors are unpickled.
 
     Raises:
-        FileNotFoundError: No such file.
-        ValueError: Not one plain tensor of three dimensions and one of these types, of another shape than the file's
-            name says, cut short, or one that claims more numbers than the file has.
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not one plain tensor of three dimensions and one of these types, has another shape than the
+            file's name says, is cut short, or claims more numbers than the file has.
     """
     import torch
 
@@ -72,12 +72,11 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
     """The one plain tensor of a file that `torch.save` wrote, memory-mapped; nothing in the file is executed.
 
     Args:
-        path: The file.
-        what: What it must be, for the message.
-
+        path: File to read.
+        what: Kind of file that it must be, for the message.
     Raises:
-        FileNotFoundError: No such file.
-        ValueError: Anything but one plain tensor, cut short, or one that claims more numbers than the file has.
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is anything but one plain tensor, is cut short, or claims more numbers than the file has.
     """
     import torch
 
@@ -116,20 +115,19 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
             f"{path}: must hold every number that it claims, {tuple(value.shape)} takes {claimed} bytes, the file has "
             f"{path.stat().st_size}; save tensor.contiguous()"
         )
-    return value.detach()
+    return value.detach()  # a tensor that was saved while it wanted a gradient still wants one
 
 
 def check_finite(values: torch.Tensor, path: str | os.PathLike) -> None:
     """Look through a map, one channel at a time.
 
     Args:
-        values: (C, h, w), float16 or float32.
-        path: Of its file, for the message.
-
+        values: (C, h, w) map, float16 or float32.
+        path: File of the map, for the message.
     Raises:
-        ValueError: A value is NaN or infinite; names the first one's place.
+        ValueError: If a value is NaN or infinite; names the first one's place.
     """
-    for channel, plane in enumerate(values.detach().cpu().numpy()):
+    for channel, plane in enumerate(values.detach().cpu().numpy()):  # NumPy takes no tensor with a gradient
         # Exponents of ones alone: several times as fast as numpy's isfinite in half precision.
         bits, ones = (
             (plane.view(np.uint16), 0x7C00) if plane.dtype == np.float16 else (plane.view(np.uint32), 0x7F800000)

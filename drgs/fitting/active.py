@@ -25,6 +25,7 @@ from drgs.data.guided import Matches
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, Run, write_json
+from drgs.fitting.config import recorded_config
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.timetable import Timetable
 from drgs.sizes import at_most, resized_alike
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from drgs.data import View
     from drgs.ellipsoids import Scene
     from drgs.features.decoder import Decoder
-    from drgs.fitting.config import ActiveConfig, FitConfig
+    from drgs.fitting.config import FitConfig
     from drgs.information.choices import Block
     from drgs.information.pool import Workers
 
@@ -52,7 +53,7 @@ class ActiveViews:
     """The training split of an active fit: what has been seen, and what to see next.
 
     Attributes:
-        active: The `ActiveConfig`.
+        active: How views are chosen.
         views: The training split, in its order; what has not been picked has not been opened.
         timetable: When one is picked, and among which.
         chosen: Indices of views that may be read, in the order in which they came.
@@ -63,7 +64,6 @@ class ActiveViews:
 
     def __init__(
         self,
-        active: ActiveConfig,
         views: list[View],
         config: FitConfig,
         moves: bool = False,
@@ -71,8 +71,8 @@ class ActiveViews:
     ) -> None:
         """
         Args:
-            active, config: Of the fit.
-            views: Its training split.
+            views: The training split.
+            config: What the fit does; its `selection` says how views are chosen.
             moves: Whether a deformation is fitted.
             workers: Processes that compute what candidates tell, as `drgs.select` takes them.
         Raises:
@@ -80,6 +80,9 @@ class ActiveViews:
         """
         from drgs.select import policy_named
 
+        active = config.selection
+        if active is None:
+            raise ValueError("active: config must have a selection, got none; e.g. SelectionConfig()")
         if not views:
             raise ValueError("active: there must be at least one training view, got none; add photographs")
         self.active = active
@@ -87,7 +90,7 @@ class ActiveViews:
         self._config = config
         self._workers = workers
         policy_named(active.policy)  # else the first pick would be where that is found out
-        self.timetable = Timetable.of(active, self.views, config, moves)
+        self.timetable = Timetable.of(self.views, config, moves)
         first = len(self.timetable.start)
         last = len(self.timetable.start) + self.timetable.add - 1
         for count in active.measure:
@@ -99,11 +102,11 @@ class ActiveViews:
         self.chosen = list(self.timetable.start)
         self.picks = list[dict]()
         self.measured = list[dict]()
-        self.pool_leak = config.init_points == "all"
+        self.pool_leak = config.data.init_points == "all"
         # Photographs of another time do not say where things are at this one.
         wanted = not self.pool_leak and self.timetable.schedule == "views"
         grows = {"auto": wanted, "uncovered": True, "none": False}[active.pick_points]
-        self._share = config.max_gaussians // (len(self.chosen) + self.timetable.add) if grows else 0
+        self._share = config.density.max_gaussians // (len(self.chosen) + self.timetable.add) if grows else 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._matches = Matches()
         self._began: int | None = None  # triangulated points of the start, once they are known
@@ -115,7 +118,7 @@ class ActiveViews:
         Args:
             fitted: Block -> whether there is what it tells about.
         """
-        wanted = self.active.blocks or () if self.active.policy == "fisher" else ()
+        wanted = self.active.scoring.blocks or () if self.active.policy == "fisher" else ()
         lack: dict[Block, str] = {"semantic": "a fit without a teacher's maps", "deformation": "a fit of what is still"}
         for name, why in lack.items():
             if name in wanted and not fitted[name]:
@@ -201,7 +204,7 @@ class ActiveViews:
         if restart == "never" or not self._share or dense:
             return None
         seed = self._config.seed + len(self.picks)
-        room = self._config.max_gaussians - self.reserved
+        room = self._config.density.max_gaussians - self.reserved
         began = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), self._began)
         with Bar("points of all views") as bar:
             if began is None:  # the first call: what is matched here is kept for the next one
@@ -258,9 +261,9 @@ class ActiveViews:
 
         active = self.active
         left = self.timetable.left(len(self.picks), self.chosen)
-        pixels = active.info_pixels or self._config.max_pixels
+        pixels = active.info_pixels or self._config.data.max_pixels
         semantics = None if decoder is None else SemanticMetric(decoder.metric())
-        scoring = active.scoring(self._config.settings, semantics)
+        scoring = active.scoring_of(self._config.settings, semantics)
         seen = [at_most(frame.camera, pixels) for frame in frames]
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
@@ -292,7 +295,7 @@ class ActiveViews:
             "margin": best.margin,
             "seconds": selection.seconds,
             "policy": active.policy,
-            "criterion": active.criterion if active.policy == "fisher" else None,
+            "criterion": scoring.criterion if active.policy == "fisher" else None,
             "prior": scoring.prior_of(active.policy).to_json(),
             "blocks": selection.blocks,
             "semantics": selection.semantics,
@@ -323,7 +326,7 @@ class ActiveViews:
         return {
             "schema": SCHEMA,
             "command": "fit",
-            **self._resolved(self.active.to_json()),
+            **self._resolved(self.active.flat()),
             "start_rule": self.active.start,  # `start` are the views
             "seed": self._config.seed,
             "init_points": "all" if self.pool_leak else "views",
@@ -343,7 +346,7 @@ class ActiveViews:
         """Tensors and header that a checkpoint adds to the trainer's."""
         # Nothing that the clock says: two fits to the same bits have the same checkpoint.
         picks = [{name: x for name, x in pick.items() if name != "seconds"} for pick in self.picks]
-        header = {"config": self.active.to_json(), "pool": [view.name for view in self.views], "picks": picks}
+        header = {"pool": [view.name for view in self.views], "picks": picks}
         header |= {"measured": self.measured}
         return {"policy_rng": self._generator.get_state()}, {"active": header}
 
@@ -354,8 +357,10 @@ class ActiveViews:
             ValueError: If the checkpoint chose by another rule, or from other views.
         """
         old = header["active"]
-        new = self._resolved(self.active.to_json())
-        was = self._resolved(self.active.recorded(old["config"]))
+        selection = recorded_config(header["config"], old.get("config")).selection
+        assert selection is not None
+        new = self._resolved(self.active.flat())
+        was = self._resolved(selection.flat())
         for key in new:
             if new[key] != was[key]:
                 raise ValueError(
@@ -395,7 +400,7 @@ class ActiveViews:
         stated = self.views[index].camera
         self.views[index] = view = self.views[index].checked()
         self._sizes[stated.width, stated.height] = view.camera.width, view.camera.height
-        return load_frames([view], self._config.max_pixels, self._config.mask)[0]
+        return load_frames([view], self._config.data.max_pixels, self._config.data.mask)[0]
 
     def _camera(self, index: int) -> Camera:
         """The camera of a candidate, as its frame would have it."""
@@ -403,7 +408,7 @@ class ActiveViews:
         camera = dataclasses.replace(view.camera.undistorted(), name=view.name)
         if not view.is_checked:
             camera = resized_alike(camera, self._sizes)
-        return at_most(camera, self._config.max_pixels)
+        return at_most(camera, self._config.data.max_pixels)
 
 
 def _reduced(mask: torch.Tensor | None, camera: Camera) -> torch.Tensor | None:

@@ -1,43 +1,50 @@
-"""What a fit does, as two frozen records; imports nothing heavy, for the options of the command line read it."""
+"""What a fit does, as frozen records by subject; imports nothing heavy, for the options of the command line are theirs.
+
+What `Attributes` say of a field is what `drgs fit --help-all` says of its option; what takes longer to say stands above
+them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import functools
+import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from drgs.guards.arguments import check_fields, must_be
-from drgs.information.choices import (
-    POLICY_NAMES,
-    Block,
-    Combine,
-    Criterion,
-    Method,
-    NetworkScore,
-    check_combined,
-    checked_blocks,
-)
+from drgs.guards.arguments import check_fields
+from drgs.guards.records import Record, ways_of
+from drgs.information.choices import POLICY_NAMES
+from drgs.information.prior import Prior
+from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
-    from drgs.select import Scoring
 
 __all__ = [
     "ActiveConfig",
+    "DataConfig",
     "Degree",
+    "DensityConfig",
     "Dynamics",
+    "FeatureConfig",
     "FeatureSize",
     "FieldPreset",
     "FitConfig",
     "InitPoints",
+    "LossConfig",
     "MaskUse",
+    "MotionConfig",
     "PickPoints",
-    "SAVING",
+    "RateConfig",
+    "Restart",
+    "SavingConfig",
     "Schedule",
+    "SelectionConfig",
     "SemanticUse",
     "Start",
+    "recorded_config",
 ]
 
 InitPoints = Literal["auto", "views", "all"]
@@ -52,142 +59,88 @@ FeatureSize = Literal["image", "teacher"]
 Dynamics = Literal["auto", "ignore"]
 FieldPreset = Literal["neu3d", "dnerf"]
 
-SAVING = ("save_every", "save_minutes")
-"""Fields of `FitConfig` that change nothing of what is fitted: a fit may go on with others."""
-
 _COUNT = (1, 10**9)
 _SHARE = (0.0, 1.0)
 _RATE = (0.0, 1e6)
+_FADING = (1e-30, 1e6)  # of rates whose logarithms are interpolated
 _WEIGHT = (0.0, 1e6)
-_RANGES = {
-    **dict.fromkeys(("max_steps", "max_pixels", "max_gaussians", "save_every"), _COUNT),
-    "save_minutes": (1e-3, 1e9),
-    "test_every": (0, 10**9),
-    "test_offset": (0, 10**9),
-    "seed": (0, 2**31 - 1),  # what COLMAP takes
-    "means_rate": (1e-30, 1e6),  # their logarithms are interpolated
-    **dict.fromkeys(("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate"), _RATE),
-    **dict.fromkeys(("outside_weight", "opacity_weight", "scale_weight", "noise"), _WEIGHT),
-    **dict.fromkeys(("initial_opacity", "dense_opacity"), (1e-6, 1 - 1e-6)),
-    **dict.fromkeys(("ssim_weight", "sh_every", "refine_start", "refine_stop", "refine_every"), _SHARE),
-    **dict.fromkeys(("min_opacity", "grow_until"), _SHARE),
-    "dense_scale": (1e-6, 1e6),
-    "feature_width": (1, 4096),
-    "feature_weight": _WEIGHT,
-    **dict.fromkeys(("feature_rate", "decoder_rate"), _RATE),
-    "jitter": (0.0, 1e3),
-    "times": (1, 10**6),
-    "static_share": _SHARE,
-    **dict.fromkeys(("grid_rate", "field_rate"), (1e-30, 1e6)),  # their logarithms are interpolated
-    "motion_rate": _RATE,
-    **dict.fromkeys(("motion_weight", "smooth_weight", "plane_weight", "l1_time_weight"), _WEIGHT),
-}
+_OPACITY = (1e-6, 1 - 1e-6)  # its logit is finite in float32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FitConfig:
-    """Everything that determines a fit besides its data. Fractions are of `max_steps`.
+class DataConfig(Record):
+    """Which photographs are fitted, how large, and where Gaussians begin.
+
+    An active fit reads nothing of a view before it is picked, so that its initial points are of the initial views
+    unless `init_points` is `all`. A split that the data set's own files state wins over `test_every` and `test_offset`,
+    and `test_cameras` wins over both.
 
     Attributes:
-        settings: What `drgs.render` computes.
-        max_steps: Optimizer steps.
         max_pixels: Images are reduced to at most this many pixels.
-        max_gaussians: Budget of the density control, at the start as later.
-        init_points: `auto` (the data set's points, else `views`), `views` (only what the training views show) or, in
-            an active fit, where `auto` is `views`, `all` (the data set's points, else what all its views show).
-        test_every: Every n-th view by name is held out; 0 holds out none.
-        test_offset: Index of the first view that is held out, below `test_every`. A split that the data set's own files
-            state wins over both.
-        test_cameras: Names of the cameras that are held out at all times, of videos and of captures by several cameras,
-            which wins over what is above; None: as the data set has it, where there are videos the first; empty: none.
-        times: How many synchronous frames of every camera are taken, evenly over the whole length.
-        seed: Of everything random.
-        sh_degree: Highest degree of the view-dependent color.
-        deterministic: One Dr.Jit thread, hence the same bits for the same seed. An image that is drawn again without
-            gradients differs from the one that was fitted by 1e-7, the rounding of its sums (presets `fast`, `inria`
-            and `gsplat`; those of `exact` and `mitsuba` have the same bits).
-        save_every: Steps between checkpoints.
-        save_minutes: A checkpoint is written after so many minutes, too, however few steps these were.
-        mask: `object` (nothing is outside), `valid` (anything may be outside), `ignore`, or `auto`: `object` where
-            the data set has mask files, `valid` where undistorted photographs have empty corners.
-        means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
-        dc_rate, rest_rate, opacity_rate, scale_rate, rotation_rate: Learning rates of the other parameters.
-        ssim_weight: Of 1 - SSIM against L1.
-        outside_weight: Of the opacity outside an `object` mask.
-        opacity_weight, scale_weight: Regularizers of MCMC density control.
-        initial_opacity: Of every Gaussian at the start.
-        dense_opacity, dense_scale: The same, and a factor of the scales, for points from depth maps: these cover the
-            surfaces already, and wide transparent Gaussians would only make every ray meet hundreds of them (half the
-            time, for the same PSNR, on the still life and on `office`).
-        sh_every: Fraction between two degrees of SH.
-        refine_start, refine_stop, refine_every: Fractions between which, and how often, density is controlled.
-        min_opacity: Below it a Gaussian is moved elsewhere.
-        grow_until: Fraction at which the budget is reached, at a constant rate of growth.
-        noise: Strength of the exploration noise (5e5 in MCMC, for 30,000 steps). Off: in 1,500 steps on `banana` it
-            cost 0.4 dB of held-out PSNR (28.0 against 28.4).
-        jitter: Displacement of copies in their own standard deviations.
-        semantics: `auto` fits features and a decoder where the data set has maps of a teacher (Feature 3DGS [1]);
-            `ignore` never does, and reads none of them.
-        feature_width: Channels D of the features that are rendered; the decoder makes those of the teacher of them.
-        feature_weight: gamma, of the L1 distance between decoded features and the teacher's map.
-        feature_rate, decoder_rate: Learning rates of the features and of the decoder, as in [1].
-        couple_features: Let the feature image move the geometry, too; in [1] it reaches the features alone.
-        feature_resolution: Features are rendered at the size of the `image` and then reduced to the teacher's, as in
-            [1], or at the size of the `teacher`'s map.
-        dynamics: `auto` fits Gaussians that a deformation field moves [2] where the training views are of two times or
-            more; `ignore` fits Gaussians that stand still to the photographs of all times.
-        static_share: Fraction of the steps of the static stage, which fits Gaussians that stand still to the first time
-            of all training cameras (to all times, where fewer than 3 photographs show the first); 0 leaves it out. The
-            dynamic stage goes on with them, and with their moments in the optimizer, and adds the field. Rates and SH
-            follow one schedule over both; those of the field begin with the dynamic stage. Density control goes
-            through its schedule in each stage, `refine_start` to `refine_stop` of its steps: the static one up to half
-            of `max_gaussians`, the dynamic one up to all, so that there are some left for what appears later.
-        field_preset: Size of the deformation field, as in [2] for videos of several cameras (`neu3d`) or for one camera
-            around an object (`dnerf`).
-        grid_rate, field_rate: First and last learning rate of the field's planes and of its MLP, log-linear between.
-            Ten times those of [2], which are for 14,000 steps: in some hundred or thousand, motion must be found
-            before what is in the wrong place has become transparent.
-        motion_rate: How far the logit of a gate, one a Gaussian, that says what moves can go in the dynamic stage: its
-            learning rate is that divided by the steps.
-        motion_weight: Of the mean of all gates: what no photograph shows to move comes to a rest, and is not deformed.
-        smooth_weight: Of the second differences along time of the field's planes of space and time, as in [2].
-        plane_weight: The same, of its planes of space.
-        l1_time_weight: Of the distance from 1, which is rest, of its planes of space and time, as in [2].
-
-    Reference:
-        [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
-        [2] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
+        init_points: Initial points: of the training views (views) or of the data set (all); auto: all, or views if
+            --views active.
+        test_every: Every n-th view, by name, is held out; 0 holds out none.
+        test_offset: Index of the first of them, below --test-every; a split that the data set itself states wins over
+            both.
+        test_cameras: Synchronous cameras that are held out at all times, e.g. cam00,cam07; none leaves it to
+            --test-every.
+        times: How many frames of each synchronous camera are used, evenly over its video, the first and the last
+            included.
+        mask: Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files,
+            valid where undistorted photographs have empty corners; ignore reads none.
     """
 
-    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
-    max_steps: int = 3000
     max_pixels: int = 130_000
-    max_gaussians: int = 30_000
     init_points: InitPoints = "auto"
     test_every: int = 8
     test_offset: int = 0
     test_cameras: tuple[str, ...] | None = None
     times: int = 40
-    seed: int = 0
-    sh_degree: Degree = 3
-    deterministic: bool = False
-    save_every: int = 1000
-    save_minutes: float = 10.0
     mask: MaskUse = "auto"
-    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
-    dc_rate: float = 2.5e-3
-    rest_rate: float = 1.25e-4
-    opacity_rate: float = 0.05
-    scale_rate: float = 5e-3
-    rotation_rate: float = 1e-3
-    ssim_weight: float = 0.2
-    outside_weight: float = 1.0
-    opacity_weight: float = 0.01
-    scale_weight: float = 0.01
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        low = {"test_every": (0, 10**9), "test_offset": (0, 10**9)}
+        check_fields("fit", self, {"max_pixels": _COUNT, "times": (1, 10**6), **low})
+        if self.test_every == 1:
+            raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
+        if self.test_offset >= max(self.test_every, 1):
+            raise ValueError(
+                f"fit: test_offset must be in 0..{max(self.test_every, 1) - 1} with test_every {self.test_every}, got "
+                f"{self.test_offset}; lower it"
+            )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DensityConfig(Record):
+    """How many Gaussians there are, how new ones look, and when and where they come: MCMC density control [1].
+
+    Points from depth maps cover the surfaces already, and wide transparent Gaussians would only make every ray meet
+    hundreds of them: so these begin smaller and more opaque (half the time, for the same PSNR, on the still life and on
+    `office`). The exploration noise is off: in 1,500 steps on `banana` it cost 0.4 dB of held-out PSNR (28.0 against
+    28.4); MCMC has 5e5, for 30,000 steps.
+
+    Attributes:
+        max_gaussians: How many Gaussians there may be, at the start as later.
+        initial_opacity: Opacity of every Gaussian at the start.
+        dense_opacity: The same, where the initial points are of depth maps.
+        dense_scale: Factor of the scales of Gaussians at points of depth maps.
+        refine_start: Fraction of the steps from which on density is controlled.
+        refine_stop: Fraction of the steps up to which density is controlled.
+        refine_every: Fraction of the steps between two times that density is controlled.
+        min_opacity: A Gaussian below this opacity is moved elsewhere.
+        grow_until: Fraction of the steps at which the budget of Gaussians is reached, growing at a constant rate.
+        noise: Strength of the noise by which Gaussians explore; 0 is none, 5e5 is that of MCMC.
+        jitter: Displacement of copies, in their own standard deviations.
+
+    Reference:
+        [1] Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
+    """
+
+    max_gaussians: int = 30_000
     initial_opacity: float = 0.1
     dense_opacity: float = 0.3
     dense_scale: float = 0.5
-    sh_every: float = 1 / 30
     refine_start: float = 1 / 30
     refine_stop: float = 0.8
     refine_every: float = 1 / 30
@@ -195,6 +148,97 @@ class FitConfig:
     grow_until: float = 0.5
     noise: float = 0.0
     jitter: float = 0.1
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        shares = ("refine_start", "refine_stop", "refine_every", "min_opacity", "grow_until")
+        ranges = {
+            "max_gaussians": _COUNT,
+            "initial_opacity": _OPACITY,
+            "dense_opacity": _OPACITY,
+            "dense_scale": (1e-6, 1e6),
+            "noise": _WEIGHT,
+            "jitter": (0.0, 1e3),
+        }
+        check_fields("fit", self, ranges | dict.fromkeys(shares, _SHARE))
+
+    def start_of(self, dense: bool) -> tuple[float, float]:
+        """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
+        return (self.dense_opacity, self.dense_scale) if dense else (self.initial_opacity, 1.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RateConfig(Record):
+    """Learning rates of Adam, a tensor of the Gaussians each; those of features and of motion are with these.
+
+    Attributes:
+        means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
+        dc_rate: Learning rate of the base color, SH of degree 0.
+        rest_rate: Learning rate of the SH of higher degrees.
+        opacity_rate: Learning rate of the logits of the opacities.
+        scale_rate: Learning rate of the logarithms of the scales.
+        rotation_rate: Learning rate of the quaternions.
+        sh_every: Fraction of the steps between two degrees of SH.
+    """
+
+    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
+    dc_rate: float = 2.5e-3
+    rest_rate: float = 1.25e-4
+    opacity_rate: float = 0.05
+    scale_rate: float = 5e-3
+    rotation_rate: float = 1e-3
+    sh_every: float = 1 / 30
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        single = ("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate")
+        check_fields("fit", self, {"means_rate": _FADING, "sh_every": _SHARE, **dict.fromkeys(single, _RATE)})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LossConfig(Record):
+    """Weights of the terms of the loss that every fit has; the photographs' L1 distance has what SSIM leaves of 1.
+
+    Attributes:
+        ssim_weight: Weight of 1 - SSIM against the L1 distance, in [0, 1].
+        outside_weight: Weight of the opacity outside of a mask of kind object.
+        opacity_weight: Weight of the mean opacity, which lets Gaussians that nobody needs fade (MCMC).
+        scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
+    """
+
+    ssim_weight: float = 0.2
+    outside_weight: float = 1.0
+    opacity_weight: float = 0.01
+    scale_weight: float = 0.01
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        weights = ("outside_weight", "opacity_weight", "scale_weight")
+        check_fields("fit", self, {"ssim_weight": _SHARE, **dict.fromkeys(weights, _WEIGHT)})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeatureConfig(Record):
+    """A fit to a teacher's maps, beside the photographs: Feature 3DGS [1], whose rates and weights these are.
+
+    In [1] features are rendered at the size of the image, and the feature image reaches the features alone.
+
+    Attributes:
+        semantics: Fit features and a decoder, too, where the data set has maps of a teacher (auto), or never (ignore).
+        feature_width: Feature channels of a Gaussian; a linear decoder makes the teacher's of them.
+        feature_weight: Weight of the features' distance to the teacher's maps in the loss; that of the photographs'
+            is 1.
+        feature_rate: Learning rate of the features; five times as much for fits of about 1,000 steps
+            (docs/semantic.md).
+        decoder_rate: Learning rate of the decoder, a tenth of the features' as a rule.
+        couple_features: Let features move the geometry, too; else only colors do.
+        feature_resolution: Features are rendered at the size of the image and then reduced, or at that of the teacher's
+            map: faster.
+
+    Reference:
+        [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
+    """
+
     semantics: SemanticUse = "auto"
     feature_width: int = 128
     feature_weight: float = 1.0
@@ -202,6 +246,47 @@ class FitConfig:
     decoder_rate: float = 1e-4
     couple_features: bool = False
     feature_resolution: FeatureSize = "image"
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        rates = {"feature_rate": _RATE, "decoder_rate": _RATE}
+        check_fields("fit", self, {"feature_width": (1, 4096), "feature_weight": _WEIGHT, **rates})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MotionConfig(Record):
+    """Gaussians that a deformation field moves [1], where the training views are of two times or more.
+
+    The static stage fits Gaussians that stand still to the first time of all training cameras (to all times, where
+    fewer than 3 photographs show the first). The dynamic stage goes on with them, and with their moments in the
+    optimizer, and adds the field. Rates and SH follow one schedule over both; those of the field begin with the dynamic
+    stage. Density control goes through its schedule in each stage: the static one up to half of `max_gaussians`, the
+    dynamic one up to all, so that there are some left for what appears later.
+
+    The field's rates are ten times those of [1], which are for 14,000 steps: in some hundred or thousand, motion must
+    be found before what is in the wrong place has become transparent. A gate is a logit a Gaussian; what no photograph
+    shows to move comes to a rest by their weight, and is not deformed.
+
+    Attributes:
+        dynamics: Fit a deformation field where the views have several times (auto), or static Gaussians to all times
+            (ignore).
+        static_share: Fraction of the steps that fit static Gaussians to the first time, before the deformation field is
+            added; 0 leaves them out.
+        field_preset: Size of the deformation field: for videos of several cameras (neu3d), or one camera around an
+            object (dnerf).
+        grid_rate: First and last learning rate of the field's planes.
+        field_rate: First and last learning rate of the field's MLP.
+        motion_rate: Learning rate of the gates (a logit each Gaussian: does it move?), times the steps of the dynamic
+            stage.
+        motion_weight: Weight in the loss of the mean of all gates: the larger, the fewer Gaussians move.
+        smooth_weight: Weight of the field's smoothness along time.
+        plane_weight: Weight of the smoothness of the field's planes of space (x and y, x and z, y and z).
+        l1_time_weight: Weight of the L1 distance of the field's planes of time from 1, at which they change nothing.
+
+    Reference:
+        [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
+    """
+
     dynamics: Dynamics = "auto"
     static_share: float = 3 / 17
     field_preset: FieldPreset = "neu3d"
@@ -212,131 +297,240 @@ class FitConfig:
     smooth_weight: float = 1e-3
     plane_weight: float = 2e-4
     l1_time_weight: float = 1e-4
+    where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        check_fields("fit", self, _RANGES)
+        weights = ("motion_weight", "smooth_weight", "plane_weight", "l1_time_weight")
+        rates = {"grid_rate": _FADING, "field_rate": _FADING, "motion_rate": _RATE}
+        check_fields("fit", self, {"static_share": _SHARE, **rates, **dict.fromkeys(weights, _WEIGHT)})
         if self.static_share == 1:
             raise ValueError("fit: static_share must be below 1, got 1; --dynamics ignore fits no motion at all")
-        if self.test_every == 1:
-            raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
-        if self.test_offset >= max(self.test_every, 1):
-            raise ValueError(
-                f"fit: test_offset must be in 0..{max(self.test_every, 1) - 1} with test_every {self.test_every}, got "
-                f"{self.test_offset}; lower it"
-            )
-
-    def start_of(self, dense: bool) -> tuple[float, float]:
-        """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
-        return (self.dense_opacity, self.dense_scale) if dense else (self.initial_opacity, 1.0)
-
-    def to_json(self) -> dict:
-        """As config.json holds it."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
-
-    @classmethod
-    def from_json(cls, value: dict) -> FitConfig:
-        """The inverse of `to_json`; unknown fields raise ValueError."""
-        known = {field.name for field in dataclasses.fields(cls)}
-        must_be("fit", "config", value, dict, "as FitConfig.to_json() makes it")
-        must_be("fit", "settings", value.get("settings", {}), dict, "the fields of a RenderSettings")
-        if unknown := sorted(set(value) - known):
-            raise ValueError(f"fit: config must hold known fields, got {unknown[0]!r}; was it written by a newer drgs?")
-        settings = RenderSettings().replace(**value.get("settings", {}))
-        value = {k: tuple(v) if isinstance(v, list) else v for k, v in value.items()}
-        return cls(**{**value, "settings": settings})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ActiveConfig:
-    """How views are chosen during a fit.
+class SavingConfig(Record):
+    """When checkpoints are written. It changes nothing of what is fitted: a fit may go on with another one.
 
     Attributes:
-        policy: A name in `drgs.select.POLICIES`, or `package.module:function` of one's own.
-        criterion: Of policy `fisher`, one of `drgs.gain.CRITERIA`.
-        method: Of the diagonal, see `drgs.fisher.diagonal`.
-        schedule: `views`: `initial` views, then one after the other. `times`: the static stage on all cameras at the
-            first time, then one camera at each later time, in order. `pairs`: the same start, then any (camera, time).
-            `auto`: `times` where a deformation is fitted, else `views`. More in `drgs.fitting.timetable`.
-        initial: Of `views`: views at the start: one by `start`, then those farthest from all before.
-        start: The first of them: `first` of the training split by name, or one of it drawn by the fit's `seed`, from a
-            generator of its own, so that no policy's draws depend on it.
-        add: Views to be added, one at a time; None: 10, and of `times` and `pairs` as many as there are later times.
-        every: Steps between two of them, and before the first, in the dynamic stage; None: 200, and of `times` and
-            `pairs` that part of 17,000 of `max_steps`, as in arXiv 2512.22771.
-        info_pixels: Pixels of the views that information is computed from; None: those of the fit.
-        prior: lambda, the prior precision of every parameter; None: as in `drgs.select.Scoring`.
-        relative_prior: lambda is `prior` times the median of the group's positive information.
-        pick_points: `uncovered`: a picked view brings the points that can be triangulated with it, and more where the
-            Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided
-            evenly among the views. `none`: no points after the start, as in arXiv 2512.22771. `auto`: `none` with
-            initial points of the whole data set and at later times, else `uncovered`.
-        restart: Whether the Gaussians begin again after a pick, at points that all views seen so far show together;
-            schedules, networks and photographs go on. `auto`: until 1,000 were triangulated at a start; `always`, as
-            FisherRF's code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth
-            maps, and where next to none can be triangulated.
-        blocks, network, combine, probes: What counts in policy `fisher`, and how, as in `drgs.select.Scoring`; blocks
-            None: all that the fit has.
-        measure: Numbers of views at which the held-out views are measured on the way, just before the next one is
-            picked; selection.json has the averages. What all picks lead to is in metrics.json as ever.
+        save_every: Steps between checkpoints.
+        save_minutes: Minutes after which one is written all the same, however few steps these were.
+    """
+
+    save_every: int = 1000
+    save_minutes: float = 10.0
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        check_fields("fit", self, {"save_every": _COUNT, "save_minutes": (1e-3, 1e9)})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SelectionConfig(Record):
+    """How views are chosen during a fit that begins with a few.
+
+    `schedule`: `views` takes `initial` views, then one after the other. `times`: the static stage on all cameras at the
+    first time, then one camera at each later time, in order. `pairs`: the same start, then any (camera, time). More in
+    `drgs.fitting.timetable`. The first view that a seed draws comes from a generator of its own, so that no policy's
+    draws depend on it.
+
+    `pick_points`: with `uncovered` a picked view brings the points that can be triangulated with it, and more where the
+    Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided evenly
+    among the views. With `none` no points come after the start, as in arXiv 2512.22771. `auto` is `none` with initial
+    points of the whole data set and at later times, else `uncovered`.
+
+    `restart`: whether the Gaussians begin again after a pick, at points that all views seen so far show together;
+    schedules, networks and photographs go on. `auto`: until 1,000 were triangulated at a start; `always`, as FisherRF's
+    code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth maps, and where next
+    to none can be triangulated.
+
+    Attributes:
+        policy: What chooses: a name, or package.module:function of one's own (docs/extending.md).
+        scoring: What counts, and how; its settings and the metric of its features are the fit's.
+        schedule: Pick view by view (views), one camera at each later time (times), or any camera at any (pairs); auto:
+            times where a deformation is fitted.
+        initial: Views at the start: that of --start, then those farthest away.
+        start: The first of the initial views: the first training view by name, or one that the seed draws.
+        add: Views to be chosen on the way, others are not read; default 10, or one for every time after the first.
+        every: Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of
+            17,000.
+        info_pixels: Information is computed on views of at most this many pixels; default as in the fit.
+        pick_points: Points that a picked view adds: triangulated, and where nothing is yet; auto: none with
+            --init-points all.
+        restart: After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never.
+        measure: Numbers of training views at which the held-out views are measured, too, just before the next pick.
     """
 
     policy: str = "fisher"
-    criterion: Criterion = "v_opt"
-    method: Method = "exact"
+    scoring: Scoring = dataclasses.field(default_factory=Scoring)
     schedule: Schedule = "auto"
     initial: int = 2
     start: Start = "first"
     add: int | None = None
     every: int | None = None
     info_pixels: int | None = None
-    prior: float | None = None
-    relative_prior: bool = False
     pick_points: PickPoints = "auto"
-    blocks: tuple[Block, ...] | None = None
-    network: NetworkScore = "ratio"
-    combine: Combine | None = None
-    probes: int = 16
     restart: Restart = "auto"
     measure: tuple[int, ...] = ()
+    where: ClassVar[str] = "active"
 
     def __post_init__(self) -> None:
-        from drgs.gain import Prior
-
         if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
             known = ", ".join(POLICY_NAMES)
             raise ValueError(f"active: policy must be one of {known}, or package.module:function, got {self.policy!r}")
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
-        if self.blocks is not None:
-            object.__setattr__(self, "blocks", checked_blocks("active", self.blocks, self.method))
-        count = (1, 10**9)
-        ranges = dict.fromkeys(("initial", "add", "every", "info_pixels", "probes", "measure"), count)
-        check_fields("active", self, ranges)
-        check_combined("active", self.blocks, self.criterion, self.network, self.combine)
-        Prior.given(self.prior, self.relative_prior)
+        check_fields("active", self, dict.fromkeys(("initial", "add", "every", "info_pixels", "measure"), _COUNT))
+        usual = Scoring()
+        for name in ("settings", "semantics"):
+            if getattr(self.scoring, name) != getattr(usual, name):
+                raise ValueError(f"active: scoring must leave its {name} to the fit, got others; drop them")
 
-    @classmethod
-    def recorded(cls, config: Mapping[str, Any]) -> dict:
-        """A recorded config with what an earlier version did not know: as it did, which never began again."""
-        return {**cls().to_json(), "restart": "never", **config}
-
-    def scoring(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
+    def scoring_of(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
         """As `drgs.select` takes it, for views that are rendered with these settings."""
-        from drgs.gain import Prior
-        from drgs.select import Scoring
+        return dataclasses.replace(self.scoring, settings=settings, semantics=semantics)
 
-        return Scoring(
-            criterion=self.criterion,
-            settings=settings,
-            method=self.method,
-            prior=Prior.given(self.prior, self.relative_prior),
-            blocks=self.blocks,
-            semantics=semantics,
-            network=self.network,
-            combine=self.combine,
-            probes=self.probes,
-        )
+    def flat(self) -> dict[str, Any]:
+        """All fields beside each other, as selection.json has them."""
+        record = self.to_json()
+        scoring = record.pop("scoring")
+        prior = scoring.pop("prior") or {"value": None, "relative": False}
+        return record | scoring | {"prior": prior["value"], "relative_prior": prior["relative"]}
 
-    def to_json(self) -> dict:
-        """As config.json, selection.json and the checkpoint hold it."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+def recorded_config(fit: Any, active: Mapping[str, Any] | None = None) -> FitConfig:
+    """The config of a run's files.
+
+    Args:
+        fit: What `to_json` made, or all fields beside each other, as older versions wrote them.
+        active: Those of the selection, which older versions wrote elsewhere. The first did not begin again after a
+            pick, and had no field that says so.
+    Raises:
+        ValueError: If a field is unknown or out of range.
+    """
+    config = FitConfig.from_json(fit)
+    return config.replace(selection=selection_of_flat({"restart": "never", **active})) if active else config
+
+
+def selection_of_flat(fields: Mapping[str, Any]) -> SelectionConfig:
+    """The record of fields as `drgs.fitting.config.ActiveConfig` had them: lambda as a number and a flag.
+
+    Raises:
+        ValueError: If a field is unknown or out of range.
+    """
+    known = {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
+    relative = known.pop("relative_prior", False)
+    prior = known.pop("prior", None)
+    return SelectionConfig.of(**known, prior=Prior.given(prior, relative))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitConfig(Record):
+    """Everything that determines a fit besides its data. Fractions are of `max_steps`.
+
+    `FitConfig.of(max_steps=500, max_gaussians=5000)` takes any field of any part by its name, as `replace` does.
+
+    `deterministic`: an image that is drawn again without gradients differs from the one that was fitted by 1e-7, the
+    rounding of its sums (presets `fast`, `inria` and `gsplat`; those of `exact` and `mitsuba` have the same bits).
+
+    Attributes:
+        settings: What `drgs.render` computes.
+        max_steps: Optimizer steps.
+        seed: Seed of everything random.
+        sh_degree: Highest degree of the view-dependent color.
+        deterministic: One Dr.Jit thread: same seed, same bits; slower. (Images drawn again without gradients differ by
+            1e-7: docs/numerics.md.)
+        data: Photographs, split and initial points.
+        density: Numbers of Gaussians, and density control.
+        rates: Learning rates.
+        loss: Weights of the terms of the loss.
+        features: A fit to a teacher's maps.
+        motion: A fit to what moves.
+        saving: Checkpoints.
+        selection: How views are chosen on the way; None: the fit is to all of them.
+    Raises:
+        ValueError: If a field has another type or is out of its range.
+    """
+
+    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
+    max_steps: int = 3000
+    seed: int = 0
+    sh_degree: Degree = 3
+    deterministic: bool = False
+    data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    density: DensityConfig = dataclasses.field(default_factory=DensityConfig)
+    rates: RateConfig = dataclasses.field(default_factory=RateConfig)
+    loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    features: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
+    motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
+    saving: SavingConfig = dataclasses.field(default_factory=SavingConfig)
+    selection: SelectionConfig | None = None
+    where: ClassVar[str] = "fit"
+
+    def __post_init__(self) -> None:
+        check_fields("fit", self, {"max_steps": _COUNT, "seed": (0, 2**31 - 1)})  # a seed is what COLMAP takes
+
+    def difference(self, other: FitConfig) -> tuple[str, Any, Any] | None:
+        """The first field whose value in `other` makes another fit, and both values as JSON has them.
+
+        When checkpoints are written makes none; how views are chosen is compared where it is known what `auto` is.
+        """
+        mine, theirs = (config.replace(saving=SavingConfig(), selection=None).to_json() for config in (self, other))
+        return _difference(mine, theirs)
+
+
+def _difference(mine: dict, theirs: dict) -> tuple[str, Any, Any] | None:
+    """The first key, in the innermost objects, with other values."""
+    for name, x in mine.items():
+        y = theirs[name]
+        if isinstance(x, dict) and isinstance(y, dict):
+            if found := _difference(x, y):
+                return found
+        elif x != y:
+            return name, x, y
+    return None
+
+
+# ------------------------------------------------------- as it was written before the records, for one release
+
+
+def _with_flat_fields(kind: type[FitConfig]) -> None:
+    """Let `FitConfig(max_gaussians=5)` and `config.max_gaussians` go on, with a warning that says how it is written."""
+    made = kind.__init__
+
+    @functools.wraps(made)
+    def begin(self: FitConfig, **fields: Any) -> None:
+        own = {field.name for field in dataclasses.fields(kind)}
+        if flat := [name for name in fields if name not in own]:
+            base = kind(**{name: x for name, x in fields.items() if name in own})
+            whole = base.replace(**{name: fields[name] for name in flat})
+            _warn(f"FitConfig({flat[0]}=...) is written FitConfig.of({flat[0]}=...)")
+            fields = {name: getattr(whole, name) for name in own}
+        made(self, **fields)
+
+    kind.__init__ = begin  # type: ignore[method-assign]
+
+
+def _read_flat(self: Record, name: str) -> Any:
+    """A field of a part, read of the whole."""
+    way = ways_of(type(self)).get(name, ())
+    value: Any = self
+    if len(way) < 2:
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+    for step in way:
+        value = getattr(value, step)
+    _warn(f"{type(self).__name__}.{name} is written {type(self).__name__}.{'.'.join(way)}")
+    return value
+
+
+def _warn(text: str) -> None:
+    warnings.warn(f"{text}; the old way ends with the next release", DeprecationWarning, stacklevel=3)
+
+
+_with_flat_fields(FitConfig)
+FitConfig.__getattr__ = SelectionConfig.__getattr__ = _read_flat  # type: ignore[attr-defined]
+
+
+def ActiveConfig(**fields: Any) -> SelectionConfig:
+    """A `SelectionConfig`, of fields as they stood beside each other; the name ends with the next release."""
+    _warn("ActiveConfig(...) is written drgs.train.SelectionConfig.of(...), and lambda as prior=Prior(...)")
+    return selection_of_flat(fields)

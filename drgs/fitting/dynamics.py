@@ -70,7 +70,7 @@ class Motion:
     def __init__(self, config: FitConfig, times: Sequence[float]) -> None:
         self.config = config
         self.times = tuple(times)
-        self.first_step = round(config.static_share * config.max_steps)
+        self.first_step = round(config.motion.static_share * config.max_steps)
         self.field: DeformationField | None = None
         self.step = 0
         self._length = 1.0  # the field's unit of length: the extent of the scene or of its Gaussians, whichever is less
@@ -129,7 +129,7 @@ class Motion:
         self.step = step
         gates = rows.tensors["motion"]
         group = next(group for group in rows.optimizer.param_groups if group["name"] == "motion")
-        group["eps"] = max(_NOISE * self.config.motion_weight / max(len(rows), 1), 1e-15)
+        group["eps"] = max(_NOISE * self.config.motion.motion_weight / max(len(rows), 1), 1e-15)
         if step == self._again:
             with torch.no_grad():  # leaves are changed in place
                 rows.overwrite(torch.arange(len(rows)), {"motion": gates.clamp(min=_OPEN)})
@@ -185,7 +185,7 @@ class Motion:
     def _extended(self, rows: GaussianRows, parts: Parts, bounds: torch.Tensor) -> Parts:
         """The parts of the dynamic stage, around a new field."""
         config = self.config
-        sizes = FieldConfig.preset(config.field_preset, times=len(self.times))
+        sizes = FieldConfig.preset(config.motion.field_preset, times=len(self.times))
         self.field = field = DeformationField(sizes, bounds, (self.times[0], self.times[-1]), seed=config.seed)
         begin = self.first_step / config.max_steps
 
@@ -196,14 +196,14 @@ class Motion:
         # Adam's steps have the rate's length: what makes lengths of features has them in units of what it moves.
         lengths = dict.fromkeys(("means.3.weight", "means.3.bias"), self._length)
         networks = [
-            Network(FIELD[0], field.grid, lambda part: rate(config.grid_rate, part), fused=True),
-            Network(FIELD[1], field.mlp, lambda part: rate(config.field_rate, part), lengths, fused=True),
+            Network(FIELD[0], field.grid, lambda part: rate(config.motion.grid_rate, part), fused=True),
+            Network(FIELD[1], field.mlp, lambda part: rate(config.motion.field_rate, part), lengths, fused=True),
         ]
         terms = [*parts.terms, Smoothness(field, config)]
-        if config.motion_weight:
-            terms.append(Rest(self, rows, config.motion_weight))
+        if config.motion.motion_weight:
+            terms.append(Rest(self, rows, config.motion.motion_weight))
         steps = max(config.max_steps - self.first_step, 1)
-        gates = min(config.motion_rate / steps, _FASTEST)
+        gates = min(config.motion.motion_rate / steps, _FASTEST)
         return dataclasses.replace(
             parts,
             terms=terms,
@@ -228,9 +228,9 @@ class Smoothness:
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
         """See `LossTerm`; None where all weights are 0."""
         weights = {
-            time_smoothness: self.config.smooth_weight,
-            plane_smoothness: self.config.plane_weight,
-            time_l1: self.config.l1_time_weight,
+            time_smoothness: self.config.motion.smooth_weight,
+            plane_smoothness: self.config.motion.plane_weight,
+            time_l1: self.config.motion.l1_time_weight,
         }
         parts = [weight * of(self.field.grid) for of, weight in weights.items() if weight]
         return torch.stack(parts).sum() if parts else None

@@ -71,10 +71,10 @@ def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> 
     """
     return data.load(
         path,
-        test_every=config.test_every,
-        test_offset=config.test_offset,
-        times=config.times,
-        test_cameras=config.test_cameras,
+        test_every=config.data.test_every,
+        test_offset=config.data.test_offset,
+        times=config.data.times,
+        test_cameras=config.data.test_cameras,
         background=config.settings.background,
         **options,
     )

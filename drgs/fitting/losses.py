@@ -51,13 +51,13 @@ class LossTerm(Protocol):
 
 def terms_of(config: FitConfig, extent: float) -> list[LossTerm]:
     """The terms of a fit, in the order in which they are added up; `extent` of the scene is its unit of length."""
-    terms: list[LossTerm] = [Photometric(config.ssim_weight)]
-    if config.outside_weight:
-        terms.append(Outside(config.outside_weight))
-    if config.opacity_weight:
-        terms.append(Opacity(config.opacity_weight))
-    if config.scale_weight:
-        terms.append(Scale(config.scale_weight, extent))
+    terms: list[LossTerm] = [Photometric(config.loss.ssim_weight)]
+    if config.loss.outside_weight:
+        terms.append(Outside(config.loss.outside_weight))
+    if config.loss.opacity_weight:
+        terms.append(Opacity(config.loss.opacity_weight))
+    if config.loss.scale_weight:
+        terms.append(Scale(config.loss.scale_weight, extent))
     return terms
 
 

@@ -50,21 +50,29 @@ def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> P
     """
     rates: dict[str, Rate] = {
         "means": lambda part: means_rate(config, part) * extent,
-        "quats": config.rotation_rate,
-        "log_scales": config.scale_rate,
-        "logit_opacities": config.opacity_rate,
-        "sh_dc": config.dc_rate,
-        "sh_rest": config.rest_rate,
+        "quats": config.rates.rotation_rate,
+        "log_scales": config.rates.scale_rate,
+        "logit_opacities": config.rates.opacity_rate,
+        "sh_dc": config.rates.dc_rate,
+        "sh_rest": config.rates.rest_rate,
     }
     parts = Parts(terms_of(config, extent), rates)
     if channels is None:
         return parts
-    from drgs.fitting.semantics import with_features
+    from drgs.fitting.semantics import features_of
 
-    return with_features(parts, config, channels)
+    term, decoder = features_of(config, channels)
+    return dataclasses.replace(
+        parts,
+        terms=[*parts.terms, term],
+        rates={**parts.rates, "features": config.features.feature_rate},
+        networks=[*parts.networks, decoder],
+        shows_features=term.is_shown,
+        couple_features=config.features.couple_features,
+    )
 
 
 def means_rate(config: FitConfig, part: float) -> float:
     """Learning rate of the means, in units of the extent, when the fraction `part` of the fit is done."""
-    first, last = config.means_rate
+    first, last = config.rates.means_rate
     return first * (last / first) ** part

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.files import load_ply, load_state
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.files import CONFIG_SCHEMA, load_ply, load_state
+from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
-from drgs.guards.arguments import ArgumentError
 from drgs.guards.json_files import check_json, parse_json, read_json
 
 if TYPE_CHECKING:
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
 __all__ = [
     "FitRecord",
     "LoadedRun",
-    "active_record",
     "check_checkpoint",
     "config_record",
     "fit_record",
@@ -62,7 +60,7 @@ _HEADER = {
 }
 _OF_A_PICK = ("number", "step", "index")  # by which an event of the log is a pick of the checkpoint
 _TIMED = ("train", "preview", "checkpoint", "done")  # events whose `seconds` are those of all steps so far
-_ACTIVE = {"config": dict, "pool": [str], "picks": [{"number": int, "step": int, **_VIEW}]}
+_ACTIVE = {"pool": [str], "picks": [{"number": int, "step": int, **_VIEW}]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +71,6 @@ class FitRecord:
         data: The data set.
         train, test: Names of the views of the two splits; of an active run, `train` are those it began with.
         config: How it was fitted.
-        is_active: Whether views were chosen during the fit.
         semantics: What its features were fitted to; None where it has none.
         times: Of the views, sorted, where it was fitted to what moves; else none.
     """
@@ -82,33 +79,19 @@ class FitRecord:
     train: tuple[str, ...]
     test: tuple[str, ...]
     config: FitConfig
-    is_active: bool
     semantics: SemanticRecord | None = None
     times: tuple[float, ...] = ()
+
+    @property
+    def is_active(self) -> bool:
+        """Whether views were chosen during the fit."""
+        return self.config.selection is not None
 
     def check_data(self, run: Path, otherwise: str = "") -> None:
         """Raise FileNotFoundError if the data set is no longer where it was fitted; `otherwise` is advice, too."""
         if not self.data.exists():
             advice = f"move it back, or {otherwise}" if otherwise else "move it back"
             raise FileNotFoundError(f"{run}: the data set of the run must be at {self.data}, found none; {advice}")
-
-
-def active_record(run: Run) -> ActiveConfig | None:
-    """How the views of a run were chosen; None where none were.
-
-    Raises:
-        FileNotFoundError: If it is no run folder.
-        ValueError: If config.json is damaged.
-    """
-    if not (recorded := run.config().get("active")):
-        return None
-    try:
-        known: dict[str, Any] = ActiveConfig.recorded(recorded)
-        lists = {name: tuple(x) for name, x in known.items() if isinstance(x, list)}
-        return ActiveConfig(**(known | lists))
-    except (TypeError, ValueError, ArgumentError) as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"{run.path / 'config.json'}: active: {text}; restore the file") from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,10 +255,11 @@ def config_record(
 ) -> dict:
     """What config.json is to say of a fit, for `drgs.files.Run.start`; `fit_record` reads it."""
     recorded: dict[str, Any] = {
+        "schema": CONFIG_SCHEMA,
         "command": "fit",
         "data": str(Path(dataset.path).resolve()),
         "format": dataset.format,
-        "split_rule": dataset.split_rule(config.test_every, config.test_offset, config.test_cameras),
+        "split_rule": dataset.split_rule(config.data.test_every, config.data.test_offset, config.data.test_cameras),
         "train": [frame.name for frame in frames],
         "test": [frame.name for frame in held_out],
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
@@ -289,7 +273,6 @@ def config_record(
     }
     if plan:
         recorded |= {
-            "active": plan.active.to_json(),
             "pool": [view.name for view in plan.views],
             "pool_leak": plan.pool_leak,
         }
@@ -307,8 +290,10 @@ def fit_record(run: Run) -> FitRecord:
     where = f"{run.path / 'config.json'}"
     advice = "restore the file, or fit again in another folder"
     check_json(where, config, _CONFIG | ({"times": [float]} if "times" in config else {}), advice)
+    active = config.get("active")  # of versions that wrote it there
+    check_json(where, {"active": active}, {"active": (None, dict)}, advice)
     try:
-        fit = FitConfig.from_json(config["fit"])
+        fit = recorded_config(config["fit"], active)
     except (ValueError, NotImplementedError) as error:
         raise ValueError(f"{where}: {error}; {advice}") from None
     return FitRecord(
@@ -316,7 +301,6 @@ def fit_record(run: Run) -> FitRecord:
         tuple(config["train"]),
         tuple(config["test"]),
         fit,
-        bool(config.get("active")),
         SemanticRecord.from_json(config.get("semantics"), f"{where}: semantics"),
         tuple(config.get("times", ())),
     )

@@ -72,10 +72,10 @@ class SemanticRecord:
             views: Those that may be read at the start: no other's map is looked at, as long as one of them has a map,
                 and never that of a held-out view.
         """
-        known = dataset.semantics if config.semantics == "auto" else None
+        known = dataset.semantics if config.features.semantics == "auto" else None
         if known is None or not known.maps:
             return None
-        train, _ = dataset.split(config.test_every, config.test_offset, config.test_cameras)
+        train, _ = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
         path = next((view.teacher_path for view in (*views, *train) if view.teacher_path is not None), None)
         if path is None:  # maps of held-out views alone teach nothing
             return None
@@ -88,7 +88,7 @@ class SemanticRecord:
             known.teacher,
             known.labels,
             channels,
-            config.feature_width,
+            config.features.feature_width,
             (width, height),
             None if classes is None else classes.names,
             classes is not None and classes.embeddings is not None,

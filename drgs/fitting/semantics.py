@@ -26,11 +26,10 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.config import FeatureSize, FitConfig
     from drgs.fitting.frames import Frame
-    from drgs.fitting.parts import Parts
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["FeatureDistance", "with_features"]
+__all__ = ["FeatureDistance", "features_of"]
 
 _INSIDE = 0.5  # share of a cell of the teacher's map that the mask must keep
 _CHUNK = 1 << 22  # decoded numbers at a time: 16 MB, where a map of 512x360x480 has 354 MB
@@ -133,22 +132,16 @@ class _Distance(torch.autograd.Function):
         return (*(grad * x for x in ctx.saved_tensors), None)
 
 
-def with_features(parts: Parts, config: FitConfig, channels: int) -> Parts:
-    """The parts of a fit, with features and a decoder to `channels` of a teacher.
+def features_of(config: FitConfig, channels: int) -> tuple[FeatureDistance, Network]:
+    """The term and the decoder of a fit to `channels` of a teacher.
 
     The decoder's first weights are those of torch, drawn by the config's seed; torch's own generator stays as it was.
     """
+    wanted = config.features
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        decoder = Decoder(config.feature_width, channels)
+        decoder = Decoder(wanted.feature_width, channels)
     term = FeatureDistance(
-        decoder, config.feature_weight, config.settings, config.feature_resolution, config.couple_features
+        decoder, wanted.feature_weight, config.settings, wanted.feature_resolution, wanted.couple_features
     )
-    return dataclasses.replace(
-        parts,
-        terms=[*parts.terms, term],
-        rates={**parts.rates, "features": config.feature_rate},
-        networks=[*parts.networks, Network("decoder", decoder, config.decoder_rate)],
-        shows_features=term.is_shown,
-        couple_features=config.couple_features,
-    )
+    return term, Network("decoder", decoder, wanted.decoder_rate)

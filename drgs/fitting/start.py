@@ -37,7 +37,7 @@ def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion 
     Raises:
         ValueError: If some views have a time and others do not.
     """
-    if config.dynamics == "ignore" or not times_of(train):
+    if config.motion.dynamics == "ignore" or not times_of(train):
         return None
     from drgs.fitting.dynamics import Motion
 
@@ -59,18 +59,18 @@ def start(
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
-    given = config.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
+    given = config.data.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     with Bar("initial points") as bar:
         seen = views if motion is None else first_time(views)
         points, colors, source = initial_points(
-            dataset if given else seen, config.seed, config.max_gaussians - reserved, bar.stage
+            dataset if given else seen, config.seed, config.density.max_gaussians - reserved, bar.stage
         )
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
     dense = not given and any(view.depth_path is not None for view in views)
     width, channels = (taught.width, taught.channels) if taught else (0, None)
     model = GaussianRows.from_points(
-        torch.from_numpy(points), torch.from_numpy(colors), *config.start_of(dense), features=width
+        torch.from_numpy(points), torch.from_numpy(colors), *config.density.start_of(dense), features=width
     )
     _log.info("%d initial points: %s", len(points), source)
     return Trainer(config, frames, model, extent, parts or parts_of(config, extent, channels), motion), source

@@ -26,7 +26,7 @@ import numpy as np
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
-    from drgs.fitting.config import ActiveConfig, FitConfig, Schedule
+    from drgs.fitting.config import FitConfig, Schedule, SelectionConfig
 
 __all__ = ["VIEWS_TO_ADD", "Timetable", "initial_views"]
 
@@ -35,7 +35,7 @@ _EVERY = 200  # steps between two picks, as in [1]
 _PART = 200 / 17_000  # of the steps between two picks at times, as in [1]
 
 VIEWS_TO_ADD = 10
-"""As in [1], where things stand still and `ActiveConfig` does not say."""
+"""As in [1], where things stand still and `SelectionConfig` does not say."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,16 +59,18 @@ class Timetable:
     first: int
 
     @classmethod
-    def of(cls, active: ActiveConfig, views: Sequence[View], config: FitConfig, moves: bool = False) -> Timetable:
+    def of(cls, views: Sequence[View], config: FitConfig, moves: bool = False) -> Timetable:
         """The timetable of a fit.
 
         Args:
-            active, config: Of the fit.
-            views: Of the training split, in its order, at least one.
+            views: The training split, in its order, at least one.
+            config: What the fit does, with a selection.
             moves: Whether a deformation is fitted: what `auto` goes by.
         Raises:
             ValueError: If the data set has not as many views or times, or the steps do not suffice.
         """
+        active = config.selection
+        assert active is not None
         schedule = ("times" if moves else "views") if active.schedule == "auto" else active.schedule
         if schedule == "views":
             if moves:
@@ -94,7 +96,7 @@ class Timetable:
         return 0 if step < self.first else min(self.add, 1 + (step - self.first) // self.every)
 
     @classmethod
-    def _of_views(cls, active: ActiveConfig, views: Sequence[View], config: FitConfig) -> Timetable:
+    def _of_views(cls, active: SelectionConfig, views: Sequence[View], config: FitConfig) -> Timetable:
         """View by view."""
         add, every = active.add or VIEWS_TO_ADD, active.every or _EVERY
         if active.initial + add > len(views):
@@ -112,7 +114,9 @@ class Timetable:
         return cls("views", tuple(start), (tuple(range(len(views))),), add, every, every)
 
     @classmethod
-    def _of_times(cls, active: ActiveConfig, views: Sequence[View], config: FitConfig, schedule: Schedule) -> Timetable:
+    def _of_times(
+        cls, active: SelectionConfig, views: Sequence[View], config: FitConfig, schedule: Schedule
+    ) -> Timetable:
         """Cameras at times, after the static stage."""
         where = f"active: --schedule {schedule}"
         _check_times(where, active, views, config)
@@ -128,7 +132,7 @@ class Timetable:
         if add > room:
             what = "later times" if schedule == "times" else "training views at later times"
             raise ValueError(f"{where} must have --add of at most the {room} {what}, got {add}; lower it")
-        static = round(config.static_share * config.max_steps)
+        static = round(config.motion.static_share * config.max_steps)
         least = math.ceil(_PART * config.max_steps)
         every = active.every or max(1, round(_PART * config.max_steps))
         first = static + max(every, least)
@@ -142,9 +146,9 @@ class Timetable:
         return cls(schedule, start, pools, add, every, first)
 
 
-def _check_times(where: str, active: ActiveConfig, views: Sequence[View], config: FitConfig) -> None:
+def _check_times(where: str, active: SelectionConfig, views: Sequence[View], config: FitConfig) -> None:
     """Refuse what does not go with picks at times."""
-    if config.dynamics == "ignore":
+    if config.motion.dynamics == "ignore":
         raise ValueError(f"{where} must fit what moves, got --dynamics ignore; drop it, or use --schedule views")
     if timeless := next((view.name for view in views if view.camera.time is None), None):
         raise ValueError(f"{where} must have a time of every view, {timeless!r} has none; use --schedule views")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.config import SAVING, FitConfig
+from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
@@ -128,7 +128,7 @@ class Trainer:
         features = self.rows.tensors.get("features")
         width = 0 if features is None else features.shape[1]
         degree = self.rows.sh_degree
-        self.rows = GaussianRows.from_points(points, colors, *self.config.start_of(False), features=width)
+        self.rows = GaussianRows.from_points(points, colors, *self.config.density.start_of(False), features=width)
         while self.rows.sh_degree < degree:
             self.rows.raise_sh_degree()
         self._start_count = len(self.rows)
@@ -163,8 +163,9 @@ class Trainer:
             for optimizer in optimizers:
                 optimizer.step()
             stage = self._stage()
-            if config.noise and done - stage.begin < config.refine_stop * stage.length:
-                explore(rows, means_rate(config, self._part()), self.extent, config.noise, self._generator)
+            density = config.density
+            if density.noise and done - stage.begin < density.refine_stop * stage.length:
+                explore(rows, means_rate(config, self._part()), self.extent, density.noise, self._generator)
         else:
             self.bad_steps += 1
             self._bad_in_a_row += 1
@@ -228,7 +229,7 @@ class Trainer:
         """Continue from a checkpoint.
 
         Args:
-            config, frames: As they were; when checkpoints are written (`SAVING`) may change.
+            config, frames: As they were; when checkpoints are written may change.
             tensors, header: Of the checkpoint.
             where: It, for messages.
             parts: As they were at the first step; networks are overwritten by those of the checkpoint.
@@ -237,14 +238,12 @@ class Trainer:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
         # What an older drgs did not know, it did as the defaults say.
-        new = config.to_json()
-        old = FitConfig().to_json() | header["config"]
-        for key in new:
-            if key not in SAVING and new[key] != old[key]:
-                raise ValueError(
-                    f"{where}: --resume must continue the same fit, {key} was {old[key]!r} and is {new[key]!r}; "
-                    "repeat the options or choose another run folder"
-                )
+        if other := config.difference(FitConfig.from_json(header["config"])):
+            name, now, was = other
+            raise ValueError(
+                f"{where}: --resume must continue the same fit, {name} was {was!r} and is {now!r}; "
+                "repeat the options or choose another run folder"
+            )
         if header["views"] != [frame.name for frame in frames]:
             raise ValueError(
                 f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
@@ -278,16 +277,18 @@ class Trainer:
     def _prepare(self, done: int) -> list[dict]:
         """Schedules and density control before step `done`."""
         config = self.config
+        density = config.density
         rows = self.rows
         events = []
         # The degree is a quotient, rounded up; 1e-9 keeps a whole one from being rounded up to the next.
-        while rows.sh_degree < min(config.sh_degree, done / max(1, round(config.sh_every * config.max_steps)) - 1e-9):
+        apart = max(1, round(config.rates.sh_every * config.max_steps))
+        while rows.sh_degree < min(config.sh_degree, done / apart - 1e-9):
             rows.raise_sh_degree()
             events.append({"event": "sh_degree", "degree": rows.sh_degree})
         stage = self._stage()
-        every = max(1, round(config.refine_every * stage.length))
-        start = config.refine_start * stage.length
-        stop = config.refine_stop * stage.length
+        every = max(1, round(density.refine_every * stage.length))
+        start = density.refine_start * stage.length
+        stop = density.refine_stop * stage.length
         if (done - stage.begin) % every == 0 and max(start, 1) <= done - stage.begin < stop:
             events.append(self._refine(done, start))
         rows.set_rates({name: rate_at(self.parts.rates[name], self._part()) for name in rows.tensors})
@@ -297,16 +298,17 @@ class Trainer:
 
     def _refine(self, done: int, start: float) -> dict:
         """Density control at step `done`; `start`: when the first is due in a stage. What it did, for the log."""
-        config = self.config
+        density = self.config.density
         rows = self.rows
         stage = self._stage()
-        moved = relocate(rows, config.min_opacity, config.jitter, self._generator)
+        moved = relocate(rows, density.min_opacity, density.jitter, self._generator)
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
-        full = max(config.grow_until * stage.length - start, 1)
-        part = min(1.0, (done - stage.begin - start + config.refine_every * stage.length) / full)
-        budget = round(stage.budget * config.max_gaussians) - self.reserved
+        full = max(density.grow_until * stage.length - start, 1)
+        part = min(1.0, (done - stage.begin - start + density.refine_every * stage.length) / full)
+        budget = round(stage.budget * density.max_gaussians) - self.reserved
         wanted = round(self._start_count * (budget / self._start_count) ** part) if self._start_count < budget else 0
-        added = add_gaussians(rows, min(wanted, budget) - len(rows), config.min_opacity, config.jitter, self._generator)
+        missing = min(wanted, budget) - len(rows)
+        added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self._generator)
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
 
     def _stage(self) -> Stage:

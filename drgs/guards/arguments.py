@@ -115,7 +115,9 @@ def _checked(value: Any, hint: Any, low: float, high: float) -> tuple[Any, str |
         is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
         good = is_number and (hint is float or isinstance(value, int)) and _finite(value) and low <= value <= high
         return value, None if good else what + _between(low, high)
-    return value, None if isinstance(value, hint) else {bool: "True or False", str: "a text"}.get(hint, f"{hint}")
+    return value, None if isinstance(value, hint) else {bool: "True or False", str: "a text"}.get(
+        hint, f"a {getattr(hint, '__name__', hint)}"
+    )
 
 
 def _finite(value: Any) -> bool:

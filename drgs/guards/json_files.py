@@ -1,18 +1,20 @@
-"""JSON that others wrote or edited: parsed with limits, and compared with what it must hold before it is used."""
+"""JSON, and TOML, that others wrote or edited: parsed with limits, and compared with what it must hold before use."""
 
 from __future__ import annotations
 
 import json
 import math
+import tomllib
 import unicodedata
 from pathlib import Path
 from typing import Any
 
 from drgs.guards.foreign import refuse_foreign
 
-__all__ = ["check_json", "parse_json", "read_json"]
+__all__ = ["check_json", "parse_json", "read_json", "read_toml"]
 
 _LARGEST = 1 << 29  # bytes; ten thousand photographs with all their fields take some 20 MB
+_LARGEST_TOML = 1 << 20
 _INT64 = 1 << 63
 
 
@@ -27,12 +29,31 @@ def read_json(path: Path, what: str = "a JSON file", advice: str = "write the fi
         FileNotFoundError: If there is no such file.
         ValueError: If it is not JSON, too large or too deeply nested, or known to be of another kind.
     """
+    return parse_json(_bounded(path, what, advice, _LARGEST), str(path), advice)
+
+
+def read_toml(path: Path, what: str = "a TOML file", advice: str = "write the file again") -> dict[str, Any]:
+    """Parse a TOML file, of at most 1 MiB: people write these.
+
+    Args, Raises: As `read_json`.
+    """
+    data = _bounded(path, what, advice, _LARGEST_TOML)
+    try:
+        return tomllib.loads(data.decode("utf-8-sig").replace("\r\n", "\n"))
+    except RecursionError:
+        raise ValueError(f"{path}: must be valid TOML, got one that is nested too deeply; {advice}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: must be valid TOML, got {' '.join(str(error).split())}; {advice}") from None
+
+
+def _bounded(path: Path, what: str, advice: str, largest: int) -> bytes:
+    """The bytes of a file that is not too large, and not known to be of another kind."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be {what}, found none; check the path")
     refuse_foreign(path, what)
-    if path.stat().st_size > _LARGEST:
-        raise ValueError(f"{path}: must be {what} of at most {_LARGEST >> 20} MiB, is larger; {advice}")
-    return parse_json(path.read_bytes(), str(path), advice)
+    if path.stat().st_size > largest:
+        raise ValueError(f"{path}: must be {what} of at most {largest >> 20} MiB, is larger; {advice}")
+    return path.read_bytes()
 
 
 def parse_json(data: bytes | str, where: str, advice: str = "write the file again") -> Any:

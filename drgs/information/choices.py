@@ -15,6 +15,7 @@ __all__ = [
     "NETWORK_ESTIMATES",
     "Block",
     "Combine",
+    "CRITERION_NAMES",
     "Criterion",
     "Estimate",
     "Method",
@@ -28,6 +29,8 @@ __all__ = [
 
 Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
 """The names in `drgs.gain.CRITERIA`, where the functions are; views are chosen by the first unless told otherwise."""
+
+CRITERION_NAMES: tuple[Criterion, ...] = typing.get_args(Criterion)
 
 Policy = Literal["fisher", "fisherrf", "coverage", "moments", "farthest", "uniform", "random"]
 """The names in `drgs.select.POLICIES`, where the functions are."""

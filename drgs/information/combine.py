@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.information.backdrop import Sphere
     from drgs.information.choices import Block
-    from drgs.information.pool import Scoring
+    from drgs.information.scoring import Scoring
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 

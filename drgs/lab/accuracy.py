@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 FIELDS = ("rgb", "alpha", "depth", "features")
-_ENTRIES = 1 << 22  # of an intermediate of the dense Jacobian held at once: 32 MB
+_ENTRIES = 1 << 22  # entries of an intermediate of the dense Jacobian that are held at once: 32 MB
 
 
 # -------------------------------------------------- random scenes
@@ -64,7 +64,7 @@ def random_camera(
     center: tuple[float, float] | None = None,
     skew: float = 0.0,
 ) -> Camera:
-    """Looks at the origin from `distance` away, off its axis, with an off-center principal point.
+    """A camera that looks at the origin from `distance` away, off its axis, with an off-center principal point.
 
     The focal length keeps 2 world units around the origin in the image unless it is given; `skew` is a multiple of it.
     """
@@ -123,7 +123,7 @@ def twist_basis() -> torch.Tensor:
 
 def pose_gradient(cam: Camera, gradient: torch.Tensor) -> torch.Tensor:
     """(6,) the part of a gradient of w2c along the world twists c2w <- exp(xi) c2w."""
-    change = -cam.w2c.detach() @ twist_basis()  # where the pose is, not how it came there
+    change = -cam.w2c.detach() @ twist_basis()  # the directions are constants: the pose's own graph has no part in them
     return (change * gradient).sum((1, 2))
 
 
@@ -139,7 +139,7 @@ def inner(a: Mapping[str, torch.Tensor], b: Mapping[str, torch.Tensor]) -> float
 
 def relative(a: torch.Tensor, b: torch.Tensor, floor: float = 1e-6) -> float:
     """|a - b| / max(|b|, floor) in the L2 norm; the floor stands for a gradient that is 0."""
-    return float((a - b).norm() / b.norm().clamp_min(floor))
+    return float((a - b).norm() / b.norm().clamp_min(floor))  # b = 0 would give NaN for a = 0
 
 
 class Oracle:
@@ -178,13 +178,13 @@ class Oracle:
         loss = sum((images[name] * u).sum() for name, u in self.u.items())
         groups = leaves(g, cam)
         back = _grad(loss, groups, create_graph=True)
-        # Tangents are constants.
+        # Tangents are constants: with the pose's graph, the second differentiation below would go through it again.
         change = {**self.v, "camera": -cam.w2c.detach() @ (self.v["camera"][:, None, None] * twist_basis()).sum(0)}
         self.push = _grad(sum((back[name].double() * change[name]).sum() for name in back), self.u)
-        # The graph has served: numbers from here on.
+        # The graph has served; kept, it would hold every intermediate of the oracle for as long as this object lives.
         self.back = {n: x.detach().double() for n, x in back.items()}
         self.back["camera"] = pose_gradient(cam, self.back["camera"])
-        self.u = {name: u.detach() for name, u in self.u.items()}
+        self.u = {name: u.detach() for name, u in self.u.items()}  # it was a variable to get J v, and is a number now
 
 
 def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
@@ -198,6 +198,7 @@ def gradients(
     g: Gaussians, cam: Camera, out: Output | reference.ReferenceOutput, u: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
     """float64 gradient of sum <u, image> by group, `camera` as a twist."""
+    # Sums over an image in float64: in float32 they lose more digits than the gradients are compared by.
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
     found = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
     return {**found, "camera": pose_gradient(cam, found["camera"])}
@@ -211,7 +212,7 @@ class Errors:
         image: Output name -> largest absolute error (depths: relative to the largest depth, or 1).
         gradient: Group -> relative L2 error of the adjoint.
         forward: Output name -> relative L2 error of the forward mode.
-        joint: relative L2 error of the forward mode over all outputs but depth.
+        joint: Relative L2 error of the forward mode over all outputs but depth.
         duality: |<Jv, u> - <v, J^T u>| / (|Jv| |u|).
         finite: Every output, gradient and tangent is finite, ambiguous pixels included.
         count: Largest difference of the number of hits of a pixel.
@@ -233,7 +234,7 @@ def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle)
     out = render(g, cam, settings, outputs="all")
     ref = oracle.out
     good = oracle.good
-    size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])
+    size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])  # a list holds numbers
     image = {}
     finite = True
     for name in (*FIELDS, "median_depth"):
@@ -279,7 +280,7 @@ def jacobian(g: Gaussians, out: reference.ReferenceOutput, features: bool = Fals
     """
     wanted = {name: x for name, x in g.parameters().items() if name != "features"}
     J = dict(zip(wanted, _dense(out.rgb.reshape(-1), list(wanted.values())), strict=True))
-    # Where the derivative is taken is a constant.
+    # Quaternions say where the derivative is taken; `turn` is linear in `slope` alone.
     J["rotations"] = turn(g.quats.detach().double(), J.pop("quats"))
     J = {name: J[name] for name in ("means", "rotations", "log_scales", "logit_opacities", "sh")}
     if features and g.features is not None:

@@ -13,8 +13,8 @@ from drgs.lab.reference_model import ORDERS, ReferenceModel
 
 __all__ = ["LEAST", "Finding", "Found", "find"]
 
-_SHARE = 0.3  # of the remaining difference that a variation must explain to be named
-LEAST = 0.1  # of the pixels: fewer that are without near ties say nothing
+_SHARE = 0.3  # share of the remaining difference that a variation must explain to be named
+LEAST = 0.1  # share of the pixels: fewer that are without near ties say nothing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +22,11 @@ class Finding:
     """A convention that differs.
 
     Attributes:
-        name: What it is about, e.g. `quaternion order`.
-        expected, found: The preset's and the rasterizer's.
-        without, with_it: RMS of the image's difference if everything but this, or everything, is taken into account.
+        name: Name of the convention, e.g. `quaternion order`.
+        expected: Value that the preset has.
+        found: Value that the rasterizer has.
+        without: RMS of the image's difference if everything but this is taken into account.
+        with_it: RMS of the image's difference if everything is.
         groups: Raw parameters whose gradient it changes most directly.
     """
 
@@ -83,11 +85,11 @@ def find(
     that hang on near ties of that start do not count: a tie that fell the other way must not be taken for an order.
 
     Args:
-        image: (H, W, 3) of the rasterizer.
+        image: (H, W, 3) image of the rasterizer.
         starts: Models that may be meant: the claimed one, or one a preset. What differs is counted from the one that
             needs least.
-        draw: A model -> its (H, W, 3) image of that view.
-        near_ties: A model -> (H, W) bool.
+        draw: Function of a model: its (H, W, 3) image of that view.
+        near_ties: Function of a model: (H, W) bool, the pixels that hang on near ties.
         settled: RMS below which two images are one: what their rounding does.
     """
     known: dict[ReferenceModel, torch.Tensor] = {}
@@ -131,8 +133,10 @@ class Found:
     """What `find` found.
 
     Attributes:
-        start, model: The preset, and the model with what is unusual.
-        before, after: RMS of the image's difference to each of them.
+        start: The preset.
+        model: The preset with what is unusual.
+        before: RMS of the image's difference to `start`.
+        after: RMS of the image's difference to `model`.
         findings: What differs between the two.
     """
 

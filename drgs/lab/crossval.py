@@ -2,9 +2,8 @@
 
 The image is compared with our models until one with the rasterizer's conventions is found (conventions.py). There the
 gradients of <u, image>, u of random signs, are compared group by group: raw parameters, the pose of every view along
-rigid motions (`viewmats`), and, in an image of many channels, plain `colors` (channels.py). Where they differ, a choice
-that is known to be made on purpose may explain it; else the rasterizer's own central differences decide
-(differences.py):
+rigid motions (`viewmats`), and, in an image of many channels, plain `colors`. Where they differ, a choice that is known
+to be made on purpose may explain it; else the rasterizer's own central differences decide (differences.py):
 
     agreement          the gradient is the model's
     known deviation    it is the model's with a documented choice: view direction detached, clamped alpha passed through
@@ -27,26 +26,29 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
+from drgs.integrator import render
 from drgs.lab import conventions
-from drgs.lab.channels import wide_gradients
-from drgs.lab.crops import crops
-from drgs.lab.dumps import Dump, cotangents
+from drgs.lab.dumps import Dump, cotangents, one_line
 from drgs.lab.image_errors import error_line
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import COLORS, POSE, raw_of, with_pose
+from drgs.lab.raw import COLORS, PARAMETERS, POSE, raw_of, with_colors, with_pose
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
-from drgs.lab.verdicts import Case, compared, judge, with_errors
+from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
 from drgs.settings import RenderSettings
+from drgs.sizes import cropped
 
-__all__ = ["VERDICTS", "Result", "crossval"]
+__all__ = ["VERDICTS", "Result", "crops", "crossval"]
 
 VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
-_STARTS = ("gsplat", "inria", "fast", "exact", "mitsuba")  # of equally near ones the first is taken
+_STARTS = ("gsplat", "inria", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
 _ORACLE_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a scene that the oracle takes as it is
 _TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}
 _SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs
 _ALPHA = 1e-4  # a mean difference of alpha that is worth a word
+_SIDES = (32, 16, 8)  # pixels of a crop, the largest that the oracle can take
+_STEP = 16  # pixels between the places that are tried for a crop: a rasterizer's tiles stay where they are
+_CROP_PAIRS = 1_000_000  # (pixel, Gaussian) pairs of a crop that take the oracle seconds: image and gradient, by CPU
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +56,14 @@ class Result:
     """What `crossval` found.
 
     Attributes:
-        report: Everything, JSON-serializable.
+        report: Everything that was found, JSON-serializable.
         images: A dict a view: `rasterizer`, `model`, `exact` (H, W, 3) arrays.
-        groups: A row a group whose gradient was compared.
+        groups: Group -> its row, of each group whose gradient was compared.
         views: A row a view.
         findings: Conventions that differ from the preset's.
         model: The model at the rasterizer's conventions.
-        gaussians, cameras: What was compared (a part of a large scene where the oracle is the reference).
+        gaussians: Gaussians that were compared (a part of a large scene where the oracle is the reference).
+        cameras: Views that were compared, as they were cropped.
     """
 
     report: dict
@@ -111,21 +114,21 @@ def crossval(
     """Compare a rasterizer with the model that it claims to compute.
 
     Args:
-        rasterizer: From `drgs.lab.rasterizers.load_rasterizer`.
-        g: The scene.
+        rasterizer: The rasterizer, as `drgs.lab.rasterizers.load_rasterizer` returns it.
+        g: Gaussians of the scene.
         cameras: Pinhole cameras of one image size.
-        preset: What it claims to be, or `auto`: the preset whose image needs least to be explained.
+        preset: Preset that it claims to be, or `auto`: the one whose image needs least to be explained.
         fields: Settings that replace the preset's, `background` among them.
         tolerance: Relative L2 difference of gradients that agree; default 5e-4, and 5e-3 in float32.
-        entries: Parameters a group whose central differences are taken, where they are needed.
-        seed: Of the cotangents.
+        entries: Number of parameters a group whose central differences are taken, where they are needed.
+        seed: Seed of the cotangents.
         channels: Width of the plain colors whose gradient is compared, too; 0 for none.
-        advance: Called with each stage's name.
+        advance: Function that is called with each stage's name.
     Raises:
         ValueError: If cameras differ in size, or the rasterizer's function fails.
     Reference:
         The reference is `drgs.render` (float32, its errors in docs/numerics.md); for our own renderers it is the
-        float64 oracle, on a crop of every view of a large scene (crops.py).
+        float64 oracle, on a crop of every view of a large scene (`crops`).
     """
     say = advance or (lambda _: None)
     fields = dict(fields or {})
@@ -140,8 +143,8 @@ def crossval(
     places: list[Crop | None] = [None] * asked
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
         say("crops")
-        g, cameras, cropped = crops(g, cameras, starts[0].settings)
-        places = [*cropped]
+        g, cameras, found_places = crops(g, cameras, starts[0].settings)
+        places = [*found_places]
     dtype = getattr(rasterizer, "dtype", torch.float32)
     raw = with_pose(raw_of(g))
     signs = cotangents(cameras, seed)
@@ -176,21 +179,21 @@ def crossval(
     if not any(bool(alpha.any()) for _, alpha in drawn):
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
-    beside = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
-    judge(case, model, beside)
-    if not beside.agrees:
+    comparison = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
+    judge(case, model, comparison)
+    if not comparison.agrees:
         say("what the error looks like")
         models = {"the model at its conventions": model} if found.findings else {}
         models |= {f"preset {claimed}": found.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
-        beside.views = with_errors(beside, pictures, models, drawn_by)
-    not_offered = {} if POSE in beside.groups else {POSE: "its image has no gradient of them"}
+        comparison.views = with_errors(comparison, pictures, models, drawn_by)
+    not_offered = {} if POSE in comparison.groups else {POSE: "its image has no gradient of them"}
     if channels:
-        wide, reason = wide_gradients(case, model, beside, channels, seed, functools.partial(ties_of, model))
-        beside.groups |= wide
+        wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
+        comparison.groups |= wide
         not_offered |= {COLORS: reason} if reason else {}
-    worst = min((row.verdict for row in beside.groups.values()), key=VERDICTS.index)
-    if not beside.agrees:
+    worst = min((row.verdict for row in comparison.groups.values()), key=VERDICTS.index)
+    if not comparison.agrees:
         worst = min(worst, "model difference", key=VERDICTS.index)
     elif found.findings:
         worst = min(worst, "other convention", key=VERDICTS.index)
@@ -200,12 +203,12 @@ def crossval(
         "preset": claimed,
         "conventions": [dataclasses.asdict(finding) for finding in found.findings],
         "image": {
-            "agrees": beside.agrees,
+            "agrees": comparison.agrees,
             "before": found.before,
             "after": found.after,
-            "views": [dataclasses.asdict(row) for row in beside.views],
+            "views": [dataclasses.asdict(row) for row in comparison.views],
         },
-        "groups": {name: row.json() for name, row in beside.groups.items()},
+        "groups": {name: row.json() for name, row in comparison.groups.items()},
         "not_offered": not_offered,
         "reference": "float64 oracle" if oracle else "drgs.render",
         "gaussians": len(g),
@@ -214,9 +217,9 @@ def crossval(
         "cameras": [camera.name for camera in cameras],
         "size": [cameras[0].width, cameras[0].height],
         "crops": [None if place is None else dataclasses.asdict(place) for place in places],
-        "pixels": beside.ties.numel(),
-        "near_ties": int(beside.ties.sum()),
-        "near_ties_counted": beside.counted,
+        "pixels": comparison.ties.numel(),
+        "near_ties": int(comparison.ties.sum()),
+        "near_ties_counted": comparison.counted,
         "background": list(background),
         "tolerance": case.tolerance,
         "seed": seed,
@@ -229,7 +232,7 @@ def crossval(
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
         true, _ = _drawn(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
-    return Result(report, images, beside.groups, beside.views, found.findings, model, g, cameras)
+    return Result(report, images, comparison.groups, comparison.views, found.findings, model, g, cameras)
 
 
 def _scope(r: dict) -> list[str]:
@@ -275,3 +278,117 @@ def _drawn(model: ReferenceModel, raw: dict, camera: Camera, oracle: bool) -> tu
     with torch.no_grad():  # images alone are compared
         image, alpha = model.draw(raw, camera, oracle)
     return image.cpu(), alpha.cpu()
+
+
+# ------------------------------------------------------------------------- crops of large scenes
+
+
+def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tuple[Gaussians, list[Camera], list[Crop]]:
+    """The most varied square of each view, and the Gaussians that any of them sees.
+
+    Squares have 32 pixels a side, or 16 or 8 where the oracle would take long over what one of them sees.
+
+    Args:
+        g: Gaussians of the scene.
+        cameras: Pinhole cameras of one image size.
+        settings: Settings of the images that are looked at.
+    Returns:
+        The Gaussians; a camera a view that shows anything; and where each crop lies.
+    Raises:
+        ValueError: If no view shows a Gaussian.
+    """
+    drawn = []
+    for camera in cameras:
+        image, seen = _looked_at(g, camera, settings)
+        if bool(seen.any()):
+            drawn.append((camera, image))
+    if not drawn:
+        raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
+    for side in _SIDES:
+        parts = []
+        places = []
+        in_crops = []
+        for camera, image in drawn:
+            width, height = min(camera.width, side), min(camera.height, side)
+            x, y = _liveliest(image, width, height)
+            parts.append(cropped(camera, x, y, width, height))
+            places.append(Crop(x, y, width, height, [camera.width, camera.height]))
+            in_crops.append(_looked_at(g, parts[-1], settings)[1])
+        if max(int(x.sum()) for x in in_crops) * side**2 <= _CROP_PAIRS:
+            break
+    index = torch.nonzero(torch.stack(in_crops).any(0))[:, 0]
+    # Leaves of their own: gradients are to end here, not at the parameters of the whole scene.
+    fields = {name: getattr(g, name).detach()[index] for name in PARAMETERS}
+    return Gaussians(**fields, origin=g.origin), parts, places
+
+
+def _looked_at(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
+    """(H, W, 4) color and alpha, and (N,) bool: what is seen."""
+    with torch.no_grad():  # what is looked for is where to look
+        out = render(g, camera, settings, outputs=("visibility",))
+    assert out.visibility is not None  # asked for
+    return torch.cat([out.rgb, out.alpha[..., None]], -1).cpu(), out.visibility.cpu() > 0
+
+
+def _liveliest(image: torch.Tensor, width: int, height: int) -> tuple[int, int]:
+    """Corner (x, y) of the crop of an (H, W, 4) image whose colors and alpha vary most."""
+    x = image.double().permute(2, 0, 1)[None]  # the difference of two squares cancels in float32 where little varies
+
+    def mean(values: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(values, (height, width), stride=_STEP)
+
+    variance = (mean(x * x) - mean(x) ** 2).sum(1)[0]
+    row, column = divmod(int(variance.argmax()), variance.shape[1])
+    return _STEP * column, _STEP * row
+
+
+# ------------------------------------------------------------------------- images of many channels
+
+
+def _wide_gradients(
+    case: Case, model: ReferenceModel, rgb: Compared, channels: int, seed: int, near_ties: Callable[[int], torch.Tensor]
+) -> tuple[dict[str, GroupRow], str]:
+    """Gradients of an image of D channels: the same Gaussians with plain colors (N, D) instead of SH.
+
+    Rasterizers carry such channels along other paths than RGB (padding, chunks, a second pass), where gradients get
+    lost. One view is compared, on black. Of the geometry only what the RGB image has right is asked about again.
+
+    Args:
+        case: What was compared in RGB.
+        model: The model at the conventions that were found.
+        rgb: The comparison in RGB.
+        channels: Number D of channels.
+        seed: Seed of colors and cotangents.
+        near_ties: Function of a view's index: (H, W) bool, the pixels that hang on near ties.
+    Returns:
+        The row `colors`, and `GROUP, D channels` for every other group whose gradient is wrong here and was right in
+        RGB; or nothing, and the reason.
+    """
+    rasterizer, camera = case.rasterizer, case.cameras[case.first]
+    if isinstance(rasterizer, Dump):
+        return {}, "a dump has no image of them"
+    if not rgb.agrees:
+        return {}, "its image is of another model"
+    if (model.channels, model.transfer) != ("rgb", "none") or tuple(model.settings.background) not in (
+        tuple(case.background),
+        (0.0, 0.0, 0.0),
+    ):
+        return {}, "what it does to colors is a convention of three channels"
+    fixed = {name: x for name, x in case.raw.items() if name != POSE}
+    raw = with_colors(fixed, channels, seed)
+    black = (0.0,) * channels
+    u = cotangents([camera], seed, channels)
+    case.say(f"{channels} channels")
+    try:
+        picture, alpha = rasterizer.image(raw, camera, black)
+        rasterizer.gradient(raw, camera, black, u[0])
+    except Exception as error:  # whatever a function raises that knows three channels only
+        return {}, f"it draws no image of {channels} channels: {one_line(error)}"
+    wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0)
+    drawn = [_drawn(model, raw, camera, case.oracle)]
+    found = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
+    right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]
+    found.groups = {name: row for name, row in found.groups.items() if name == COLORS or name in right}
+    judge(wide, model, found)
+    rows = {COLORS: found.groups.pop(COLORS)}
+    return rows | {f"{k}, {channels} channels": x for k, x in found.groups.items() if x.verdict != "agreement"}, ""

@@ -20,10 +20,10 @@ from drgs.oracle import float64
 __all__ = ["Differences", "central"]
 
 _STEPS = 4  # each half of the one before
-_FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # in units of what changes the image by its own size
-_EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # of an image: rounding, and of float32 renderers in general
-_LEFT = 0.5  # of the pixels that an entry changes must be kept
-_JUMP = 0.05  # of the largest slope in the image: what no smooth change of half a step reaches
+_FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # first step, in units of what changes the image by its own size
+_EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # rounding of an image, of float32 renderers in general
+_LEFT = 0.5  # share of the pixels that an entry changes which must be kept
+_JUMP = 0.05  # share of the largest slope that no smooth change of half a step reaches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,12 +57,12 @@ def central(
     """Central differences at chosen entries, four steps each, accumulated in float64.
 
     Args:
-        rasterizer: Whose image is differenced.
+        rasterizer: The rasterizer whose image is differenced.
         raw: Raw parameters, float64.
         camera, background: The view.
-        cotangent: (H, W, 3).
-        entries: Group -> flat indices.
-        noise: Rounding of its image; default by its precision.
+        cotangent: (H, W, 3) weights of the image's values.
+        entries: Group -> flat indices of the parameters that are moved.
+        noise: Rounding of the rasterizer's image; default by its precision.
     """
     slopes: dict[str, list[list[torch.Tensor]]] = {}
     steps: dict[str, list[list[float]]] = {}
@@ -133,7 +133,7 @@ def _unit(raw: dict, camera: Camera, group: str, index: int) -> float:
     """The change of a parameter that changes its Gaussian's part of the image by about its own size."""
     if group not in ("means", "quats", POSE):
         return 1.0
-    # a step is a constant
+    # A step is a number: it scales what is measured and is differentiated by nothing.
     w2c = float64(camera.w2c).detach()
     scales = raw["log_scales"].exp()
     depths = raw["means"] @ w2c[2, :3] + w2c[2, 3]

@@ -29,12 +29,13 @@ _LARGEST = 4 << 30  # bytes of a dump
 
 @dataclasses.dataclass(frozen=True)
 class Dump:
-    """What a rasterizer wrote: see `load`.
+    """What a rasterizer wrote: see `drgs.lab.rasterizers.load_rasterizer`.
 
     Attributes:
-        name: The file.
-        images, alphas: (C, H, W, 3) and (C, H, W) float64.
-        cotangents: (C, H, W, 3).
+        name: Path of the file.
+        images: (C, H, W, 3) float64 colors.
+        alphas: (C, H, W) float64 opacities.
+        cotangents: (C, H, W, 3) weights that the gradients belong to.
         gradients: Group -> gradient of sum <cotangents, images>, raw parameters, all views together; and maybe
             `viewmats` (C, 6).
     """
@@ -63,6 +64,7 @@ def cotangents(cameras: list[Camera], seed: int, channels: int = 3) -> torch.Ten
 def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict[str, np.ndarray]:
     """What tells a scene from another: float32 raw parameters, world frame, cameras and background."""
     arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
+    # A file holds values, in float32 as rasterizers take them; a pose may be a leaf.
     arrays["viewmat"] = np.stack([float64(c.w2c).detach().float().numpy() for c in cameras])
     arrays["K"] = np.stack([np.asarray(c.K, np.float32) for c in cameras])
     arrays["width"] = np.int64(cameras[0].width)
@@ -95,7 +97,7 @@ def is_export(path: Path) -> bool:
 
 
 def _signature(names: Iterable[str]) -> np.ndarray:
-    """Of an export: numbers, for readers that make tensors of all that they find."""
+    """The mark of an export, as numbers: readers may make tensors of all arrays that they find."""
     return np.frombuffer(hashlib.sha256(" ".join(sorted(names)).encode()).digest(), np.uint8)
 
 

@@ -29,12 +29,12 @@ Builder = Callable[[np.random.Generator], Built]
 
 @dataclasses.dataclass(frozen=True)
 class ExtremeCase:
-    """One scene.
+    """One scene at an extreme.
 
     Attributes:
-        name: As printed.
-        build: rng -> (Gaussians, Camera).
-        preset: Where the settings come from.
+        name: Name of the case, as it is printed.
+        build: Function of a random generator: Gaussians and camera.
+        preset: Preset that the settings start from.
         fields: Settings that differ from the preset.
         bvh: Whether `bvh` keeps the bounds as well; `rounds` where it keeps those of its rounding (docs/numerics.md),
             `warns` where it keeps none and says so, `skip` where it is not run.
@@ -54,12 +54,12 @@ class ExtremeCase:
 
     @property
     def settings(self) -> RenderSettings:
-        """On `tiles`."""
+        """Render settings of the case, for the traversal `tiles`."""
         return RenderSettings.preset(self.preset, **self.fields)
 
     @property
     def traversals(self) -> tuple[str, ...]:
-        """Those that it is run on."""
+        """Traversals that the case is run on."""
         return ("tiles",) if self.bvh == "skip" or self.settings.planar else ("tiles", "bvh")
 
 
@@ -98,7 +98,7 @@ def _on_axes(rng: np.random.Generator) -> Built:
     g = random_gaussians(rng, 12, 4)
     cam = random_camera(rng, SIZE, turn=0.0)
     places = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]
-    with torch.no_grad():
+    with torch.no_grad():  # leaves are changed in place
         cam.w2c[:3, 3] = torch.tensor([0.125, -0.125, 4.0])  # as a float32 mean can be
         for i, place in enumerate(places):
             g.means[i] = torch.tensor(cam.center + 0.25 * np.array(place))
@@ -182,7 +182,7 @@ def _equal_depths(rng: np.random.Generator) -> Built:
     """A plane of equal camera z, mirrored pairs at equal distance."""
     g = random_gaussians(rng, 12, 4)
     cam = random_camera(rng, SIZE, turn=0.0)
-    with torch.no_grad():
+    with torch.no_grad():  # leaves are changed in place
         g.means[:, 2] = 0.5
         g.means[:, 0] = 0.1 + 0 * g.means[:, 0]
         g.means[:, 1] = torch.linspace(-0.8, 0.8, 12)
@@ -214,7 +214,7 @@ def _focal(focal: float) -> Builder:
         cam = random_camera(rng, SIZE, focal=focal, turn=0.0)
         if focal > 100:
             # The image spans 1e-4 of the distance.
-            with torch.no_grad():
+            with torch.no_grad():  # leaves are changed in place
                 g.means[:, :2].mul_(1e-4).sub_(torch.tensor([0.1, -0.1]))
                 g.log_scales.fill_(math.log(5e-5)).add_(0.3 * torch.tensor(rng.normal(size=(12, 3))))
         return g, cam
@@ -232,7 +232,7 @@ def _layers(rng: np.random.Generator, n: int = 1000) -> Built:
     """Opaque layers: T underflows within a few of them."""
     g = random_gaussians(rng, n, 1)
     cam = random_camera(rng, SIZE)
-    with torch.no_grad():
+    with torch.no_grad():  # leaves are changed in place
         g.log_scales[:] = torch.tensor([0.4, 0.5, 0.7]).log()
         g.logit_opacities[:] = 6.0
     return g, cam
@@ -284,7 +284,7 @@ def _at_near(near: float) -> Builder:
 def _translucent_layers(rng: np.random.Generator) -> Built:
     """Layers that end a ray at a transmittance of 1e-4 and are not clamped, so that no product is a tie."""
     g, cam = _layers(rng, 300)
-    with torch.no_grad():
+    with torch.no_grad():  # leaves are changed in place
         g.logit_opacities[:] = torch.tensor(rng.uniform(0, 2, len(g)))
     return g, cam
 

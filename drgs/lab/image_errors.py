@@ -43,12 +43,12 @@ PATTERNS = {
 OFF = 1e-3
 """A pixel that differs by more is off."""
 _PLACES = ("border", "edges", "few pixels", "none")
-_FOUND = 0.9  # of the squared error that a pattern must explain
-_AS_GOOD = 0.01  # of the squared error: a simpler pattern that explains that little less is taken
-_SIDE = 0.1  # of the width or height: what a border is at most
-_STEEP = 0.1  # of the pixels: those of the largest gradient
-_FEW = 0.05  # of the pixels
-_SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)  # of blurs, in pixels
+_FOUND = 0.9  # share of the squared error that a pattern must explain
+_AS_GOOD = 0.01  # share of the squared error: a simpler pattern that explains so little less is taken
+_SIDE = 0.1  # share of the width or height that a border is at most
+_STEEP = 0.1  # share of the pixels, those of the largest gradient
+_FEW = 0.05  # share of the pixels
+_SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)  # standard deviations of blurs, in pixels
 _MOVES = 20  # steps of the search for a shift, each about squares the error of the one before
 _MOVED = 1e-4  # pixels that the last of these steps moves something by
 
@@ -59,7 +59,7 @@ class Pattern:
 
     Attributes:
         name: A key of `PATTERNS`.
-        what: In words, to follow "the image of the model".
+        what: The pattern in words that follow "the image of the model".
         explained: Share of the squared error; NaN for `none`.
     """
 
@@ -91,15 +91,16 @@ class _Case:
 
 
 def error_row(
-    wrong: np.ndarray, model: np.ndarray, counts: np.ndarray, pattern: Pattern, beside: str
+    wrong: np.ndarray, model: np.ndarray, counts: np.ndarray, pattern: Pattern, changed: str
 ) -> ErrorRow | None:
-    """Where an image is off the model's, with a pattern; None where no pixel is.
+    """The place where an image is off the model's, with a pattern; None where no pixel is off.
 
     Args:
-        wrong, model: (H, W, 3).
+        wrong: (H, W, 3) image that is looked at.
+        model: (H, W, 3) image of the model.
         counts: (H, W) bool, the pixels that count.
-        pattern: Of `pattern_of`.
-        beside: What the pattern changes, in words.
+        pattern: Pattern of the error, as `pattern_of` finds it.
+        changed: What the pattern changes, in words.
     """
     error = np.abs(wrong - model).max(-1) * counts
     ys, xs = np.nonzero(error > OFF)
@@ -115,7 +116,7 @@ def error_row(
         rasterizer=[float(v) for v in wrong[y, x]],
         model=[float(v) for v in model[y, x]],
         pattern=pattern.name,
-        what=f"the image of {beside}, {pattern.what}" if known else pattern.what,
+        what=f"the image of {changed}, {pattern.what}" if known else pattern.what,
         explained=pattern.explained if known else None,
     )
 
@@ -139,9 +140,10 @@ def pattern_of(
     """The simplest pattern that makes a wrong image of the right one.
 
     Args:
-        wrong, right: (H, W, 3).
-        alpha: (H, W), of the right one.
-        background: RGB of both.
+        wrong: (H, W, 3) image that is looked at.
+        right: (H, W, 3) image that it should be.
+        alpha: (H, W) opacity of the right image.
+        background: RGB background of both.
         counts: (H, W) bool, the pixels that count.
     """
     case = _Case(*(np.asarray(x, np.float64) for x in (wrong, right, alpha, background)), np.asarray(counts, bool))
@@ -206,7 +208,7 @@ def _backgrounds(case: _Case) -> Iterator[tuple]:
 
 
 def _transfers(case: _Case) -> Iterator[tuple]:
-    right = case.right.clip(0)
+    right = case.right.clip(0)  # a power of a negative color is NaN
     low, high = right <= 0.0031308, right <= 0.04045
     encoded = np.where(low, 12.92 * right, 1.055 * np.maximum(right, 1e-9) ** (1 / 2.4) - 0.055)
     yield "transfer", "encoded as sRGB", encoded
@@ -245,7 +247,7 @@ def _moves(case: _Case) -> Iterator[tuple]:
                 move[:count] += step
                 if np.abs(step * (1, 1, max(width, height))[:count]).max() < _MOVED:
                     break
-            move[:2] = move[:2].clip(-width, width)
+            move[:2] = move[:2].clip(-width, width)  # a search that diverged stays in numbers that can be warped by
             made, known = _moved(case.right, move)
             if (case.counts & known).sum() > 0.25 * case.counts.sum():
                 ends.append((case.explained(made, known), move, made, known))
@@ -260,7 +262,7 @@ def _moved(image: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     height, width = image.shape[:2]
     dx = move[0]
     dy = move[1]
-    zoom = 1 + float(np.clip(move[2], -0.5, 0.5))
+    zoom = 1 + float(np.clip(move[2], -0.5, 0.5))  # at -1 nothing would be left, beyond it all is mirrored
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     matrix = np.column_stack([zoom * np.eye(2), middle - zoom * middle + (dx, dy)])
 
@@ -290,7 +292,7 @@ def _blank(case: _Case) -> Iterator[tuple]:
 
 
 def _place(case: _Case) -> Pattern | None:
-    """Where an error lies that is like nothing known."""
+    """The kind of place where an error lies that is like nothing known; None where it lies everywhere."""
     error = ((case.wrong - case.right) ** 2).sum(-1) * case.counts
     total = error.sum()
     sides = {"left": (1, 1), "right": (1, -1), "top": (0, 1), "bottom": (0, -1)}
@@ -316,7 +318,7 @@ def _place(case: _Case) -> Pattern | None:
 def _ratio(x: np.ndarray, y: np.ndarray) -> float:
     """The number times x that is nearest to y."""
     square = float((x * x).sum())
-    return float((x * y).sum()) / square if square > 1e-12 * x.size else 0.0
+    return float((x * y).sum()) / square if square > 1e-12 * x.size else 0.0  # of a black image: no number is nearest
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -1,9 +1,9 @@
 """How much of a rasterizer's difference to exact ray tracing each of its approximations explains.
 
 From a rasterizer's settings to preset `exact` one thing is switched at a time, in a stated order and in its reverse,
-and each step's image and gradient are kept. With the step ``s_k = y_k - y_{k-1}`` and ``total = y_end - y_start`` a
-rung's share is ``<s_k, total> / |total|^2``: shares sum to 1, one above 1 or below 0 says that steps cancel, and the
-two orders agree where steps do not interact. Gradients are ``J^T u`` of one fixed Rademacher cotangent u, group by
+and each step's image and gradient are kept. With the step `s_k = y_k - y_{k-1}` and `total = y_end - y_start` a
+rung's share is `<s_k, total> / |total|^2`: shares sum to 1, one above 1 or below 0 says that steps cancel, and the
+two orders agree where steps do not interact. Gradients are `J^T u` of one fixed Rademacher cotangent u, group by
 group in raw parameters.
 
 The order is that of `RUNGS`. Its reverse is not always legal: dilation, culling and the field-of-view clamp exist
@@ -66,14 +66,15 @@ def ladder(
     Args:
         g: N Gaussians.
         cameras: Pinhole cameras; the images of all are one vector. Crops are of the first.
-        start: The rasterizer, for example `RenderSettings.preset("gsplat")`; its background stays.
+        start: Settings of the rasterizer, for example `RenderSettings.preset("gsplat")`; its background stays.
         crop: Width and height in pixels of the crops, in the middle and in a corner; 0 leaves crops, and with them
             float32 and the far end, out.
-        seed: Of the cotangent.
-        volume: Also the far end, on the crops: response peak to integral, and sorting to the true volume.
-        gradients: Also the gradients by group.
+        seed: Seed of the cotangent.
+        volume: Whether the far end is measured, too, on the crops: response peak to integral, and sorting to the true
+            volume.
+        gradients: Whether gradients are measured, too, by group.
         advance: Called after each image that is computed.
-        pictures: Of an earlier call with the same scene, cameras, crop and seed.
+        pictures: Images of an earlier call with the same scene, cameras, crop and seed, which are not computed again.
     Returns:
         A JSON-serializable dict. `image`: the ladder over all pixels in float32, with lists `forward` and `reverse` of
         rungs, and `total`, each as `ladder_table.Step` says.

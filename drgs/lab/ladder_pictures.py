@@ -50,7 +50,7 @@ class Pictures:
         g: N Gaussians.
         cameras: Pinhole cameras, at least one.
         crop: Width and height in pixels of the crops of the first camera; 0 for none.
-        seed: Of the cotangent.
+        seed: Seed of the cotangent.
         gradients: Whether J^T u is wanted.
         advance: Called after each image.
     """
@@ -70,7 +70,7 @@ class Pictures:
             )
         if crop < 0:
             raise ValueError(f"ladder: crop must be >= 0 pixels, got {crop}; correct it")
-        # Each picture makes leaves of its own.
+        # Each picture makes leaves of its own; a graph behind these would be walked by each of them.
         self.g = g.detach()
         self.cameras = list(cameras)
         self.crop = crop
@@ -118,6 +118,7 @@ class Pictures:
         """Images as rows of pixels, and J^T u by backward mode where gradients are wanted."""
         gradient = {}
         if self.gradients:
+            # In float64, so that rounding of the sum is no rung of the ladder.
             loss: Any = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
             leaves = [g.parameters()[name] for name in PARAMETERS]
             found: Sequence[torch.Tensor | None] = [None] * len(leaves)
@@ -164,6 +165,6 @@ def _joined(states: list[State]) -> State:
 def constant_colors(g: Gaussians, camera: Camera) -> Gaussians:
     """The same image with colors computed beforehand, from directions that are constants."""
     offset = torch.from_numpy(np.asarray(camera.center, np.float64) - np.asarray(g.origin, np.float64))
-    towards = g.means.detach().cpu().double() - offset
+    towards = g.means.detach().cpu().double() - offset  # this is the approximation: the mean gets nothing through it
     base = (sh_colors(g.sh.cpu().double(), towards) - 0.5) * np.sqrt(4 * np.pi)
     return g.replace(sh=base.to(g.sh.dtype).to(g.sh.device)[:, None, :])

@@ -13,12 +13,13 @@ __all__ = ["Step", "table"]
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Of a step's gradient by one parameter; None where the divisor is 0.
+    """How large a step's gradient by one parameter is; None where the divisor is 0.
 
     Attributes:
         norm: |step|.
         share: <step, total> / |total|^2.
-        of_total, of_exact: |step| / |total|, |step| / |exact|.
+        of_total: |step| / |total|.
+        of_exact: |step| / |exact|.
     """
 
     norm: float
@@ -28,8 +29,8 @@ class Size:
 
     @classmethod
     def of(cls, step: torch.Tensor, total: torch.Tensor, exact: torch.Tensor) -> Size:
-        """Of three tensors of one shape."""
-        step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))
+        """Measure a step beside the whole way and the exact end, three tensors of one shape."""
+        step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))  # norms over millions of values
         whole = float(total.norm())
         truth = float(exact.norm())
         size = float(step.norm())
@@ -46,10 +47,11 @@ class Step:
     """One rung; without its first two fields, the whole way.
 
     Attributes:
-        rung: Its name.
+        rung: Name of the rung.
         switched: Field of the settings -> [before, after]; None of a step outside of the ladder.
-        rms, max: Of the image, over pixels and channels.
-        norm, share, of_total, of_exact: Of the image, as of a gradient (`Size`).
+        rms: Root of the mean square of the image's change, over pixels and channels.
+        max: Largest change of the image.
+        norm, share, of_total, of_exact: Size of the image's change, as `Size` says it of a gradient.
         gradient: Parameter -> `Size`; empty without gradients.
     """
 
@@ -65,7 +67,7 @@ class Step:
 
     @classmethod
     def of(cls, step: State, total: State, exact: State, rung: str | None = None, switched: dict | None = None) -> Step:
-        """From the difference that it makes, that of the whole way, and its end."""
+        """Measure the difference that a step makes beside that of the whole way and the way's end."""
         return cls(
             rung=rung,
             switched=switched,

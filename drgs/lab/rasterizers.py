@@ -32,13 +32,13 @@ class Rasterizer:
     """A function that draws.
 
     Attributes:
-        name: As the user gave it.
+        name: Name of the rasterizer, as the user gave it.
         draw: (raw parameters by group, camera, background) -> image (H, W, 3), alpha (H, W); differentiable. With
             `colors` (N, D) instead of `sh` the image has D channels and the background D zeros; with `viewmats`, a
             motion of the camera, its gradient arrives there.
-        dtype: Of the parameters that it is given.
-        device: Where it wants them.
-        preset: The preset that it is, if it is ours.
+        dtype: Precision of the parameters that it is given.
+        device: Device that it wants them on.
+        preset: Preset that it is, if it is ours.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Rasterizer:
         """Image and alpha without derivatives, float64 on the CPU."""
         with torch.no_grad():
             image, alpha = self.draw(self.taken(raw), camera, background)
-        # A function may turn gradients on for itself.
+        # A function may turn gradients on for itself: its graph would be kept with the image.
         return image.detach().double().cpu(), alpha.detach().double().cpu()
 
     def gradient(self, raw: dict, camera: Camera, background: tuple, cotangent: torch.Tensor) -> dict:
@@ -73,12 +73,13 @@ class Rasterizer:
             # It may make an array of the pose, or refuse one that wants a gradient: the others are asked for alone.
             fixed = {name: x for name, x in raw.items() if name != POSE}
             return {**self.gradient(fixed, camera, background, cotangent), POSE: None}
-        # Numbers from here on.
+        # Gradients are numbers from here on; a function may have asked for a graph of them.
         return {name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, found, strict=True)}
 
     def taken(self, raw: dict) -> dict:
         """Copies of the parameters as it wants them."""
-        return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}  # new leaves
+        # New leaves: gradients are to end at these, whatever the raw parameters were made of.
+        return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}
 
 
 def load_rasterizer(
@@ -92,7 +93,8 @@ def load_rasterizer(
             file .npz or .safetensors with `image` (C,H,W,3), `alpha` (C,H,W), `cotangent` (C,H,W,3), `grad_means`,
             `grad_quats`, `grad_log_scales`, `grad_logit_opacities`, `grad_sh` (of raw parameters), maybe `grad_viewmat`
             (C,4,4), and the arrays of the scene as `export` wrote them (C = 1 may be left out).
-        g, cameras: What a dump must be of.
+        g: Scene that a dump must be of.
+        cameras: Views that a dump must be of.
         fields: Settings that hold whatever the preset is: ours are drawn with them, a dump is of their background.
     Returns:
         A `Rasterizer` or a `Dump`.
@@ -137,7 +139,7 @@ def function(call: Callable, name: str) -> Rasterizer:
     open_ended = any(p.kind is p.VAR_KEYWORD for p in accepted.values())
 
     def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-        """Its image, or one line that says how it failed."""
+        """The function's image and alpha, or one line that says how it failed."""
         means = raw["means"]
         camera = posed(raw, camera)
         like = {"dtype": means.dtype, "device": means.device}

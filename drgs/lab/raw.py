@@ -33,18 +33,19 @@ COLORS = "colors"  # (N, D) in place of `sh`
 
 def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
     """Raw parameters in float64, world frame, without a graph: the leaves of every gradient."""
+    # A graph behind them would make these no leaves; float64, so that steps of central differences are exact.
     raw = {name: getattr(g, name).detach().double().cpu() for name in PARAMETERS}
     raw["means"] = raw["means"] + torch.tensor(np.asarray(g.origin, float))
     return raw
 
 
 def with_pose(raw: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The same, and the motion of a view, which is none."""
+    """Raw parameters together with the motion of a view, which is none."""
     return {**raw, POSE: torch.zeros(6, dtype=torch.float64)}
 
 
 def with_colors(raw: dict[str, torch.Tensor], channels: int, seed: int) -> dict[str, torch.Tensor]:
-    """The same with random colors (N, D) in [0, 1] instead of SH."""
+    """Raw parameters with random colors (N, D) in [0, 1] instead of SH."""
     generator = torch.Generator().manual_seed(seed)
     colors = torch.rand(len(raw["means"]), channels, generator=generator).double()
     return {name: x for name, x in raw.items() if name != "sh"} | {COLORS: colors}
@@ -58,7 +59,7 @@ def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
     """
     if POSE not in raw:
         return camera
-    # the motion is the parameter, not the matrix
+    # The motion is the parameter, not the matrix: a camera whose pose is a leaf gets no gradient here.
     w2c = float64(camera.w2c).detach()
     twist = float64(raw[POSE])
     turn = twist[:3]
@@ -75,7 +76,7 @@ def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
 
 def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
     """Median depth of the means in front of a camera, 1 where there is none: a unit, so without a derivative."""
-    # a unit is a constant
+    # A unit is a constant: how the median moves with the means is no part of the motion's gradient.
     w2c = float64(camera.w2c).detach()
     means = float64(raw["means"]).detach()
     depths = means @ w2c[2, :3] + w2c[2, 3]

@@ -25,9 +25,9 @@ __all__ = ["ORDERS", "ReferenceModel"]
 
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
 _WINDOW = 16  # pixels a side
-_NEAR = 2e-6  # of the distance: some ten times what float32 loses where it computes a depth
-_EFFECT = 1e-5  # of a weight: what moves less moves no gradient by what counts
-_COMPENSATION_FLOOR = 0.005**2  # of the ratio of determinants
+_NEAR = 2e-6  # share of the distance: some ten times what float32 loses where it computes a depth
+_EFFECT = 1e-5  # part of a weight: what moves less moves no gradient by what counts
+_COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,24 +35,24 @@ class ReferenceModel:
     """A preset and what is unusual about it.
 
     Attributes:
-        settings: Response, order, cut-offs, background.
-        quaternions: `wxyz`, or `xyzw`: how the four numbers are read.
-        rotation: `as given`, or `transposed`.
+        settings: Response, order, cut-offs and background.
+        quaternions: Order in which the four numbers are read, `wxyz` or `xyzw`.
+        rotation: Whether the rotation is taken `as given` or `transposed`.
         scales: `linear`, or `exponential`: exp is applied to what already is a standard deviation.
         opacities: `linear`, or `sigmoid`: the logistic function is applied to what already is an opacity.
         compensation: `none`, or opacities times sqrt(det / det after dilation) as in anti-aliased modes: `full`, or `at
             least 0.005`.
-        direction: Where SH are evaluated: `to the mean`, `to the camera` (the opposite), or `camera frame` (to the
-            mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
+        direction: Direction that SH are evaluated in: `to the mean`, `to the camera` (the opposite), or `camera frame`
+            (to the mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
         direction_gradient: Whether the mean gets a gradient through that direction.
-        sh_degree: Bands above it are left out.
+        sh_degree: Largest SH degree that counts; bands above it are left out.
         sh_sign: Coefficients whose sign is turned: `none`, `odd m` (a basis without the factor (-1)^m), or a band.
         channels: Order of the color channels of the image, or of the Gaussians' colors alone (`bgr, not behind`).
         transfer: `none`, or `sRGB to linear`: applied to the finished image, or to what is in front of the background
             (`sRGB to linear, not behind`).
-        pixel_center: Of column 0 and row 0.
-        flip: `none`, `vertical`, `horizontal`.
-        pose: `w2c`, or `c2w`: how the camera matrix is read.
+        pixel_center: Coordinates of the center of column 0 and row 0, in pixels.
+        flip: How the image is mirrored: `none`, `vertical`, `horizontal`.
+        pose: How the camera matrix is read, `w2c` or `c2w`.
     """
 
     settings: RenderSettings
@@ -77,8 +77,8 @@ class ReferenceModel:
         Args:
             raw: Raw parameters by group, float64, and maybe a motion of the camera, `viewmats`. With `colors` (N, D)
                 instead of `sh` the image has D channels, on black.
-            camera: Pinhole.
-            oracle: By the float64 oracle instead of the renderer.
+            camera: Pinhole camera.
+            oracle: Whether the float64 oracle draws instead of the renderer.
         """
         rows: dict[int, list] = {}
         for (y, _), image, alpha in self._pieces(raw, camera, oracle):
@@ -88,7 +88,7 @@ class ReferenceModel:
 
     def gradient(self, raw: dict, camera: Camera, cotangent: torch.Tensor, oracle: bool = False) -> dict:
         """float64 gradient of <cotangent, image> by group."""
-        # New leaves, whatever the raw parameters came from.
+        # New leaves: gradients are to end at these, whatever the raw parameters were made of.
         leaves = {name: x.detach().clone().requires_grad_() for name, x in raw.items()}
         total = {name: torch.zeros_like(x) for name, x in raw.items()}
         cotangent = self._flipped(cotangent)  # of what is not flipped yet
@@ -138,10 +138,10 @@ class ReferenceModel:
         if image.shape[-1] == 3 and self.channels in ORDERS:
             image = image[..., ["rgb".index(c) for c in self.channels]]
         if self.transfer != "none":
-            behind = 0.0
+            background = 0.0
             if self.transfer.endswith("behind"):
-                behind = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
-            image = _linear(image - behind) + behind
+                background = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
+            image = _linear(image - background) + background
         return image, alpha
 
     def _flipped(self, picture: torch.Tensor) -> torch.Tensor:
@@ -167,7 +167,7 @@ class ReferenceModel:
         """The raw parameters that have this model's meaning in ours."""
         raw = dict(raw)
         if self.quaternions == "xyzw":
-            raw["quats"] = raw["quats"][:, [3, 0, 1, 2]]
+            raw["quats"] = raw["quats"][:, [3, 0, 1, 2]]  # its real part stands last, ours first
         if self.rotation == "transposed":
             raw["quats"] = raw["quats"] * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
         if self.scales == "exponential":
@@ -178,7 +178,7 @@ class ReferenceModel:
             # The root has no derivative at 0; gsplat has no floor, and 1e-6 of an opacity is not drawn by anyone.
             floor = 1e-12 if self.compensation == "full" else _COMPENSATION_FLOOR
             alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings, floor)
-            # Logits of 0 and 1 are infinite.
+            # Logits of 0 and 1 are infinite; 1e-12 of an opacity is drawn by nobody.
             raw["logit_opacities"] = torch.logit(alpha.clamp(1e-12, 1 - 1e-12))
         if COLORS in raw:
             return raw
@@ -230,9 +230,10 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
     det = torch.linalg.cross(a, b).square().sum(-1)
     trace = (a * a + b * b).sum(-1)
     ratio = det / (det + s.dilation * (trace + s.dilation))
-    return ratio.clamp_min(floor).sqrt()
+    return ratio.clamp_min(floor).sqrt()  # at 0 the root's derivative is infinite
 
 
 def _linear(x: torch.Tensor) -> torch.Tensor:
     """Linear light of sRGB values."""
+    # The power is evaluated where it is not taken, too: below -0.055 it is NaN, and so would the gradient be.
     return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)

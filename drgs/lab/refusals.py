@@ -25,9 +25,9 @@ class Refusal:
     """One kind of such input.
 
     Attributes:
-        name: As printed.
-        attempts: () -> pairs of a call and a text that its message must have.
-        warns: Whether the message is a warning; else a ValueError.
+        name: Name of the kind, as it is printed.
+        attempts: Function that yields pairs of a call and a text that its message must have.
+        warns: Whether the message is a warning; else it is a ValueError.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Refusal:
 
 def _scene() -> tuple[Gaussians, Camera]:
     rng = np.random.default_rng(0)
-    # No leaves: their values are changed in place.
+    # No leaves: their values are changed in place, which torch refuses of leaves.
     return random_gaussians(rng, 4, 4, 2).detach(), random_camera(rng, (9, 7))
 
 
@@ -74,13 +74,13 @@ def _broken_camera() -> Attempts:
     """A camera is refused when it is made, and once more when its pose has been moved since."""
     g, cam = _scene()
     for value in (math.nan, math.inf):
-        # changed in place, which no leaf can be
+        # Copies without a graph: their values are changed in place, which torch refuses of leaves.
         K = cam.K.copy()
         w2c = cam.w2c.detach().clone()
         K[0, 0] = w2c[0, 3] = value
         yield lambda K=K: dataclasses.replace(cam, K=K), "K must"
         yield lambda w2c=w2c: dataclasses.replace(cam, w2c=w2c), "pose must be finite"
-        moved = dataclasses.replace(cam, w2c=cam.w2c.detach().clone())
+        moved = dataclasses.replace(cam, w2c=cam.w2c.detach().clone())  # no leaf: it is changed in place
         moved.w2c[0, 3] = value  # a pose that an optimizer moved
         for traversal in ("tiles", "bvh"):
             settings = RenderSettings.preset("exact", traversal=traversal)

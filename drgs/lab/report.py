@@ -95,9 +95,9 @@ def html(report: dict, images: list[dict], ladder: str = "") -> str:
     """The page.
 
     Args:
-        report: Of `drgs.crossval.Result`, with `scene` and `source`.
-        images: Of the same: a dict a view of (H, W, 3) arrays.
-        ladder: A table in Markdown, its cells without markup.
+        report: The `report` of a `drgs.crossval.Result`, with `scene` and `source`.
+        images: The `images` of that result: a dict a view of (H, W, 3) arrays.
+        ladder: Table of the ladder in Markdown, its cells without markup.
     """
     from jinja2 import Environment
     from markupsafe import Markup

@@ -26,15 +26,16 @@ class AlphaRow:
 
 @dataclasses.dataclass(frozen=True)
 class ErrorRow:
-    """Where an image is wrong, and what its error looks like.
+    """The place where an image is wrong, and what its error looks like.
 
     Attributes:
-        pixels: How many differ by more than 0.001 and count.
-        box: The smallest that holds them: x and y of its first and of its last pixel.
-        x, y: Of the worst of them.
-        rasterizer, model: Its RGB in either image.
+        pixels: Number of pixels that count and differ by more than 0.001.
+        box: The smallest rectangle that holds them: x and y of its first and of its last pixel.
+        x, y: Column and row of the worst of them.
+        rasterizer: RGB of that pixel in the rasterizer's image.
+        model: RGB of that pixel in the model's image.
         pattern: One of `drgs.lab.image_errors.PATTERNS`.
-        what: The same in words, with its numbers.
+        what: The pattern in words, with its numbers.
         explained: Share of the squared error that the pattern explains, or that lies where it says; null for `none`.
     """
 
@@ -55,12 +56,13 @@ class ViewRow:
 
     Attributes:
         view: The camera's name, or its number where it has none.
-        rms, max: Of the difference.
-        share: Of the pixels that differ by more than 0.001.
-        alpha: Of the difference of alphas.
-        near_ties: Pixels that do not count.
-        worst: Up to five pixels.
-        error: Where it is wrong and how; null where the image is the model's.
+        rms: Root of the mean square of the difference.
+        max: Largest difference.
+        share: Share of the pixels that differ by more than 0.001.
+        alpha: Difference of the alphas.
+        near_ties: Number of pixels that do not count.
+        worst: Up to five pixels of the largest difference.
+        error: Place and look of the error; null where the image is the model's.
     """
 
     view: str
@@ -87,12 +89,14 @@ class OwnRow:
 
     Attributes:
         entries: Flat indices of the group's parameters.
-        central, uncertainty, gradient: At each of them.
+        central: Central difference at each of them.
+        uncertainty: Error bar of each central difference.
+        gradient: The rasterizer's gradient at each of them.
         relative: L2 norm of the error over that of the differences.
-        left_out: Entries that did not converge.
+        left_out: Number of entries that did not converge.
         bug: Whether the gradient contradicts the differences.
-        what: In words.
-        pixels_left_out: That jump on one of the steps.
+        what: The finding in words.
+        pixels_left_out: Number of pixels that jump on one of the steps.
     """
 
     entries: list[int]
@@ -112,13 +116,14 @@ class GroupRow:
 
     Attributes:
         verdict: One of `crossval.VERDICTS`, None while it is to be explained.
-        why: In words.
-        worst: Up to five Gaussians.
+        why: The reason in words.
+        worst: Up to five Gaussians of the largest difference.
         relative: L2 norm of the difference over that of the model's gradient.
-        cosine, bias: Between the two; how much too long the gradient is along the model's.
+        cosine: Cosine of the angle between the two gradients.
+        bias: How much too long the gradient is along the model's.
         max: Largest difference.
-        norm: Of the model's gradient.
-        differences: What decided, where they were asked for.
+        norm: L2 norm of the model's gradient.
+        differences: Central differences that decided, where they were asked for.
     """
 
     verdict: str | None
@@ -137,13 +142,13 @@ class GroupRow:
         self.why = why
 
     def json(self) -> dict:
-        """Without `differences` where there are none."""
+        """The row as crossval.json holds it, without `differences` where there are none."""
         return {name: x for name, x in dataclasses.asdict(self).items() if name != "differences" or x is not None}
 
 
 @dataclasses.dataclass(frozen=True)
 class Crop:
-    """Where a crop lies in its view: a corner, its size, and the view's (width, height), in pixels."""
+    """The place of a crop in its view: a corner, its size, and the view's (width, height), in pixels."""
 
     x: int
     y: int

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.sizes import cropped
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
@@ -34,7 +36,7 @@ BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fi
 """What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
 
 _DENSE = 3_000_000  # pixels^2 x Gaussians: the dense Jacobian of that takes the oracle a few seconds
-_ROUNDING = 8 * 6e-8  # of `bvh`, times distance / smallest sigma: docs/numerics.md
+_ROUNDING = 8 * 6e-8  # rounding of `bvh`, times distance / smallest sigma: docs/numerics.md
 
 _CRITERIA = ("logdet", "eig", "trace_cov")
 
@@ -44,13 +46,14 @@ class StressRow:
     """One case on one traversal.
 
     Attributes:
-        case, traversal: Their names; refusals have the traversal `all`.
-        image, gradient, forward, duality, fisher: Errors, see `BOUNDS`; None where there is none.
-        group: That of the worst gradient.
-        finite: Every output, derivative and entry of the information is; None where nothing was computed.
+        case: Name of the case.
+        traversal: Name of the traversal; `all` of a refusal.
+        image, gradient, forward, duality, fisher: Errors that `BOUNDS` limits; None where there is none.
+        group: Parameter group of the worst gradient.
+        finite: Whether every output, derivative and entry of the information is; None where nothing was computed.
         verdict: `holds`, `warns` (refused or warned about, as documented) or `FAILS`.
         remark: What a reader should know, messages included.
-        seconds: Of the renderer, compilation of its kernels included.
+        seconds: Time of the renderer, compilation of its kernels included.
     """
 
     case: str
@@ -92,9 +95,10 @@ class Truth:
     """A case, and what the oracle says about it.
 
     Attributes:
-        g, cam: The scene, leaves.
-        oracle: Images and derivatives.
-        view: The camera whose image is compared in Fisher information; None where none is.
+        g: Gaussians of the scene, all leaves.
+        cam: Camera of the scene, whose pose is a leaf.
+        oracle: Images and derivatives of the oracle.
+        view: Camera whose image is compared in Fisher information; None where none is.
         information: Group -> diagonal of the dense Jacobian's J^T J, of `view`.
         remark: What `view` leaves out, and why.
     """
@@ -198,7 +202,7 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
 
 def _rounded(g: Gaussians, cam: Camera) -> dict[str, float]:
     """`BOUNDS` of hits in float32 world space; derivatives have four times the error, their squares twice that."""
-    # Numbers for a bound, no part of a graph.
+    # A bound is a number: `float` of a tensor with a graph would warn.
     far = (g.means.detach().double() - torch.tensor(cam.center - g.origin)).norm(dim=1)
     unit = _ROUNDING * float((far / g.scales.detach().double().amin(1)).max())
     more = {"image": unit, "gradient": 4 * unit, "forward": 4 * unit, "fisher": 8 * unit}
@@ -277,10 +281,7 @@ def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
                 best = max(best, (low * (right - left + 1), left, bottom + 1 - low, right - left + 1, low))
     _, x, y, w, h = (int(v) for v in best)
     w, h = (w, max(1, min(h, most // w))) if w <= most else (most, 1)
-    K = cam.K.copy()
-    K[0, 2] = K[0, 2] - x
-    K[1, 2] = K[1, 2] - y
-    return dataclasses.replace(cam, K=K, width=w, height=h)
+    return cropped(cam, x, y, w, h)
 
 
 def refused(case: Refusal) -> StressRow:

@@ -27,24 +27,26 @@ from drgs.lab.tradeoff_rows import (
     rows_of,
     why_skipped,
 )
+from drgs.sizes import by_share
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
+    from drgs.information.choices import Method
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["clocked", "measure", "placed"]
+__all__ = ["clocked", "measure", "placed", "scaled_diagonal"]
 
 Tensors = dict[str, torch.Tensor]
 _Result = TypeVar("_Result")
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
-_AT_LEAST = 3  # but not before so many
-_RAYS = 200  # of a sample on Mitsuba's traversal
+_AT_LEAST = 3  # rounds, before which they do not end
+_RAYS = 200  # rays of a sample on Mitsuba's traversal
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
 _NOTHING = 1e-6  # alpha of a view that shows nothing
-_UNSEEN = 1e-6  # of the largest: entries of the diagonal that are left out of relative errors
+_UNSEEN = 1e-6  # share of the largest: smaller entries of the diagonal are left out of relative errors
 
 
 def measure(
@@ -59,12 +61,12 @@ def measure(
     """Times and errors of settings.
 
     Args:
-        gaussians: At least one.
-        cameras: Pinhole, at least one.
-        variants: Rows; the first one is the truth.
+        gaussians: Gaussians of the scene, at least one.
+        cameras: Pinhole cameras, at least one.
+        variants: Variants to be measured, a row each; the first one is the truth.
         fields: Settings that hold in every row that does not say otherwise.
         repeats: Rounds of timing at most; they end after 100 seconds if three are done.
-        seed: Of the cotangents, of the samples of pixels and of the order within a round.
+        seed: Seed of the cotangents, of the samples of pixels and of the order within a round.
         advance: Called after each turn.
     Returns:
         A row for each of `variants`. Where there is no number there is None, and the reason in `skipped` or `notes`.
@@ -107,8 +109,9 @@ def measure(
 
 
 def placed(gaussians: Gaussians) -> Gaussians:
-    """Where they are rendered, without a graph."""
+    """Gaussians on the device that they are rendered on, without a graph."""
     device = "cuda" if runtime.backend().name == "cuda" else "cpu"
+    # Forward times are of images without derivatives; the leaves of the others are made of these (`_Stage`).
     return gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
 
 
@@ -117,7 +120,7 @@ class _Answer:
     """What a setting makes of a view.
 
     Attributes:
-        image: (H, W, 3), on the CPU.
+        image: (H, W, 3) colors, on the CPU.
         slopes: J^T u by group.
         information: The Fisher diagonal by group; None where the setting has none.
     """
@@ -152,12 +155,12 @@ class _Stage:
 
     def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
         """(H, W, 3), whatever the share of its resolution that is rendered."""
-        out = render(g, _reduced(camera, share), settings, outputs=())
-        self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)
+        out = render(g, by_share(camera, share), settings, outputs=())
+        self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)  # a yes or no has no derivative
         if share == 1:
             return out.rgb
         size = (camera.height, camera.width)
-        image = out.rgb.permute(2, 0, 1)[None]
+        image = out.rgb.permute(2, 0, 1)[None]  # torch interpolates images whose channels come first
         return torch.nn.functional.interpolate(image, size=size, mode="bilinear")[0].permute(1, 2, 0)
 
     def check(self, settings: RenderSettings) -> None:
@@ -182,11 +185,8 @@ class _Stage:
         return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
 
     def information(self, camera: Camera, settings: RenderSettings, share: float) -> Tensors:
-        """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is looked at."""
-        small = _reduced(camera, share)
-        found = fisher.diagonal(self.gaussians, small, settings)
-        scale = camera.width * camera.height / (small.width * small.height)
-        return {name: x * scale for name, x in found.items()} if share != 1 else found
+        """The Fisher diagonal by group."""
+        return scaled_diagonal(self.gaussians, camera, settings, share)
 
 
 class _Turn:
@@ -253,6 +253,7 @@ class _Turn:
 
     def _compare(self, truth: _Answer, seen: _Answer) -> None:
         """Add one view's differences from the truth: sizes of pixels', sums by group, medians of entries."""
+        # In float64 from here on: squares of differences of 1e-6 are summed over all pixels.
         self.pixels.append((seen.image - truth.image).abs().double().reshape(-1).numpy())
         for name, x in seen.slopes.items():
             a, b = self.slopes.get(name, (0.0, 0.0))
@@ -260,7 +261,7 @@ class _Turn:
             self.slopes[name] = a + _squares(x - y), b + _squares(y)
         for name, x in (seen.information or {}).items() if truth.information else ():
             y = truth.information[name]
-            (a, b) = self.parts.get(name, (0.0, 0.0))
+            a, b = self.parts.get(name, (0.0, 0.0))
             self.parts[name] = a + float((x - y).abs().sum()), b + float(y.sum())
             known = y > _UNSEEN * y.max()
             if bool(known.any()):
@@ -380,10 +381,22 @@ def _squares(x: torch.Tensor) -> float:
     return float(x.double().square().sum())
 
 
-def _reduced(camera: Camera, share: float) -> Camera:
-    if share == 1:
-        return camera
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+def scaled_diagonal(
+    gaussians: Gaussians, camera: Camera, settings: RenderSettings, share: float = 1.0, method: Method = "exact"
+) -> Tensors:
+    """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is looked at.
+
+    Args:
+        gaussians: Gaussians of the scene.
+        camera: View at full size.
+        settings: Render settings.
+        share: Share of the view's width and height that is looked at.
+        method: Method of `drgs.fisher.diagonal`.
+    """
+    small = by_share(camera, share)
+    found = fisher.diagonal(gaussians, small, settings, method)
+    scale = camera.width * camera.height / (small.width * small.height)
+    return {name: x * scale for name, x in found.items()} if share != 1 else found
 
 
 def clocked(work: Callable[[], _Result]) -> tuple[_Result, float]:
@@ -400,6 +413,6 @@ def clocked(work: Callable[[], _Result]) -> tuple[_Result, float]:
 
 
 def _clock_name() -> str:
-    """With one thread, time of the processor: what else runs on the machine does not stretch it."""
+    """The clock: of one thread the processor's time, which nothing else on the machine stretches; else the wall's."""
     backend = runtime.backend()
     return "processor" if backend.name == "llvm" and backend.threads == 1 else "wall"

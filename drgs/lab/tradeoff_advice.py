@@ -33,15 +33,17 @@ class Advice:
     """What is recommended for a use and a budget.
 
     Attributes:
-        use, budget: For which.
-        clock: The time that counts.
-        name: Of the row; None where no setting is within the budget, and then all that follows `reason` is None.
+        use: One of `USES`.
+        budget: Largest error that is allowed.
+        clock: Name of the time that counts.
+        name: Name of the row that is chosen; None where no setting is within the budget, and then all that follows
+            `reason` is None.
         gain: Whether it is faster than `exact`.
         reason: Why there is no setting, or no gain.
-        kind, flags: Of the row.
-        error: Its largest that counts.
+        kind, flags: The row's fields of these names.
+        error: The row's largest error that counts.
         full: Whether its time is of views as large as they are drawn.
-        ratio, low, high, rounds: Of its times to exact's.
+        ratio, low, high, rounds: Its times over exact's, as an `Interval`.
     """
 
     use: str
@@ -60,7 +62,7 @@ class Advice:
     rounds: int | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As tradeoff.json holds it: what was not found has no numbers."""
+        """The advice as tradeoff.json holds it: what was not found has no numbers."""
         value = dataclasses.asdict(self)
         return value if self.name else {k: value[k] for k in ("use", "budget", "clock", "name", "gain", "reason")}
 
@@ -86,8 +88,8 @@ def interval(ratios: Sequence[float]) -> Interval | None:
 def leaders(measured: Measured, clock: str, budgets: Sequence[float]) -> list[str]:
     """Names of the rows that are worth timing at full size: the fastest within each budget, and preset `fast`."""
     names = []
-    for use, (its, _) in USES.items():
-        for budget in budgets if its == clock else ():
+    for use, (timed, _) in USES.items():
+        for budget in budgets if timed == clock else ():
             rows = [row for row, _ in _within(measured, use, budget) if row.times[clock].ratio < 1]
             names += [min(rows, key=lambda row: row.times[clock].ratio).name] if rows else []
     fast = [row.name for row in measured.rows if row.name == "fast" and row.skipped is None and row.times[clock]]
@@ -95,14 +97,14 @@ def leaders(measured: Measured, clock: str, budgets: Sequence[float]) -> list[st
 
 
 def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Advice]:
-    """For each budget the fastest setting with a gain, the most exact one of those as fast, or why there is none.
+    """Choose for each budget the fastest setting with a gain, the most exact one of those as fast, or say why not.
 
     Args:
-        measured: Of `tradeoff.measure`, and what `tradeoff_full.measure_full` added to its rows under `full`: where a
-            clock was read at full size, only that counts. Rows of a reduced resolution and rows that were measured on
-            a sample of the rays are no candidates.
+        measured: What `tradeoff.measure` returned, and what `tradeoff_full.measure_full` added to its rows under
+            `full`: where a clock was read at full size, only that counts. Rows of a reduced resolution and rows that
+            were measured on a sample of the rays are no candidates.
         use: One of `USES`.
-        budgets: > 0.
+        budgets: Largest errors that are allowed, each > 0.
     """
     clock = USES[use][0]
     scatter = measured.scatter[clock]

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FullSize", "measure_full"]
 
-_ROUNDS = 3  # that say how much times scatter
-_FORWARD = 0.6  # of the seconds are for images, which is what is drawn at full size
+_ROUNDS = 3  # rounds that say how much times scatter
+_FORWARD = 0.6  # share of the seconds for images, which is what is drawn at full size
 _GROW = 4  # times as many pixels are tried next, on the way to full size
 
 
@@ -41,9 +41,9 @@ class FullSize:
 
     Attributes:
         size: (width, height) of the first view as it was timed; None where there was no time.
-        drawn: Its own.
-        rounds: Of timing.
-        names: Of the rows.
+        drawn: (width, height) of the first view as it is drawn.
+        rounds: Number of rounds of timing.
+        names: Names of the rows that were timed.
     """
 
     size: list[int] | None
@@ -65,13 +65,13 @@ def measure_full(
     """Times at full size, into the rows' `full`: clock -> `FullTime`.
 
     Args:
-        measured: Of `tradeoff.measure`.
-        gaussians: On the device that they are rendered on.
-        cameras: Pinhole, as large as they are drawn.
-        budgets: Of errors.
-        repeats: Rounds at most.
-        seconds: For all three clocks together.
-        seed: Of the order within a round.
+        measured: What `tradeoff.measure` returned.
+        gaussians: Gaussians of the scene, at least one.
+        cameras: Pinhole cameras, as large as they are drawn.
+        budgets: Largest errors that are allowed.
+        repeats: Largest number of rounds.
+        seconds: Time for all three clocks together.
+        seed: Seed of the order within a round and of the cotangent.
         say: Called with what is being timed, before each.
     Returns:
         Clock -> what was timed with it.
@@ -136,7 +136,7 @@ class _Work:
         return clocked(lambda: getattr(self, "_" + self.clock)(camera, row.settings))[1]
 
     def _forward(self, camera: Camera, settings: RenderSettings) -> object:
-        with torch.no_grad():
+        with torch.no_grad():  # what an image alone takes
             out = render(self.gaussians, camera, settings, outputs=())
         return out.rgb.cpu(), out.alpha.cpu()  # as `drgs render` takes them
 

@@ -32,9 +32,9 @@ def plot(measured: Measured, budgets: Sequence[float], title: str, path: Path) -
 
     Args:
         measured: Times and errors of all rows; those of samples are left out.
-        budgets: Drawn as lines.
-        title: Above.
-        path: A .png.
+        budgets: Errors that are drawn as lines.
+        title: Text above the plot.
+        path: File to write, a .png.
     Returns:
         False where there is no matplotlib.
     """

@@ -31,7 +31,7 @@ __all__ = [
 CLOCKS = ("forward", "forward_backward", "fisher")
 """What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""
 
-_UNSEEN = 1e-6  # of the largest: groups that are left out of relative errors
+_UNSEEN = 1e-6  # share of the largest: smaller groups are left out of relative errors
 
 
 # ------------------------------------------------------------------------------- which settings
@@ -44,9 +44,11 @@ class Variant:
     Attributes:
         kind: `approximation` (of exact's model), `model` (another response or view direction: a difference, not an
             error), `resolution`, or `precision`.
-        preset, fields: Of the settings.
-        share: Of width and height; the image is enlarged bilinearly, information scaled by the number of pixels.
-        by: `view`; `rays`, a sample of the rays; `oracle`, the same in float64.
+        preset: Preset that the settings start from.
+        fields: Settings that differ from the preset.
+        share: Share of width and height that is rendered; the image is enlarged bilinearly, information scaled by the
+            number of pixels.
+        by: What is measured: a whole `view`, a sample of its `rays`, or that sample by the float64 `oracle`.
     """
 
     kind: str
@@ -57,7 +59,7 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """For people, short."""
+        """A short name for people."""
         if self.by == "oracle":
             return "float64 oracle"
         text = " ".join(f"{key}={_short(value)}" for key, value in self.fields.items())
@@ -139,7 +141,7 @@ class ImageError:
 
     @classmethod
     def of(cls, off: np.ndarray) -> ImageError:
-        """From the differences' sizes (P,).
+        """Compute the errors from absolute differences (P,).
 
         Raises:
             ValueError: If there is none.
@@ -156,8 +158,9 @@ class GradientError:
     """Relative L2 errors of a gradient.
 
     Attributes:
-        all: Of all groups together; None where there is no gradient.
-        worst, group: The largest of a group, and that group's name; None where no group has one.
+        all: Error over all groups together; None where there is no gradient.
+        worst: Largest error of a group; None where no group has one.
+        group: Name of that group.
         groups: Group -> its error; None where it has no gradient to speak of.
     """
 
@@ -168,7 +171,7 @@ class GradientError:
 
     @classmethod
     def of(cls, squares: dict[str, tuple[float, float]]) -> GradientError:
-        """From sums of squares of the difference and of the truth, by group."""
+        """Compute the errors from sums of squares of the difference and of the truth, by group."""
         names = _compared({name: b for name, (_, b) in squares.items()})
         groups = {name: math.sqrt(a / b) if name in names else None for name, (a, b) in squares.items()}
         worst = max(names, key=groups.get, default=None)
@@ -191,8 +194,8 @@ class InformationError:
 
     Attributes:
         groups: Group -> its errors.
-        group: That with the largest, None where no group has one.
-        l1, median: Its errors.
+        group: Group with the largest error; None where no group has one.
+        l1, median: The errors of that group.
     """
 
     groups: dict[str, GroupInformation]
@@ -202,7 +205,7 @@ class InformationError:
 
     @classmethod
     def of(cls, sums: dict[str, tuple[float, float]], medians: dict[str, float]) -> InformationError:
-        """From sums of the differences' sizes and of the truth, and medians of relative differences, by group."""
+        """Compute the errors from sums of absolute differences and of the truth and from medians of relative ones."""
         names = _compared({name: b for name, (_, b) in sums.items()})
         nothing = GroupInformation(None, None)
         groups = {n: GroupInformation(a / b, medians[n]) if n in names else nothing for n, (a, b) in sums.items()}
@@ -254,14 +257,14 @@ class TradeoffRow:
     """A variant, and what was measured of it, in the order of tradeoff.json.
 
     Attributes:
-        name, kind, share, by: Of the variant.
+        name, kind, share, by: The variant's fields of these names.
         skipped: Why nothing was measured, else None.
-        settings: Its own, with the user's; None where these cannot be.
+        settings: The variant's settings with the user's; None where these cannot be.
         image, gradient, information: Differences from the truth; None where there are none.
         notes: What a reader should know, by subject.
-        seconds: Clock -> median; None where a clock was not read.
-        ratio: Clock -> median ratio to the truth's.
-        times: Clock -> these ratios; None of what was measured once, on a sample.
+        seconds: Clock -> median time in seconds; None where a clock was not read.
+        ratio: Clock -> median ratio of the times to the truth's.
+        times: Clock -> these ratios with their interval; None of what was measured once, on a sample.
         first_call: Seconds that the first view took longer than others.
         full: Clock -> ratios on views as large as they are drawn (tradeoff_full.py), where they were timed.
         errors: What budgets are compared with: the worst measure of each kind, plus the truth's own error.
@@ -312,12 +315,12 @@ class Measured:
     """Times and errors of settings.
 
     Attributes:
-        rows: In the order of the variants; the first one is the truth.
-        own: Those of the truth against the oracle.
+        rows: Rows in the order of the variants; the first one is the truth.
+        own: Errors of the truth against the oracle.
         scatter: Clock -> the truth's times against itself.
-        pixels: Of one view, on average.
-        rounds: Of timing.
-        clock: `wall` or `processor`.
+        pixels: Number of pixels of one view, on average.
+        rounds: Number of rounds of timing.
+        clock: Clock that was read, `wall` or `processor`.
     """
 
     rows: list[TradeoffRow]

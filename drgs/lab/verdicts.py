@@ -24,7 +24,7 @@ from drgs.lab.rows import AlphaRow, GroupRow, OwnRow, ViewRow, WorstGaussian, Wo
 
 __all__ = ["Case", "Compared", "compared", "judge", "with_errors"]
 
-_FEW = 0.01  # of the pixels: so few that are off hang on a cut-off or on the order, and are left out
+_FEW = 0.01  # share of the pixels: so few that are off hang on a cut-off or on the order, and are left out
 _IMAGE = 1e-3  # RMS of images that agree
 _ENOUGH = 3  # converged differences that a verdict needs
 _OWN = 0.02  # relative difference from its own central differences that is a bug
@@ -35,8 +35,8 @@ class Deviation:
     """A difference of gradients that is made on purpose.
 
     Attributes:
-        name: In words.
-        where: Where it is known from.
+        name: The deviation in words.
+        where: The code that it is known from.
         change: Fields of the model that have it.
     """
 
@@ -98,7 +98,7 @@ class Compared:
         views: A row a view.
         agrees: Whether the images are the model's.
         u: (C, H, W, 3) cotangents, 0 at pixels that do not count.
-        theirs: The rasterizer's gradients.
+        theirs: Gradients of the rasterizer, by group.
         groups: A row a group; of the pose only where the rasterizer has a gradient of it.
         ties: (C, H, W) bool, pixels that hang on near ties, looked for where something is to be explained.
         counted: Whether these count all the same, because next to nothing would be left.
@@ -191,10 +191,11 @@ def with_errors(
     been taken for conventions that explain a part of it. The model whose images they explain best is named.
 
     Args:
-        found: Of these views.
-        pictures: (H, W, 3) each, the rasterizer's.
-        models: In words -> the model; the first is the one at its conventions, whose pixels are compared.
-        draw: A model and a view's index -> its (H, W, 3) image and (H, W) alpha.
+        found: The comparison of these views.
+        pictures: (H, W, 3) images of the rasterizer.
+        models: Name in words -> the model; the first is the one at the rasterizer's conventions, whose pixels are
+            compared.
+        draw: Function of a model and a view's index: its (H, W, 3) image and (H, W) alpha.
     """
     off = [k for k, row in enumerate(found.views) if not _is_same(row)]
     counts = {k: (~found.ties[k] | found.counted).numpy() for k in off}
@@ -323,8 +324,8 @@ def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names:
 
 
 def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
-    """Where the two differ most, and where the gradient is largest: half of each."""
-    a = torch.nan_to_num(theirs).reshape(-1)
+    """Flat indices at which the two differ most, and at which the gradient is largest: half of each."""
+    a = torch.nan_to_num(theirs).reshape(-1)  # NaN sorts before every number: nothing else would be looked at
     b = ours.reshape(-1)
     order = [torch.argsort(x.abs(), descending=True).tolist() for x in (a - b, b)]
     return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]

@@ -31,12 +31,13 @@ class Account:
     """How a fit went.
 
     Attributes:
-        run: Its folder.
-        record: What config.json says; `config` is that file as it is.
-        env: env.json, what the fit ran on; empty without.
-        events: Of log.jsonl, without the steps that a resumed fit did again.
-        metrics: metrics.json, None before there is one.
-        selection: selection.json of an active fit, else None.
+        run: Folder of the run.
+        record: What config.json says.
+        config: Content of config.json as it is.
+        env: Content of env.json, which says what the fit ran on; empty without.
+        events: Lines of log.jsonl, without the steps that a resumed fit did again.
+        metrics: Content of metrics.json; None before there is one.
+        selection: Content of selection.json of an active fit, else None.
         wall: Seconds from each start of the fit to the last thing that it logged, pauses left out.
     """
 
@@ -83,7 +84,7 @@ def account_of(run: Run) -> Account:
     for pick in [] if selection is None else selection["picks"]:
         _check_numbers(run.path / "selection.json", pick["parts"])
     env = _optional(run.path / "env.json", {}) or {}
-    (events, wall) = _events(run)
+    events, wall = _events(run)
     return Account(run, record, run.config(), env, events, metrics, selection, wall)
 
 

@@ -68,7 +68,7 @@ def score_bars(picks: Sequence[Mapping[str, Any]]) -> str | None:
     """One row a pick: the share of each parameter group in its score, and the candidates' scores relative to the best.
 
     Args:
-        picks: Of selection.json, those with a score.
+        picks: Picks of selection.json; those without a score are left out.
     Returns:
         None where no pick has a score.
     """
@@ -84,7 +84,7 @@ def score_bars(picks: Sequence[Mapping[str, Any]]) -> str | None:
     axis = panels[-1]
     for row, pick in zip(rows, shown, strict=True):
         values = np.array([c["score"] for c in pick["candidates"] if c["score"] is not None], float)
-        scale = max(abs(pick["score"]), 1e-300)
+        scale = max(abs(pick["score"]), 1e-300)  # a score of 0 is drawn at 0
         axis.plot(values / scale, np.full(len(values), row), "|", color=_GRAY, ms=9)
         axis.plot(pick["score"] / scale, row, "o", color=_RED, ms=4)
     axis.set(xlabel="scores / the picked one's (red)", ylim=(len(shown) - 0.5, -0.5))
@@ -97,7 +97,7 @@ def _part_bars(axis: Axes, picks: Sequence[Mapping[str, Any]], names: Sequence[s
     import matplotlib
 
     table = np.array([[pick["parts"].get(name) or 0.0 for name in names] for pick in picks], float)
-    table /= np.maximum(np.abs(table).sum(1, keepdims=True), 1e-300)
+    table /= np.maximum(np.abs(table).sum(1, keepdims=True), 1e-300)  # a score without parts has bars of length 0
     ends = {True: np.zeros(len(picks)), False: np.zeros(len(picks))}
     colors = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]  # the stubs have the base class only
     for number, (name, share) in enumerate(zip(names, table.T, strict=True)):
@@ -112,7 +112,7 @@ def _part_bars(axis: Axes, picks: Sequence[Mapping[str, Any]], names: Sequence[s
 
 
 def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Camera, str]]) -> str | None:
-    """Where cameras stand and where they look, seen from above.
+    """A map of where cameras stand and where they look, seen from above.
 
     Args:
         groups: Name -> cameras: `start` or `fitted`, `not picked`, `held out`; drawn in this order.
@@ -126,7 +126,7 @@ def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Ca
     centers = np.array([camera.center for camera in cameras], float)
     up = -np.mean([camera.c2w[:3, 1] for camera in cameras], axis=0)
     axes = _ground(up, centers)
-    reach = max(float(np.ptp(centers @ axes.T, axis=0).max()), 1e-9) * 0.06
+    reach = max(float(np.ptp(centers @ axes.T, axis=0).max()), 1e-9) * 0.06  # of one camera, too, there is a length
     figure, (axis,) = _figure("cameras", 1, 4.6)
     styles = {
         "start": ("s", _BLUE, 1.0),

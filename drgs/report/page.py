@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.report.pictures import Picture
 
 if TYPE_CHECKING:
@@ -36,11 +36,15 @@ class Shown:
     """What was drawn for a page.
 
     Attributes:
-        charts: `progress`, `scores`, `cameras` -> SVG, or None.
-        previews: Pictures of the way.
-        views: Names of the views that are shown, with pictures by name: `photos`, `semantics` and `maps`.
-        moments: Stills of one camera, and its name.
-        notes: What is left out, and why.
+        charts: Name (`progress`, `scores`, `cameras`) -> SVG, or None.
+        previews: Pictures of how the fit went.
+        views: Names of the views that are shown.
+        photos: Name of a view -> photograph and rendering.
+        semantics: Name of a view -> picture of its labels.
+        maps: Name of a view -> its maps.
+        moments: Stills of one camera at several times.
+        moments_of: Name of that camera.
+        notes: Sentences that say what is left out, and why.
     """
 
     charts: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
@@ -58,10 +62,10 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
     """The page.
 
     Args:
-        account: How the fit went.
+        account: Account of how the fit went.
         shown: Charts and pictures.
-        command: That repeats the fit.
-        command_text: What it does not repeat, if anything.
+        command: Command that repeats the fit.
+        command_text: What the command does not repeat, if anything.
     """
     from jinja2 import Environment
     from markupsafe import Markup
@@ -247,7 +251,7 @@ def _picks(account: Account) -> dict[str, Any]:
 
 
 def _timings(account: Account) -> list[tuple[str, str, str]]:
-    """Where the wall time went."""
+    """Name and seconds of each part of the wall time."""
     steps = _seconds(account)
     wall = account.wall
     picks = account.selection["picks"] if account.selection else []
@@ -272,16 +276,19 @@ def _memory(account: Account) -> str:
 
 def _configuration(account: Account) -> list[tuple[str, str, bool]]:
     """Name, value and whether it is not the default, of every field."""
-    config = account.record.config.to_json()
+    config = account.record.config
+    usual = FitConfig() if config.selection is None else FitConfig(selection=SelectionConfig())
+    return _rows("", config.to_json(), usual.to_json())
+
+
+def _rows(way: str, fields: dict, usual: dict) -> list[tuple[str, str, bool]]:
+    """Those of a nested record, its innermost fields by their ways."""
     rows = []
-    usual = FitConfig().to_json()
-    for name, value in config.pop("settings").items():
-        rows.append((f"settings.{name}", _text(value), value != usual["settings"][name]))
-    rows += [(name, _text(value), value != usual[name]) for name, value in config.items()]
-    active = account.config.get("active")
-    if isinstance(active, dict):
-        usual = ActiveConfig().to_json()
-        rows += [(f"active.{name}", _text(value), value != usual.get(name)) for name, value in active.items()]
+    for name, value in fields.items():
+        if isinstance(value, dict) and isinstance(usual[name], dict) and usual[name]:
+            rows += _rows(f"{way}{name}.", value, usual[name])
+        elif name != "selection":
+            rows.append((way + name, _text(value), value != usual[name]))
     return rows
 
 

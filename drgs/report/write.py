@@ -1,4 +1,4 @@
-"""Gathers what there is about a run and writes its page."""
+"""The page of a run: what there is about it, gathered and written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["FILE", "write_report"]
 
 FILE = "report.html"
-_VIEWS = 4  # that are shown with pictures
+_VIEWS = 4  # views that are shown with pictures
 
 _log = logging.getLogger(__name__)
 
@@ -32,10 +32,12 @@ def write_report(run: Run, path: Path, command: str, command_text: str, dataset:
     """Write the page of a run, atomically.
 
     Args:
-        run: The run folder, of a fit that is done or is not.
-        path: The HTML file.
-        command, command_text: What repeats the fit, and what that leaves out, for the page.
-        dataset: What was fitted, for its cameras and times; None where it is no longer there, which the page says.
+        run: Folder of a fit that is done or is not.
+        path: HTML file to write.
+        command: Command that repeats the fit, for the page.
+        command_text: What that command leaves out, for the page.
+        dataset: Data set that was fitted, for its cameras and times; None where it is no longer there, which the page
+            says.
     Raises:
         FileNotFoundError: If it is no run folder.
         ValueError: If one of its files is damaged.
@@ -108,9 +110,9 @@ class _Cast:
     """The cameras of a fit.
 
     Attributes:
-        fitted: Those whose photographs it has seen.
-        held: Of the measured views, by name.
-        groups, picked: As `charts.camera_map` takes them.
+        fitted: Cameras whose photographs the fit has seen.
+        held: Name -> camera of each measured view.
+        groups, picked: Arguments of `charts.camera_map`.
     """
 
     fitted: list[Camera]
@@ -120,13 +122,13 @@ class _Cast:
 
     @classmethod
     def of(cls, account: Account, dataset: Dataset) -> _Cast:
-        """By the split of the fit."""
+        """The cameras of a data set, by the split of the fit."""
         config = account.record.config
-        train, test = dataset.split(config.test_every, config.test_offset, config.test_cameras)
+        train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
 
         def camera(view: View) -> Camera:
             plain = dataclasses.replace(view.camera.undistorted(), name=view.name)
-            return at_most(plain, config.max_pixels)
+            return at_most(plain, config.data.max_pixels)
 
         cameras = {view.name: camera(view) for view in train}
         tested = {view.name: camera(view) for view in test}

@@ -8,7 +8,6 @@ was killed is resumed from its checkpoint. `drgs.studies.tables` makes the table
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import shlex
 import time
@@ -21,8 +20,9 @@ import numpy as np
 from drgs.evaluation import evaluate_run
 from drgs.files import Run
 from drgs.fitting.active import SELECTION, ActiveViews
-from drgs.fitting.config import SAVING, ActiveConfig, FitConfig, Start
+from drgs.fitting.config import FitConfig, SelectionConfig, Start
 from drgs.fitting.frames import load_dataset
+from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
 from drgs.fitting.timetable import VIEWS_TO_ADD
 from drgs.guards.json_files import read_json
@@ -92,9 +92,9 @@ class Study:
     Attributes:
         name: Of the study and its scale; in every row, and the folder of its runs.
         folder: Scene and split -> folder of the data set, made where it is not there yet.
-        policies: Label -> fields of `ActiveConfig`; None: all views are known from the start, and none is picked.
-        fit: What every fit does; seed, split and initial points are the cell's.
-        active: How views are chosen; start and policy are the cell's.
+        policies: Label -> fields of `SelectionConfig` and its scoring; None: all views are known from the start, and
+            none is picked.
+        fit: What every fit does, with a selection; seed, split, initial points, start and policy are the cell's.
         metrics: What a row holds.
         reference: Label of the policy that the others are compared with.
         comparisons: More pairs (policy, reference) to be compared.
@@ -105,7 +105,6 @@ class Study:
     folder: Callable[[str, tuple[int, int]], Path]
     policies: Mapping[str, Mapping[str, Any] | None]
     fit: FitConfig
-    active: ActiveConfig
     metrics: tuple[Metric, ...]
     reference: str
     comparisons: tuple[tuple[str, str], ...] = ()
@@ -126,7 +125,7 @@ class Study:
             found += [Cell(scene, split, start, policy, protocol, seed, camera) for policy in self.policies]
         return found
 
-    def configs(self, cell: Cell) -> tuple[FitConfig, ActiveConfig | None]:
+    def config_of(self, cell: Cell) -> FitConfig:
         """What the fit of a cell is told."""
         (every, offset) = cell.split
         protocol = PROTOCOLS[cell.protocol]
@@ -135,10 +134,9 @@ class Study:
         if cell.camera:
             changed["test_cameras"] = (cell.camera,)
         fields = self.policies[cell.policy]
-        config = dataclasses.replace(self.fit, **changed)
         if fields is None:
-            return config, None
-        return config, dataclasses.replace(self.active, start=cell.start, **{**protocol.active, **fields})
+            return self.fit.replace(**changed, selection=None)
+        return self.fit.replace(**changed, start=cell.start, **{**protocol.selection, **fields})
 
     def _made(self, cell: Cell) -> Path:
         """The folder of a cell's data set, once no other process is making it any more."""
@@ -159,7 +157,7 @@ class Study:
             ValueError: If the data set states another split than the cell's: it would win.
         """
         (every, offset) = cell.split
-        (config, _) = self.configs(cell)
+        config = self.config_of(cell)
         dataset = load_dataset(self._made(cell), config, lazy=True, points=PROTOCOLS[cell.protocol].leaks)
         if cell.camera:
             return dataset  # which knows the camera, or has been refused
@@ -187,19 +185,19 @@ def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int,
     policy = next(label for label, fields in study.policies.items() if fields is not None)
     cell = Cell(scene, split, "seed", policy, protocol, 0)
     train = study.dataset(dataclasses.replace(cell, protocol="blind")).split()[0]  # no points are needed
-    _, active = study.configs(cell)
-    assert active is not None  # of such a policy
-    picked = active.add or VIEWS_TO_ADD
-    if active.initial + picked > len(train):
+    selection = study.config_of(cell).selection
+    assert selection is not None  # of such a policy
+    picked = selection.add or VIEWS_TO_ADD
+    if selection.initial + picked > len(train):
         raise ValueError(
-            f"{scene}: must have {active.initial + picked} training views for protocol {protocol}, {active.initial} at "
-            f"the start and {picked} to be picked, has {len(train)}; add photographs, or hold out fewer"
+            f"{scene}: must have {selection.initial + picked} training views for protocol {protocol}, "
+            f"{selection.initial} at the start and {picked} to be picked, has {len(train)}; add photographs, or "
+            "hold out fewer"
         )
     found: dict[frozenset[int], int] = {}
     for seed in range(100 * count if count <= len(train) else 0):
-        config, active = study.configs(dataclasses.replace(cell, seed=seed))
-        assert active is not None
-        found.setdefault(frozenset(ActiveViews(active, train, config).chosen), seed)
+        config = study.config_of(dataclasses.replace(cell, seed=seed))
+        found.setdefault(frozenset(ActiveViews(train, config).chosen), seed)
         if len(found) == count:
             return list(found.values())
     raise ValueError(
@@ -222,13 +220,13 @@ def run_cell(study: Study, cell: Cell, runs: Path, progress: bool = False) -> di
         ValueError: If the folder holds another fit, or as `drgs.train.fit`.
     """
     run = Run(runs / study.name / cell.name)
-    config, active = study.configs(cell)
+    config = study.config_of(cell)
     with claim_run(run, "fit", resume=True) as claimed:
         if (run.path / "config.json").is_file():
-            _check_same(run, config, active)
+            _check_same(run, config)
         if not (run.path / "metrics.json").is_file():
             forget_peak_memory()  # of the cell before
-            fit(study.dataset(cell), run.path, config, active=active, resume=True, progress=progress)
+            fit(study.dataset(cell), run.path, config, resume=True, progress=progress)
         if study.lpips is not None and _metrics(run)["mean"].get("lpips") is None:
             evaluate_run(run, claimed, lpips=Lpips(study.lpips))
         return _row(study, cell, run)
@@ -289,21 +287,19 @@ def _said(metric: Metric, value: float | None) -> str:
     return f"{metric.title} {'none' if value is None else f'{value:.{metric.digits}f}'}"
 
 
-def _check_same(run: Run, config: FitConfig, active: ActiveConfig | None) -> None:
+def _check_same(run: Run, config: FitConfig) -> None:
     """Refuse a run folder that was begun by another fit: by a study that had other numbers under the same name."""
-    recorded = run.config()
-    for wanted, found in ((config, recorded.get("fit")), (active, recorded.get("active"))):
-        if wanted is None:
-            continue
-        now = json.loads(json.dumps(wanted.to_json()))
-        found = found or {}
-        was = wanted.recorded(found) if isinstance(wanted, ActiveConfig) else {**FitConfig().to_json(), **found}
-        for key, value in now.items():
-            if value != was[key] and key not in SAVING:
-                raise ValueError(
-                    f"{run.path}: must be the run of this cell, {key} was {was[key]!r} and is {value!r}; "
-                    "give the study another name, or move the folder away"
-                )
+    was = fit_record(run).config
+    found = config.difference(was)
+    if found is None and config.selection is not None:
+        mine, theirs = config.selection.flat(), (was.selection or SelectionConfig()).flat()
+        found = next(((name, x, theirs[name]) for name, x in mine.items() if x != theirs[name]), None)
+    if found is not None:
+        name, now, before = found
+        raise ValueError(
+            f"{run.path}: must be the run of this cell, {name} was {before!r} and is {now!r}; "
+            "give the study another name, or move the folder away"
+        )
 
 
 def _metrics(run: Run) -> dict:

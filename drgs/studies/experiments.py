@@ -15,12 +15,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from drgs.fitting.config import ActiveConfig, FitConfig
+from drgs.fitting.config import FitConfig, Schedule, SelectionConfig
+from drgs.information.prior import Prior
 from drgs.studies.cells import Metric, Study
 from drgs.studies.choices import ExperimentName, StudyScale
 from drgs.studies.made import Sizes, made_folder
 
-__all__ = ["EXPERIMENTS", "SIZES", "Experiment", "PaperNumbers", "metrics_of", "study_of"]
+__all__ = ["EXPERIMENTS", "SIZES", "Experiment", "PaperNumbers", "fisher_policy", "metrics_of", "study_of"]
 
 PaperNumbers = Mapping[str, float]
 """Metric -> what the paper states."""
@@ -31,20 +32,21 @@ _DEFAULT = "geometry+semantic+backdrop, v_opt"
 _MOVING_DEFAULT = "joint+backdrop, v_opt"
 
 
-def _fisher(criterion: str, *blocks: str, **fields: Any) -> dict[str, Any]:
+def fisher_policy(criterion: str, *blocks: str, **fields: Any) -> dict[str, Any]:
+    """Fields of a `SelectionConfig` of policy `fisher` with a criterion and blocks, and whatever else is given."""
     return {"policy": "fisher", "criterion": criterion, "blocks": blocks, **fields}
 
 
 _EVERYTHING = ("geometry", "semantic", "deformation")
 _POLICIES: Mapping[str, Mapping[str, Any] | None] = {
     **{name: {"policy": name} for name in _BASELINES},
-    _JOINT: _fisher("eig", "geometry", "semantic"),
+    _JOINT: fisher_policy("eig", "geometry", "semantic"),
     _DEFAULT: {"policy": "fisher"},
-    "geometry": _fisher("eig", "geometry"),
-    "geometry+semantic": _fisher("eig", "geometry", "semantic"),
-    "geometry+deformation": _fisher("eig", "geometry", "deformation"),
-    "joint": _fisher("eig", *_EVERYTHING),
-    **{f"joint, lambda {x}": _fisher("eig", *_EVERYTHING, prior=float(x)) for x in ("0", "1e-7", "1e-5")},
+    "geometry": fisher_policy("eig", "geometry"),
+    "geometry+semantic": fisher_policy("eig", "geometry", "semantic"),
+    "geometry+deformation": fisher_policy("eig", "geometry", "deformation"),
+    "joint": fisher_policy("eig", *_EVERYTHING),
+    **{f"joint, lambda {x}": fisher_policy("eig", *_EVERYTHING, prior=Prior(float(x))) for x in ("0", "1e-7", "1e-5")},
     _MOVING_DEFAULT: {"policy": "fisher"},
     "all views": None,
 }
@@ -139,7 +141,7 @@ their distances), and of every lambda."""
 
 
 def _fit(**fields: Any) -> FitConfig:
-    return FitConfig(**{"feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
+    return FitConfig.of(**{"feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
 
 
 _TINY: Mapping[str, Any] = {"max_gaussians": 500, "feature_width": 8, "feature_rate": 5e-2, "decoder_rate": 1e-2}
@@ -223,20 +225,18 @@ def study_of(
         scale: Of its fits, and of the scenes that are made.
         made: Folder of the scenes that are made.
         given: Scene -> data set, of those that are not made.
-        policies: Label -> fields of `ActiveConfig`; default those of all its experiments.
+        policies: Label -> fields of `SelectionConfig`; default those of all its experiments.
         lpips: Weights of a backbone, for LPIPS.
     """
     sizes = SIZES[study, scale]
     own = [label for x in EXPERIMENTS.values() if x.study == study for label in x.policies]
-    active = ActiveConfig(add=sizes.add, every=sizes.every, info_pixels=sizes.info_pixels)
-    if study == "dynamic":
-        active = dataclasses.replace(active, schedule="times")
+    schedule: Schedule = "times" if study == "dynamic" else "auto"
+    selection = SelectionConfig(add=sizes.add, every=sizes.every, info_pixels=sizes.info_pixels, schedule=schedule)
     return Study(
         name=f"{study}-{scale}",
         folder=made_folder(study, sizes, made / scale, given or {}),
         policies=policies or {label: _POLICIES[label] for label in dict.fromkeys(own)},
-        fit=sizes.fit,
-        active=active,
+        fit=sizes.fit.replace(selection=selection),
         metrics=metrics_of(study, lpips is not None),
         reference="random",
         lpips=lpips,

@@ -67,7 +67,8 @@ def _made(
     with Bar(f"path tracing {scene}") as bar:
         if study == "static":
             return room.generate(made / scene, views=sizes.views, test_every=split[0], progress=bar.update, **size)
-        return kitchen.generate(made / scene, cameras=sizes.cameras, times=sizes.fit.times, progress=bar.update, **size)
+        times = sizes.fit.data.times
+        return kitchen.generate(made / scene, cameras=sizes.cameras, times=times, progress=bar.update, **size)
 
 
 def _number(scene: str) -> int:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from drgs import data
 from drgs.studies.cells import Study, distinct_seeds
@@ -48,6 +50,7 @@ def plan_of(
     policies: Sequence[str] = (),
     split: tuple[int, int] = (8, 0),
     lpips: Path | None = None,
+    fields: Mapping[str, Any] = MappingProxyType({}),
 ) -> StudyPlan:
     """The cells of an experiment.
 
@@ -61,6 +64,7 @@ def plan_of(
         policies: Labels of the experiment; default all.
         split: (n, k) of given data sets that state none: every n-th view is held out, from the k-th on.
         lpips: Weights of a backbone, for LPIPS.
+        fields: Fields of `FitConfig` and its parts in place of those of the scale; what a cell says goes before.
     Raises:
         ValueError: If an argument is unknown or out of range, a data set is not of the experiment's kind, or has too
             few views for the protocol.
@@ -80,14 +84,17 @@ def plan_of(
     if len(scenes) < len(given):
         raise ValueError("reproduce: --data must be folders of different names, got one twice; rename or link one")
     study = study_of(experiment.study, scale, made, scenes, lpips=lpips)
-    study = dataclasses.replace(study, policies={label: study.policies[label] for label in wanted})
-    dataclasses.replace(study.fit, test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
+    own = {name: x for name, x in fields.items() if name != "selection"}  # every fit of a study has one
+    study = dataclasses.replace(
+        study, policies={label: study.policies[label] for label in wanted}, fit=study.fit.replace(**own)
+    )
+    study.fit.replace(test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
     units = []
     notes = list[str]()
     lacking = set[tuple[str, str]]()
     for scene, path in scenes.items():
         dataset = data.load(
-            path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.times
+            path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.data.times
         )
         found = _units_of(study, scene, dataset, moves, split, seeds, protocol)
         units += found

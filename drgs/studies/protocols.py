@@ -17,14 +17,14 @@ class Protocol:
 
     Attributes:
         told: In words, for pages.
-        points: `FitConfig.init_points`.
-        active: Fields of `ActiveConfig` that replace those of the study.
+        points: `init_points` of the fit's data.
+        selection: Fields of `SelectionConfig` that replace those of the study.
         static: Whether it is only for loops that add views of one time.
     """
 
     told: str
     points: InitPoints
-    active: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    selection: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     static: bool = False
 
     @property

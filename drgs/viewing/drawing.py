@@ -6,7 +6,6 @@ the picture that is no longer wanted, not for all of it.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ import torch
 
 from drgs.ellipsoids import colors_only
 from drgs.integrator import render
-from drgs.sizes import at_most
+from drgs.sizes import at_most, cropped
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -36,8 +35,8 @@ def stages(camera: Camera, most: int) -> list[Camera]:
     """The cameras of one view in the order in which they are drawn: a small picture, then one of `most` pixels.
 
     Args:
-        camera: As large as the browser's window.
-        most: Pixels; no picture is larger than the window either.
+        camera: The view, as large as the browser's window.
+        most: Largest number of pixels; no picture is larger than the window either.
     """
     last = at_most(camera, most)
     first = at_most(camera, _FIRST)
@@ -49,9 +48,7 @@ def bands(camera: Camera, pixels: int = _BAND) -> list[Camera]:
     rows = max(1, pixels // camera.width)
     parts = []
     for top in range(0, camera.height, rows):
-        K = np.array(camera.K)
-        K[1, 2] -= top
-        parts.append(dataclasses.replace(camera, K=K, height=min(rows, camera.height - top)))
+        parts.append(cropped(camera, 0, top, camera.width, min(rows, camera.height - top)))
     return parts
 
 
@@ -65,16 +62,18 @@ def drawn(
     """What `read` takes of the rendering of a view, (H, W, ...).
 
     Args:
-        scene, camera, settings: As for `drgs.render`.
-        read: Of a band's rendering, with its depth.
+        scene: What is drawn.
+        camera: The view, as large as the picture.
+        settings: Render settings.
+        read: Function that takes a band's rendering, with its depth, and returns rows of the picture.
         features: Whether it reads the features, which else cost nothing.
     """
     parts = []
-    with torch.no_grad():  # a picture
+    with torch.no_grad():  # a picture is looked at only; a graph would keep every band's intermediates
         seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
     below = 0
     for part in bands(camera):
-        with torch.no_grad():
+        with torch.no_grad():  # entered for each band: between two of them the thread does other work
             parts.append(read(render(seen, part, settings, ("depth",))))
         below += part.height
         yield below / camera.height

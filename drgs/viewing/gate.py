@@ -37,7 +37,7 @@ class Gate:
     """What a request must be like.
 
     Attributes:
-        token: What it must know; None asks for none, and takes only requests to a name of this machine.
+        token: Token that the request must know; None asks for none, and takes only requests to a name of this machine.
         cookie: Name of the cookie that keeps the token, with the port in it: cookies are of all ports of a host.
     """
 
@@ -49,8 +49,9 @@ class Gate:
         """The gate of a viewer that listens at an address.
 
         Args:
-            host, port: The address.
-            token: The one to ask for; None: none on this machine, else one that nobody can guess.
+            host: Name or address that the viewer listens at.
+            port: Port that it listens at.
+            token: Token to ask for; None: none on this machine, else one that nobody can guess.
         Raises:
             ValueError: If the token is short, or has characters that an address has another meaning for.
         """
@@ -73,8 +74,8 @@ class Gate:
         """Why a request is not answered; None where it is.
 
         Args:
-            path: With its query.
-            headers: As `websockets` has them.
+            path: Path of the request, with its query.
+            headers: Headers of the request, as `websockets` has them.
         """
         if (odd := _odd(path, headers)) is not None:
             return http.HTTPStatus.BAD_REQUEST, odd
@@ -146,12 +147,12 @@ def _odd(path: str, headers: Any) -> str | None:
 
 
 def _query(path: str) -> dict[str, list[str]]:
-    """Of a path as it came. No `urlsplit`: to that a path of two slashes names a host, and may be an error."""
+    """Query of a path as it came. No `urlsplit`: to that a path of two slashes names a host, and may be an error."""
     return parse_qs(path.partition("?")[2].partition("#")[0], keep_blank_values=True)
 
 
 def _bytes(text: str) -> bytes:
-    """Of a header, whose bytes beyond ASCII `websockets` has as lone surrogates; of a query, whatever is in it."""
+    """Bytes of a header, which `websockets` has as lone surrogates beyond ASCII, or of whatever is in a query."""
     return text.encode(errors="surrogateescape")
 
 

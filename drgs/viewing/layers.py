@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["UNCERTAINTY", "ColorScale", "Drawing", "Layer", "layers_of", "tinted"]
 
 UNCERTAINTY = "uncertainty"
-_WIDE_PIXELS = 200_000  # of a picture of features: 100 MB of 128 channels
+_WIDE_PIXELS = 200_000  # pixels of a picture of features: 100 MB of 128 channels
 _VARIANCE = "variance of the color, as a multiple of the photographs' noise, logarithmic"
 _ROW = 4096  # Gaussians that are painted at once
 
@@ -31,8 +31,9 @@ class ColorScale:
     """What the colors of a picture mean.
 
     Attributes:
-        dark, bright: The values of its ends.
-        of: What has these values, in which unit.
+        dark: Value at the dark end.
+        bright: Value at the bright end.
+        of: Quantity that has these values, and its unit.
     """
 
     dark: float
@@ -59,11 +60,11 @@ class Layer:
     """A kind of picture.
 
     Attributes:
-        name: As the browser offers it.
+        name: Name under which the browser offers it.
         hint: What it shows, in a few words.
-        draw: (scene, camera, settings) -> steps that return a `Drawing`.
-        pixels: At most so many, whatever the window.
-        tint: (N, 3) uint8 colors of the Gaussians that the client draws; None: their own.
+        draw: Function of scene, camera and settings that returns steps to a `Drawing`.
+        pixels: Largest number of pixels, whatever the window; None: the window's.
+        tint: Function of Gaussians: (N, 3) uint8 colors in which the client draws them; None: their own.
     """
 
     name: str
@@ -76,12 +77,12 @@ class Layer:
 def layers_of(
     paint: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int
 ) -> tuple[Layer, ...]:
-    """All that can be shown.
+    """Layers that a scene has.
 
     Args:
-        paint: Kind -> what draws it of a rendering with features.
+        paint: Kind -> function that draws it of a rendering with features.
         uncertainty: What the photographs leave uncertain, where there are any.
-        pixels: Of its map, at most.
+        pixels: Largest number of pixels of its map.
     """
     made = [
         Layer("rgb", "colors", _rgb),
@@ -150,7 +151,7 @@ def _tint_of(painter: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], n
     def tint(g: Gaussians) -> np.ndarray:
         assert g.features is not None  # else there is no such painter
         rows = []
-        for features in g.features.detach().split(_ROW):
+        for features in g.features.detach().split(_ROW):  # colors for a browser: NumPy takes no tensor with a gradient
             rgb = torch.zeros(1, len(features), 3)
             alpha = torch.ones(1, len(features))
             rows.append(painter(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.display.pictures import inferno
-from drgs.viewing.placed_views import Station, scale_colors, score_colors
+from drgs.viewing.placed_views import PlacedView, scale_colors, score_colors
 
 if TYPE_CHECKING:
     from drgs.viewing.layers import ColorScale
@@ -42,10 +42,10 @@ def status(text: str, scale: ColorScale | None = None) -> str:
     return _block("drgs-status", rows)
 
 
-def legend(stations: Sequence[Station], title: str) -> str:
+def legend(placed_views: Sequence[PlacedView], title: str) -> str:
     """What the colors of cameras mean."""
-    colors, ends = score_colors(stations)
-    kinds = {station.kind: color for station, color in zip(stations, colors, strict=True)}
+    colors, ends = score_colors(placed_views)
+    kinds = {placed.kind: color for placed, color in zip(placed_views, colors, strict=True)}
     rows = [f"{_swatch(kinds['training'])} fitted to"] if "training" in kinds else []
     rows += [f"{_swatch(kinds['held out'])} not fitted to, no score"] if "held out" in kinds else []
     if ends is not None:
@@ -54,11 +54,11 @@ def legend(stations: Sequence[Station], title: str) -> str:
     return _block("drgs-legend", rows or ["no cameras"])
 
 
-def photograph(station: Station, sight: Sight) -> str:
+def photograph(placed: PlacedView, sight: Sight) -> str:
     """What is known of a place: its name, what it was used for, its score and the parts of that."""
     camera = sight.camera
     rows = [f"<b>{escape(camera.name)}</b>"]
-    used = {"training": "fitted to", "held out": "not fitted to", "candidate": "candidate"}[station.kind]
+    used = {"training": "fitted to", "held out": "not fitted to", "candidate": "candidate"}[placed.kind]
     size = f"{camera.width}x{camera.height}"
     rows.append(f"{used}, {size}" + ("" if camera.time is None else f", time {camera.time:g}"))
     if sight.pick is not None:

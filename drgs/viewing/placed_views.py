@@ -1,4 +1,4 @@
-"""Where photographs were taken, or could be, and what a selection says of each."""
+"""Places where photographs were taken, or could be, and what a selection says of each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drgs.guards.json_files import check_json, read_json
 if TYPE_CHECKING:
     from drgs.data import View
 
-__all__ = ["Ranking", "Score", "Sight", "Station", "read_ranking", "scale_colors", "score_colors", "stations_of"]
+__all__ = ["Ranking", "Score", "Sight", "PlacedView", "read_ranking", "scale_colors", "score_colors", "placed_views_of"]
 
 Kind = Literal["training", "held out", "candidate"]
 
@@ -33,8 +33,8 @@ class Score:
     Attributes:
         total: The score.
         parts: Group of parameters -> its part of it.
-        rank: From 1, of the views that were scored with it.
-        of: How many these were.
+        rank: Rank among the views that were scored with it, from 1.
+        of: Number of these views.
     """
 
     total: float
@@ -48,10 +48,10 @@ class Ranking:
     """A selection: views with scores, and which of them were picked.
 
     Attributes:
-        title: By what they were scored.
+        title: Policy and criterion that the views were scored by.
         scores: Name -> score.
-        picked: Names, the first pick first.
-        cameras: Of candidates, where the file has them: they may be of no data set.
+        picked: Names of the picks, the first one first.
+        cameras: Cameras of candidates, where the file has them: they may be of no data set.
     """
 
     title: str
@@ -65,10 +65,10 @@ class Sight:
     """What was seen from a place at one time.
 
     Attributes:
-        camera: With the view's name and time, undistorted.
-        photograph: Reads it, at most so many pixels wide: (H, W, 3) float in [0, 1]; None: there is none.
-        score: None where it has none.
-        pick: Its number among the picks, from 1; None: not picked.
+        camera: Camera with the view's name and time, undistorted.
+        photograph: Function that reads the photograph, at most so many pixels wide: (H, W, 3) float in [0, 1]; or None.
+        score: Score of the view; None where it has none.
+        pick: Number of the view among the picks, from 1; None: not picked.
     """
 
     camera: Camera
@@ -78,12 +78,12 @@ class Sight:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Station:
+class PlacedView:
     """A place where a camera stands, with a lens: of synchronous cameras there is one for all times.
 
     Attributes:
-        kind: `training` if one of its views was fitted to.
-        sights: In the order of their times; at least one.
+        kind: Use of its views; `training` if one of them was fitted to.
+        sights: What was seen from here, in the order of the times; at least one.
     """
 
     kind: Kind
@@ -91,7 +91,7 @@ class Station:
 
     @property
     def camera(self) -> Camera:
-        """Of its first sight."""
+        """Camera of its first sight."""
         return self.sights[0].camera
 
     @property
@@ -107,13 +107,13 @@ class Station:
         return min(timed, key=lambda sight: abs((sight.camera.time or 0.0) - time))
 
 
-def stations_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranking | None) -> tuple[Station, ...]:
-    """The places of a data set's views, and of the candidates that a ranking states cameras of.
+def placed_views_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranking | None) -> tuple[PlacedView, ...]:
+    """Places of a data set's views, and of the candidates that a ranking states cameras of.
 
     Args:
-        views: Of the data set, without their images.
-        fitted: Names of those that were fitted to.
-        ranking: Scores of some of them.
+        views: Views of the data set, without their images.
+        fitted: Names of the views that were fitted to.
+        ranking: Scores of some of the views.
     """
     known = set(fitted)
     scores = {} if ranking is None else ranking.scores
@@ -139,7 +139,7 @@ def stations_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranking |
         kinds = {kind for kind, _ in sights}
         kind = next(kind for kind in ("training", "candidate", "held out") if kind in kinds)
         ordered = sorted((sight for _, sight in sights), key=lambda sight: sight.camera.time or 0.0)
-        made.append(Station(kind, tuple(ordered)))
+        made.append(PlacedView(kind, tuple(ordered)))
     return tuple(made)
 
 
@@ -177,22 +177,22 @@ def read_ranking(path: Path) -> Ranking:
     )
 
 
-def score_colors(stations: Sequence[Station]) -> tuple[list[tuple[int, int, int]], tuple[float, float] | None]:
+def score_colors(placed_views: Sequence[PlacedView]) -> tuple[list[tuple[int, int, int]], tuple[float, float] | None]:
     """A color for each place, and the scores at the ends of their scale; None where no candidate has one.
 
     Places of photographs that were fitted to are blue, those without a score gray.
     """
-    totals = [station.best.score.total for station in stations if station.kind == "candidate" and station.best.score]
+    totals = [placed.best.score.total for placed in placed_views if placed.kind == "candidate" and placed.best.score]
     if not totals:
-        return [_TRAINING if station.kind == "training" else _PLAIN for station in stations], None
+        return [_TRAINING if placed.kind == "training" else _PLAIN for placed in placed_views], None
     low, high = min(totals), max(totals)
     colors = []
-    for station in stations:
-        if station.kind == "candidate" and station.best.score:
-            share = (station.best.score.total - low) / (high - low) if high > low else 1.0
+    for placed in placed_views:
+        if placed.kind == "candidate" and placed.best.score:
+            share = (placed.best.score.total - low) / (high - low) if high > low else 1.0
             colors.append(_on_scale(share))
         else:
-            colors.append(_TRAINING if station.kind == "training" else _PLAIN)
+            colors.append(_TRAINING if placed.kind == "training" else _PLAIN)
     return colors, (low, high)
 
 
@@ -223,7 +223,7 @@ def _scores(where: str, rows: list[dict[str, Any]]) -> dict[str, Score]:
 
 
 def _reader(view: View) -> Callable[[int], np.ndarray]:
-    """Reads a view's photograph, reduced; the file is opened at the first call."""
+    """A function that reads a view's photograph, reduced; the file is opened at its first call."""
 
     def read(width: int) -> np.ndarray:
         seen = view.checked()

@@ -14,9 +14,9 @@ from drgs.cameras import Camera, intrinsics
 
 __all__ = ["Pose", "camera_of", "looking", "pose_of"]
 
-_WIDEST = math.radians(150.0)  # of a client's view; a wider one is drawn so wide
+_WIDEST = math.radians(150.0)  # widest view of a client; a wider one is drawn so wide
 _LARGEST = 1 << 15  # pixels of a side of a window
-_FARTHEST = 1e30  # of a coordinate: its square is a number, too
+_FARTHEST = 1e30  # largest coordinate: its square is a number, too
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Pose:
 
     Attributes:
         wxyz: (4,) quaternion of camera to world, not 0.
-        position: (3,) of the camera.
+        position: (3,) center of the camera.
         fov: Vertical field of view in radians.
         aspect: Width over height.
     """
@@ -42,8 +42,10 @@ class Pose:
         Whatever the client sent may be here: zeros, NaN, lists of another length, text.
 
         Args:
-            wxyz, position, fov: As in a pose; the quaternion of any length but 0.
-            width, height: Pixels, at least 1.
+            wxyz: Quaternion of camera to world, of any length but 0.
+            position: Center of the camera.
+            fov: Vertical field of view in radians.
+            width, height: Size of the window in pixels, at least 1.
         """
         try:
             given = np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in (wxyz, position, fov, width, height)])
@@ -53,7 +55,7 @@ class Pose:
             return None
         quaternion = given[:4]
         place = given[4:7]
-        (angle, across, down) = given[7:]
+        angle, across, down = given[7:]
         length = float(np.linalg.norm(quaternion))
         if (
             length < 1 / _FARTHEST
@@ -68,7 +70,7 @@ class Pose:
         """Whether both show the same picture, to a small part of a pixel."""
         if other is None:
             return False
-        reach = 1e-6 * (1.0 + float(np.abs(self.position).max()))
+        reach = 1e-6 * (1.0 + float(np.abs(self.position).max()))  # what the client's float32 loses of a coordinate
         turn = abs(float(self.wxyz @ other.wxyz)) / float(np.linalg.norm(self.wxyz) * np.linalg.norm(other.wxyz))
         return bool(
             np.abs(self.position - other.position).max() < reach
@@ -82,12 +84,12 @@ def camera_of(pose: Pose, width: int, height: int, origin: np.ndarray, time: flo
     """The camera that shows what the client shows.
 
     Args:
-        pose: The client's.
-        width, height: Pixels of the image; the vertical field of view is exact, whatever they are.
-        origin: (3,) of the Gaussians: world coordinates of the client's 0.
-        time: Of the view.
+        pose: Pose of the client's camera.
+        width, height: Size of the image in pixels; the vertical field of view is exact, whatever it is.
+        origin: (3,) origin of the Gaussians: world coordinates of the client's 0.
+        time: Time of the view.
     """
-    focal = 0.5 * height / math.tan(0.5 * min(pose.fov, _WIDEST))
+    focal = 0.5 * height / math.tan(0.5 * min(pose.fov, _WIDEST))  # at 180 degrees the tangent is infinite
     K = intrinsics(focal * width / (height * pose.aspect), focal, width / 2, height / 2)
     w2c = np.eye(4)
     w2c[:3, :3] = _rotation(pose.wxyz).T
@@ -96,11 +98,11 @@ def camera_of(pose: Pose, width: int, height: int, origin: np.ndarray, time: flo
 
 
 def pose_of(camera: Camera, origin: np.ndarray) -> Pose:
-    """Where the client stands to see what a camera sees; an optical axis off the middle stays out, and so does a lens.
+    """The client's pose that shows what a camera sees; an optical axis off the middle stays out, and so does a lens.
 
     Args:
-        camera: In the world.
-        origin: (3,) of the Gaussians.
+        camera: Camera in the world.
+        origin: (3,) origin of the Gaussians: world coordinates of the client's 0.
     """
     c2w = camera.c2w
     fov = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])

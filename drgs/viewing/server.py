@@ -1,4 +1,4 @@
-"""Starts viser behind the gate, and gives every browser a session."""
+"""The viewer: viser behind the gate, with a session for every browser."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ __all__ = ["Viewer"]
 
 _log = logging.getLogger(__name__)
 
-# of the distance to what is looked at: where the client's pictures begin and end
-_NEAR = 1e-3
-_FAR = 1e3
-# jobs that can wait
+_NEAR = 1e-3  # times the distance to what is looked at: where the client's pictures begin
+_FAR = 1e3  # times that distance: where they end
+# Keys of jobs that can wait.
 _LEARNING = "uncertainty"
 _LEFT = "what browsers have left"
 
@@ -35,10 +34,11 @@ class Viewer:
 
     Args:
         subject: What is looked at first.
-        host, port: Where it listens; port 0 is any that is free.
-        token: What a browser must know; None: nothing on this machine, else one that is made up.
-        preset: How our pictures are drawn at first.
-        pixels: Of a picture, at most.
+        host: Name or address to listen at.
+        port: Port to listen at; 0 is any that is free.
+        token: Token that a browser must know; None: none on this machine, else one that is made up.
+        preset: Preset that our pictures are drawn by at first.
+        pixels: Largest number of pixels of a picture.
     Raises:
         ValueError: If there is no such address, the port is taken, or the token is none.
     """
@@ -96,7 +96,7 @@ class Viewer:
         return self.worker.close(seconds)
 
     def _place(self) -> None:
-        """Where browsers begin, and what the page looks like."""
+        """Tell viser where browsers begin, and what the page looks like."""
         subject, server = self.subject, self._server
         first = subject.first
         bright = sum(subject.background) > 1.5
@@ -156,7 +156,7 @@ class Viewer:
                 return
 
     def _tell(self, subject: Subject, uncertainty: Uncertainty) -> None:
-        """Who waits for it how many photographs have been added."""
+        """Tell those who wait for it how many photographs have been added."""
         of = f" of {subject.state}" if subject.state else ""
         for session in self._waiting():
             session.say(

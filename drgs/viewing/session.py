@@ -22,7 +22,7 @@ from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
 from drgs.viewing.drawing import stages
 from drgs.viewing.layers import UNCERTAINTY, Layer, tinted
-from drgs.viewing.placed_views import Station, score_colors
+from drgs.viewing.placed_views import PlacedView, score_colors
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.splats import ClientGaussians
 
@@ -42,9 +42,9 @@ REST = 0.3
 _PRESETS = ("exact", "fast", "gsplat")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
-_COVERS = 0.5  # of half a view's narrower side: a frustum that reaches farther is hidden
+_COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
-_MOMENTS = 48  # at most so many times in a round of playing
+_MOMENTS = 48  # times in a round of playing, at most
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
 
@@ -53,13 +53,13 @@ class Session:
     """A browser that has connected.
 
     Args:
-        client: viser's handle.
+        client: viser's handle of the browser.
         subject: What is looked at.
-        worker: Computes.
-        preset: How it is drawn at first.
-        pixels: Of a picture, at most.
-        wants: Called when the layer needs what is not known yet.
-        learnt: The last subject whose uncertainty is known; None before there is one.
+        worker: The thread that computes.
+        preset: Preset that our pictures are drawn by at first.
+        pixels: Largest number of pixels of a picture.
+        wants: Function that is called when the layer needs what is not known yet.
+        learnt: Function that returns the last subject whose uncertainty is known; None before there is one.
     """
 
     def __init__(
@@ -80,10 +80,9 @@ class Session:
         self._learnt = learnt
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
-        self._wanted = 0
-        # pictures that were drawn to the end
+        self._wanted = 0  # number of the picture that is wanted; another one's is left
         self._is_closed = False
-        self.drawn = 0
+        self.drawn = 0  # pictures that were drawn to the end
         self._is_over = False  # our picture lies there, and the Gaussians are hidden
         self.scale: ColorScale | None = None  # of the picture that lies there
         self._gaussians: Any = None
@@ -99,7 +98,7 @@ class Session:
         self._widen()
         self._build(preset)
         self._send_gaussians()
-        self._show_stations()
+        self._show_placed_views()
         self._ask_later()
         client.camera.on_update(self._camera_moved)
 
@@ -118,7 +117,7 @@ class Session:
     # ---------------------------------------------------------------------------------------- panel
 
     def _build(self, preset: str) -> None:
-        """What stands in the panel."""
+        """Build what stands in the panel."""
         gui = self.client.gui
         subject = self.subject
         is_narrow = self.size[0] <= _NARROW
@@ -136,7 +135,7 @@ class Session:
             )
         self._status = gui.add_html(panel.status(""))
         self._build_times()
-        folder = gui.add_folder("cameras", visible=bool(subject.stations), expand_by_default=not is_narrow)
+        folder = gui.add_folder("cameras", visible=bool(subject.placed_views), expand_by_default=not is_narrow)
         with folder as self._cameras:
             self._are_shown = gui.add_checkbox("show", True, hint="Click on one to fly there.")
             self._legend = gui.add_html("")
@@ -145,10 +144,10 @@ class Session:
             self._photograph = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
         for handle in (self._layer, self._preset, self._ours):
             handle.on_update(self._choice_made)
-        self._are_shown.on_update(self._stations_toggled)
+        self._are_shown.on_update(self._placed_views_toggled)
 
     def _build_times(self) -> None:
-        """The slider and the button of what moves; neither where nothing does, or no longer."""
+        """Build the slider and the button of what moves; neither where nothing does, or no longer."""
         gui, times = self.client.gui, self.subject.times
         self._stop_playing()
         for handle in (self._slider, self._button):
@@ -179,8 +178,8 @@ class Session:
         if subject.times != before.times:
             self._build_times()
         self._send_gaussians()
-        if subject.stations is not before.stations:
-            self._show_stations()
+        if subject.placed_views is not before.placed_views:
+            self._show_placed_views()
         if not keeps:
             self._ask_later()
 
@@ -253,7 +252,7 @@ class Session:
             self._button.label = "play"
 
     async def _play(self) -> None:
-        """Goes through all times, again and again, as fast as the Gaussians of each can be sent."""
+        """Go through all times, again and again, as fast as the Gaussians of each can be sent."""
         assert self._slider is not None
         first, last = self.subject.times[0], self.subject.times[-1]
         count = min(_MOMENTS, len(self.subject.times))
@@ -269,25 +268,25 @@ class Session:
             while self._worker.has((self, "gaussians")):
                 await asyncio.sleep(0.02)
 
-    async def _stations_toggled(self, _: Any) -> None:
+    async def _placed_views_toggled(self, _: Any) -> None:
         self._show_frusta()
 
     # -------------------------------------------------------------------------------------- cameras
 
-    def _show_stations(self) -> None:
-        """A frustum for each place, in the color of its score."""
+    def _show_placed_views(self) -> None:
+        """Draw a frustum for each place, in the color of its score."""
         for frustum in self._frusta:
             frustum.remove()
         subject = self.subject
         self._frusta = []
-        colors, _ = score_colors(subject.stations)
-        self._cameras.visible = bool(subject.stations)
-        self._legend.content = panel.legend(subject.stations, subject.ranking.title if subject.ranking else "")
-        eyes = np.array([station.camera.center - subject.origin for station in subject.stations]).reshape(-1, 3)
+        colors, _ = score_colors(subject.placed_views)
+        self._cameras.visible = bool(subject.placed_views)
+        self._legend.content = panel.legend(subject.placed_views, subject.ranking.title if subject.ranking else "")
+        eyes = np.array([placed.camera.center - subject.origin for placed in subject.placed_views]).reshape(-1, 3)
         away = np.linalg.norm(eyes - subject.first.target, axis=1)
         size = _FRUSTUM * (float(np.median(away)) if len(away) else 1.0) or 1.0
-        for number, (station, color) in enumerate(zip(subject.stations, colors, strict=True)):
-            pose = pose_of(station.camera, subject.origin)
+        for number, (placed, color) in enumerate(zip(subject.placed_views, colors, strict=True)):
+            pose = pose_of(placed.camera, subject.origin)
             frustum = self.client.scene.add_camera_frustum(
                 f"/cameras/{number}",
                 pose.fov,
@@ -302,13 +301,13 @@ class Session:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            frustum.on_click(self._clicked(station))
+            frustum.on_click(self._clicked(placed))
             self._frusta.append(frustum)
         self._reach = size
         self._show_frusta()
 
     def _show_frusta(self) -> None:
-        """All, or none, but for those that the camera stands in or near: they would lie over all that it sees."""
+        """Show all frusta, or none, but for those that the camera stands in or near: they would cover what it sees."""
         near = self._reach / (_COVERS * math.tan(0.5 * self.pose.fov) * min(1.0, self.pose.aspect))
         for frustum in self._frusta:
             away = float(np.linalg.norm(np.asarray(frustum.position) - self.pose.position))
@@ -316,17 +315,17 @@ class Session:
             if frustum.visible != shown:
                 frustum.visible = shown
 
-    def _clicked(self, station: Station) -> Callable[[Any], Any]:
+    def _clicked(self, placed: PlacedView) -> Callable[[Any], Any]:
         """What a click on a frustum does."""
 
         async def clicked(_: Any) -> None:
-            self.visit(station)
+            self.visit(placed)
 
         return clicked
 
-    def visit(self, station: Station) -> None:
+    def visit(self, placed: PlacedView) -> None:
         """Fly to a place, and show what is known of it, with its photograph."""
-        sight = station.at(self.time)
+        sight = placed.at(self.time)
         camera = self.client.camera
         pose = pose_of(sight.camera, self.subject.origin)
         with self.client.atomic():
@@ -339,7 +338,7 @@ class Session:
             self._slider.value = self.subject.moment(sight.camera.time)
         self._hide()
         self._ask_later()
-        self._about.content = panel.photograph(station, sight)
+        self._about.content = panel.photograph(placed, sight)
         self._view.visible = True
         self._photograph.visible = False
         if sight.photograph is not None:
@@ -387,7 +386,7 @@ class Session:
         yield
 
     def _clear(self) -> None:
-        """Nothing behind the Gaussians but the background. From any thread, with the lock."""
+        """Leave nothing behind the Gaussians but the background. From any thread, with the lock."""
         plain = np.broadcast_to(to_bytes(np.array(self.subject.background, np.float32)), (2, 2, 3))
         self.client.scene.set_background_image(np.ascontiguousarray(plain), format="png")
 
@@ -468,8 +467,8 @@ class Session:
         """Steps of a drawing, saying how much of it is done, and how long the rest will take.
 
         Args:
-            text: What is drawn.
-            expected: Seconds, by the pixels of a picture before it; 0 where there was none.
+            text: Name of what is drawn.
+            expected: Seconds that it takes by the pixels of a picture before it; 0 where there was none.
         """
         self.say(f"{text}, about {_seconds(expected)} ..." if expected else f"{text} ...")
         began = time.perf_counter()
@@ -489,7 +488,7 @@ class Session:
         return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_known
 
     def _seen_pose(self) -> tuple[Pose, tuple[int, int]] | None:
-        """Where the client's camera is, and the pixels of its window; None where it has said nothing that is one."""
+        """Pose of the client's camera and pixels of its window; None where it has said nothing that is one."""
         camera = self.client.camera
         return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
 

@@ -12,10 +12,10 @@ from drgs.ellipsoids import Y_00, Gaussians, semi_axes
 __all__ = ["ClientGaussians"]
 
 _LARGE = 64.0  # units of the client's lengths that the larger Gaussians have as their standard deviation
-_QUANTILE = 0.999  # which Gaussians those are
-_MOST = 60_000.0  # of a covariance's entry: half floats end at 65,504
-_FARTHEST = 1e30  # of a coordinate: what is farther is nowhere to be seen, and float32 ends
-_SMALLEST = 1e-30  # of the larger Gaussians, in the world's unit
+_QUANTILE = 0.999  # quantile of the sizes that says which Gaussians those are
+_MOST = 60_000.0  # largest entry of a covariance: half floats end at 65,504
+_FARTHEST = 1e30  # largest coordinate: what is farther is nowhere to be seen, and float32 ends
+_SMALLEST = 1e-30  # smallest size of the larger Gaussians, in the world's unit: its inverse is a float32, too
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class ClientGaussians:
     are drawn as they are, those above 3.8 times that as large. All of it is finite, whatever the Gaussians are.
 
     Attributes:
-        centers: (N, 3) float32.
-        covariances: (N, 3, 3) float32.
-        rgbs: (N, 3) uint8.
-        opacities: (N, 1) float32.
-        scale: The client divides by it what lengths were multiplied by: 1 / factor.
+        centers: (N, 3) float32, relative to the origin, in the client's lengths.
+        covariances: (N, 3, 3) float32, in the client's lengths squared.
+        rgbs: (N, 3) uint8 colors.
+        opacities: (N, 1) float32 in [0, 1].
+        scale: World units of a client's length, 1 / the factor that lengths were multiplied by.
     """
 
     centers: np.ndarray
@@ -42,22 +42,24 @@ class ClientGaussians:
 
     @classmethod
     def of(cls, g: Gaussians, rgbs: np.ndarray | None = None) -> ClientGaussians:
-        """Gaussians relative to their origin.
+        """Convert Gaussians; they are sent relative to their origin.
 
         Args:
-            g: At one time.
-            rgbs: (N, 3) uint8; None: their color of degree 0, which is the mean over all directions.
+            g: Gaussians at one time.
+            rgbs: (N, 3) uint8 colors; None: their color of degree 0, which is the mean over all directions.
         """
-        with torch.no_grad():  # to be looked at
+        with torch.no_grad():  # what a browser is sent has no derivative, and NumPy takes no tensor that has one
             scales = g.scales.double()  # may be infinite: float32 ends at the exponential of 88
             sizes = scales.amax(1).cpu().numpy()
             large = float(np.quantile(sizes, _QUANTILE)) if len(sizes) else 1.0
             factor = _LARGE / large if _SMALLEST < large < 1 / _SMALLEST else 1.0
+            # An infinite scale times a 0 of the rotation would be NaN; the products stay below half floats' end.
             axes = semi_axes(g.quats.double(), (scales * factor).clamp_max(_MOST**0.5))
             covariances = (axes @ axes.transpose(1, 2)).float().clamp(-_MOST, _MOST).cpu().numpy()
             if rgbs is None:
-                color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)
+                color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)  # bytes would wrap around
                 rgbs = (255 * color).round().to(torch.uint8).cpu().numpy()
+            # Beyond float32 a center would be infinite, which the client draws nothing of, neighbors included.
             centers = (g.means.double() * factor).clamp(-_FARTHEST, _FARTHEST).float().cpu().numpy()
             opacities = g.opacities.float()[:, None].cpu().numpy()
         return cls(centers, covariances, rgbs, opacities, 1.0 / factor)

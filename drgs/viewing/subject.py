@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.viewing.layers import Layer
-from drgs.viewing.placed_views import Ranking, Station
+from drgs.viewing.placed_views import PlacedView, Ranking
 from drgs.viewing.poses import Pose
 from drgs.viewing.uncertainty import Uncertainty
 
@@ -23,11 +23,11 @@ __all__ = ["FirstView", "Subject"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FirstView:
-    """Where a browser begins, in the client's frame.
+    """The view at which a browser begins, in the client's frame.
 
     Attributes:
-        pose: Of its camera.
-        target: (3,) the point that it looks at, and turns around.
+        pose: Pose of the browser's camera.
+        target: (3,) point that it looks at, and turns around.
         up: (3,) direction that is up in the capture.
     """
 
@@ -37,7 +37,7 @@ class FirstView:
 
     @property
     def distance(self) -> float:
-        """From the camera to what it looks at."""
+        """Distance from the camera to what it looks at."""
         return float(np.linalg.norm(self.target - self.pose.position))
 
 
@@ -46,20 +46,20 @@ class Subject:
     """What is looked at; another one takes its place where a run has gone on.
 
     Attributes:
-        name: Of the file or folder, whatever characters it has.
+        name: Name of the file or folder, whatever characters it has.
         state: How far a fit is, e.g. `step 1200`; empty where nobody knows.
-        count: Of Gaussians.
+        count: Number of Gaussians.
         scene: What is drawn.
-        origin: (3,) of the Gaussians: world coordinates of the client's 0.
-        times: Of a scene that moves, ascending; else none.
-        settings: Preset -> how it is drawn.
-        layers: Which pictures there are.
-        stations: Where photographs were taken or could be.
-        ranking: What says so.
+        origin: (3,) origin of the Gaussians: world coordinates of the client's 0.
+        times: Times of a scene that moves, ascending; empty for one that does not.
+        settings: Function of a preset's name: the settings that the scene is drawn by.
+        layers: Pictures that there are of it.
+        placed_views: Places where photographs were taken or could be.
+        ranking: Selection that scored these; None where there is none.
         uncertainty: What the layer of that name shows; None where there is none.
-        first: Where a browser begins.
+        first: View at which a browser begins.
         background: RGB in [0, 1].
-        notes: What else to say, a line each: why something is not there.
+        notes: Lines that say what is not there, and why.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Subject:
     times: tuple[float, ...]
     settings: Callable[[str], RenderSettings]
     layers: tuple[Layer, ...]
-    stations: tuple[Station, ...]
+    placed_views: tuple[PlacedView, ...]
     ranking: Ranking | None
     uncertainty: Uncertainty | None
     first: FirstView
@@ -81,7 +81,8 @@ class Subject:
         """The time at which it is looked at by who wants a time: one that it has; None where nothing moves.
 
         Args:
-            time: Wanted: of a slider, a photograph, or of what was looked at before, which may have had none or others.
+            time: Wanted time, of a slider, a photograph, or of what was looked at before, which may have had none or
+                others.
         """
         if not self.times:
             return None

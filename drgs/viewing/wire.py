@@ -29,8 +29,8 @@ def bound_socket(host: str, port: int) -> socket.socket:
     """A socket that listens.
 
     Args:
-        host: A name or an address.
-        port: 0 is any that is free.
+        host: Name or address to listen at.
+        port: Port to listen at; 0 is any that is free.
     Raises:
         ValueError: If there is no such address here, or the port is taken.
     """
@@ -49,7 +49,7 @@ def bound_socket(host: str, port: int) -> socket.socket:
 
 @contextlib.contextmanager
 def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
-    """For the length of the block, a server that viser starts listens at a socket, behind a gate.
+    """Let a server that viser starts within the block listen at a socket, behind a gate.
 
     Raises:
         RuntimeError: If viser has started none through it: another version of viser, which is not to be trusted.
@@ -58,14 +58,16 @@ def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
 
     led = []
 
-    def behind(handler: Any, host: Any, port: Any, *, process_request: Callable[..., Any], **options: Any) -> Any:
+    def serve_guarded(
+        handler: Any, host: Any, port: Any, *, process_request: Callable[..., Any], **options: Any
+    ) -> Any:
         led.append(port)
         options |= {"process_request": _asked(gate, process_request), "create_connection": _Answering, "logger": _log}
         return serve(handler, sock=listening, **options)
 
     before = _infra.websockets
     shown = types.SimpleNamespace(**vars(before))
-    shown.asyncio = types.SimpleNamespace(server=types.SimpleNamespace(serve=behind))
+    shown.asyncio = types.SimpleNamespace(server=types.SimpleNamespace(serve=serve_guarded))
     _infra.websockets = shown  # type: ignore[assignment]  # its module, as far as it uses it
     try:
         yield

@@ -16,10 +16,10 @@ _log = logging.getLogger(__name__)
 
 
 class Worker:
-    """Runs jobs, a step of each in turn; those that can wait only where no other is left.
+    """A thread that runs jobs, a step of each in turn; those that can wait only where no other is left.
 
     Args:
-        failed: Called with what a job raised that ended it by that; default the log.
+        failed: Function that is called with a job's key and what it raised, which has ended it; default the log.
     """
 
     def __init__(self, failed: Callable[[Hashable, Exception], None] | None = None) -> None:

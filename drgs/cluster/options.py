@@ -1,11 +1,11 @@
-"""What workers are asked for: checked before anything is loaded, which takes seconds."""
+"""The options that ask for workers, checked before anything is loaded, which takes seconds."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
 
-__all__ = ["check_address", "check_wanted"]
+__all__ = ["check_address", "check_options"]
 
 _MOST = 1024  # local workers
 _ADDRESS = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):(\d{1,5})")
@@ -26,7 +26,7 @@ def check_address(scheduler: str) -> str:
     return f"tcp://{found[1]}:{int(found[2])}"
 
 
-def check_wanted(scheduler: str | None, workers: int | None) -> str | None:
+def check_options(scheduler: str | None, workers: int | None) -> str | None:
     """Refuse what `opened` would, but for what only a connection shows.
 
     Returns:

@@ -1,0 +1,293 @@
+"""Workers behind a scheduler: what they have in common with this process, what they are sent, what they answer.
+
+What single views tell is computed by them: the scene goes to each of them once, views come back one by one. A few views
+for each worker are on their way at any time, so that this process holds no more answers than without workers. They are
+taken in their order, rounded to float32 as they are without workers, and added up here: it does not matter who has
+computed which. A view whose worker has gone is given to another one by Dask; one that has not got the scene, because it
+has started since, says so, is sent it, and the view is asked for again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import platform
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from drgs.cluster.agreement import (
+    Disagreement,
+    check_agreement,
+    statement,
+    this_worker,
+    worker_name,
+    worker_statement,
+)
+from drgs.cluster.payloads import Missing, Payload, keep, opened_payload
+
+if TYPE_CHECKING:
+    from distributed import Client, Future, LocalCluster
+
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Scene
+    from drgs.gain import Information
+    from drgs.information.pool import Question
+
+__all__ = ["WORKER_SECONDS", "Cluster", "ask"]
+
+WORKER_SECONDS = 60.0
+"""Time that a cluster may be without any worker."""
+
+_LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
+_AHEAD = 2  # views on their way for each worker: one that it computes, and the next one
+_TRIES = 20  # how often a worker may say that it misses something
+_log = logging.getLogger(__name__)
+
+
+class Cluster:
+    """Workers behind a scheduler, as `drgs.select` takes them; `opened` makes one.
+
+    Attributes:
+        client: Dask's client.
+        ours: What every worker must have in common with this process.
+        sent_bytes: Bytes that were sent to each worker so far.
+        sent_seconds: Time that it took to send them to all workers.
+        views: Worker -> how many views it has answered for.
+        view_seconds: Wall time of each of these views on its worker.
+        cpu_seconds: CPU time of all of these views together.
+        received_bytes: Size of all answers.
+    """
+
+    def __init__(self, client: Client, local: LocalCluster | None = None) -> None:
+        self.client = client
+        self._local = local
+        self.ours = {**statement()["must"], "threads": "1"}
+        self.sent_bytes = 0
+        self.sent_seconds = 0.0
+        self.received_bytes = 0
+        self.views: Counter[str] = Counter()
+        self.view_seconds: list[float] = []
+        self.cpu_seconds = 0.0
+        self._payloads: dict[str, Payload] = {}  # of the call that is being answered
+        self._is_there = time.monotonic()  # when a worker was seen last
+
+    def each(
+        self, scene: Scene, views: Sequence[tuple[Question, Camera, torch.Tensor | None]]
+    ) -> Iterator[Information]:
+        """What views of a scene say, in their order: question, camera and mask of each.
+
+        Raises:
+            ValueError: As the question does, or if something cannot be pickled, or a worker disagrees.
+            ConnectionError: If the scheduler, or all workers, have gone.
+        """
+        if not views:
+            return
+        questions: list[Question] = []
+        for question, _, _ in views:
+            if not any(question is other for other in questions):
+                questions.append(question)
+        payloads = [self.send(scene), self.send(questions)]
+        self.forget(payloads)
+        pending: dict[int, Future] = {}
+
+        def begin(i: int) -> Future:
+            question, camera, mask = views[i]
+            number = next(k for k, other in enumerate(questions) if other is question)
+            return self.submit(ask, self.ours, *payloads, number, Payload.of((camera, mask)).data)
+
+        try:
+            ahead = max(1, len(self.workers())) * _AHEAD
+            for i in range(len(views)):
+                for j in range(i, min(i + ahead, len(views))):
+                    if j not in pending:
+                        pending[j] = begin(j)
+                what = f"view {views[i][1].name or i}"
+                for _ in range(_TRIES):
+                    said = self.result(pending.pop(i), what)
+                    if "missing" not in said:
+                        break
+                    self.send_again(payloads, [said["address"]])
+                    pending[i] = begin(i)
+                else:
+                    raise ConnectionError(
+                        f"cluster: worker {said['worker']} must keep what it is sent, does not; restart it"
+                    )
+                self.views[said["worker"]] += 1
+                self.view_seconds.append(said["seconds"])
+                self.cpu_seconds += said["cpu_seconds"]
+                self.received_bytes += sum(getattr(x, "nbytes", 8) for x in said["answer"].values())
+                yield _tensors(said["answer"])
+        finally:
+            if pending:
+                self.client.cancel(list(pending.values()))
+
+    def workers(self) -> dict[str, str]:
+        """Address -> name of each worker there is now."""
+        found = self.client.scheduler_info(n_workers=-1)["workers"]
+        return {address: worker_name(address, one["name"]) for address, one in found.items()}
+
+    def workers_of(self, host: str | None) -> list[str]:
+        """Addresses of those that run on a machine."""
+        nodes = self.client.run(platform.node, on_error="ignore")
+        return [address for address, node in nodes.items() if node == host]
+
+    def check(self) -> None:
+        """Ask every worker what it computes with.
+
+        Raises:
+            Disagreement: If one differs in what must agree.
+        """
+        info = self.client.scheduler_info(n_workers=-1)["workers"]
+        found = self.client.run(worker_statement(), on_error="return")
+        machines = set()
+        for address, said in sorted(found.items()):
+            name = worker_name(address, info[address]["name"] if address in info else address)
+            if isinstance(said, OSError):
+                continue  # it has gone
+            if isinstance(said, BaseException):
+                raise Disagreement(
+                    f"cluster: worker {name} must be able to load drgs, cannot: {said}; install it there"
+                )
+            check_agreement(name, said, self.ours)
+            if (threads := info.get(address, {}).get("nthreads", 1)) != 1:
+                raise Disagreement(
+                    f"cluster: worker {name} must do one task at a time, does {threads}; start it with --nthreads 1"
+                )
+            machines.add((said["may"].get("processor"), said["may"].get("LLVM")))
+        if len(machines) > 1:
+            shown = "; ".join(f"{processor}, LLVM {llvm}" for processor, llvm in sorted(machines, key=str))
+            _log.warning("cluster: workers are unlike each other (%s): last digits depend on which gets a view", shown)
+
+    def send(self, thing: object) -> str:
+        """See to it that all workers have something; the digest under which they know it."""
+        payload = Payload.of(thing)
+        if payload.digest not in self._payloads:
+            self._payloads[payload.digest] = payload
+            self.send_again([payload.digest])
+        return payload.digest
+
+    def send_again(self, digests: Sequence[str], workers: list[str] | None = None) -> None:
+        """Send what has been sent before, to some workers; None: to all."""
+        began = time.perf_counter()
+        for digest in digests:
+            for piece in self._payloads[digest].pieces():
+                # A worker that cannot be reached will say that it misses something, or never say anything again.
+                self.client.run(keep, *piece, workers=workers, on_error="ignore")
+            self.sent_bytes += len(self._payloads[digest].data) if workers is None else 0
+        self.sent_seconds += time.perf_counter() - began
+
+    def forget(self, keeping: Sequence[str] = ()) -> None:
+        """Drop the bytes of what was sent, which would be kept for workers that come later."""
+        self._payloads = {digest: self._payloads[digest] for digest in keeping if digest in self._payloads}
+
+    def submit(self, function: Callable, *args: Any) -> Future:
+        """A task for whichever worker is free."""
+        return self.client.submit(function, *args, pure=False)
+
+    def result(self, future: Future, what: str) -> Any:
+        """What a task returned, or raised; `what` it is, for messages.
+
+        Raises:
+            ConnectionError: If the scheduler or all workers have gone, or workers die of it.
+        """
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        while not done.wait(_LOOK):
+            self.check_alive()
+        return self.finished(future, what)
+
+    def finished(self, future: Future, what: str) -> Any:
+        """`result` of a task that is done."""
+        from concurrent.futures import CancelledError
+
+        from distributed.scheduler import KilledWorker
+
+        try:
+            return future.result()
+        except CancelledError:
+            raise ConnectionError(f"cluster: the scheduler must stay until {what} is done, it has gone") from None
+        except KilledWorker as error:
+            raise ConnectionError(
+                f"cluster: workers must survive {what}, {error.allowed_failures + 1} of them died of it; look at their "
+                "logs, they may need more memory"
+            ) from None
+
+    def check_alive(self) -> None:
+        """Find out whether there is still somebody who works.
+
+        Raises:
+            ConnectionError: If the scheduler has gone, or there have been no workers for `WORKER_SECONDS`.
+        """
+        now = time.monotonic()
+        if self.client.status != "running":
+            raise ConnectionError("cluster: the scheduler must stay until all is done, it has gone; start it again")
+        if self.client.scheduler_info(n_workers=-1)["workers"]:
+            self._is_there = now
+        elif now - self._is_there > WORKER_SECONDS:
+            raise ConnectionError(
+                f"cluster: there must be a worker, there was none for {WORKER_SECONDS:.0f} s; start some, then do it "
+                "again"
+            )
+
+    def close(self) -> None:
+        """Leave the cluster; workers of this machine end at once, whatever they do."""
+        self.forget()
+        if self._local is not None:
+            from distributed.core import Status
+
+            for nanny in list(self._local.workers.values()):
+                pid = nanny.pid
+                nanny.status = Status.closing_gracefully  # else it would start another one
+                if pid:
+                    with contextlib.suppress(OSError):
+                        os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(Exception):
+            self.client.close(timeout=2)
+        if self._local is not None:
+            with contextlib.suppress(Exception):
+                self._local.close(timeout=5)
+
+
+def _tensors(answer: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    """Arrays of a message, which is read-only, as tensors of their own."""
+    return {name: torch.from_numpy(np.array(x)) for name, x in answer.items()}
+
+
+# --------------------------------------------------------------------------------------------------- on the worker
+
+
+def ask(ours: Mapping[str, str], scene: str, questions: str, number: int, view: bytes) -> dict[str, Any]:
+    """Compute what one view says, on a worker.
+
+    Args:
+        ours: What the worker must agree with.
+        scene: Digest of the payload that holds the scene.
+        questions: Digest of the payload that holds the list of questions.
+        number: Index of the view's question in that list.
+        view: Camera and mask, pickled.
+    Returns:
+        `answer`, arrays by name, `seconds` and the process's `cpu_seconds`; or what is `missing`; always `worker`, its
+        `address` and its `host`.
+    """
+    said: dict[str, Any] = {**this_worker()}
+    check_agreement(said["worker"], statement(), ours)
+    began, cpu = time.perf_counter(), time.process_time()
+    try:
+        seen, asked = opened_payload(scene), opened_payload(questions)
+    except Missing as missing:
+        return said | {"missing": str(missing)}
+    camera, mask = pickle.loads(view)
+    found = asked[number](seen, camera, mask)
+    # An answer is numbers; a graph of the worker's process could not travel.
+    answer = {name: x.detach().cpu().numpy() for name, x in found.items()}
+    seconds = time.perf_counter() - began
+    return said | {"answer": answer, "seconds": seconds, "cpu_seconds": time.process_time() - cpu}

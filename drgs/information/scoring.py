@@ -1,0 +1,166 @@
+"""How a view is scored, as one frozen record; imports nothing heavy, for the options of the command line read it."""
+
+from __future__ import annotations
+
+import dataclasses
+import numbers
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+from drgs.guards.arguments import kind_of, must_be
+from drgs.guards.records import TRANSIENT, Record
+from drgs.information.choices import (
+    BLOCK_NAMES,
+    COMBINES,
+    CRITERION_NAMES,
+    METHODS,
+    NETWORK_SCORES,
+    Block,
+    Combine,
+    Criterion,
+    Method,
+    NetworkScore,
+    check_combined,
+    checked_blocks,
+)
+from drgs.information.prior import Prior
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians, Scene
+    from drgs.information.semantics import SemanticMetric
+
+__all__ = ["Scoring"]
+
+_KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
+
+
+@dataclasses.dataclass(frozen=True)
+class Scoring(Record):
+    """How much a view counts: what is computed of it, and how that becomes a number.
+
+    `prior`: None is 1e-2 of criterion `v_opt`, for colors that are known to 0.3 beforehand and photographs to 0.03;
+    else 1e-6, as in FisherRF. Policy `coverage` takes its `value`, not its `groups`.
+
+    `blocks`: `geometry` is what the colors of an image tell about all but the features; `semantic`, what its decoded
+    features tell about the features and, coupled, about the geometry; `deformation`, what both tell, as far as the
+    other two blocks are named, else the colors, about the network that moves the Gaussians, groups `grid` and `mlp`;
+    `backdrop`, what its opacity tells about what is behind all Gaussians. None is all that the scene has (method
+    `fisherrf` knows colors of Gaussians only, `block_logdet` these and features).
+
+    `network`: `ratio` scores the diagonal of the block `deformation` by `criterion` against that of the known views,
+    like all other groups; `trace` and `paper` go by what a candidate says itself, whatever is known.
+
+    `combine`: `sum` adds up all groups' parts. With `zscore` each block alone is scored by its own information, less
+    the mean and divided by the standard deviation of the candidates (one that is the same for all counts 0), and these
+    are added up. None is `sum`, but `zscore` where a trace stands beside another block, for their units differ.
+
+    Criterion, method, groups and blocks are of policy `fisher`, method and groups not of `block_logdet`; weights are of
+    `fisher` and `fisherrf`. Groups of a scene's network need method `columns` or `probes`.
+
+    Attributes:
+        criterion: Score of policy fisher; v_opt chose the best views from six on, level below (docs/active-static.md).
+        settings: What `drgs.render` computes of a view.
+        method: How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does.
+        prior: How firmly every parameter counts as known beforehand (lambda): 1e-2 with v_opt, 1 in drgs fisher, else
+            1e-6.
+        weights: Group -> factor of its part of the score; 1 where none is given.
+        groups: Groups of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that there are.
+        blocks: What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop
+            (gaps).
+        semantics: Metric of the block semantic; None: that of features as they are stored, all channels alike.
+        network: How the block deformation scores: against what known views say of the field (ratio), or alone (trace,
+            paper).
+        combine: Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace.
+        probes: Random probes of each view, for what it tells about a deformation field, and for --method probes.
+    Raises:
+        ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
+            the wrong kind.
+    """
+
+    criterion: Criterion = CRITERION_NAMES[0]
+    settings: RenderSettings = dataclasses.field(
+        default_factory=lambda: RenderSettings.preset("exact"), metadata=TRANSIENT
+    )
+    method: Method = METHODS[0]
+    prior: Prior | None = None
+    weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    groups: tuple[str, ...] | None = None
+    blocks: tuple[Block, ...] | None = None
+    semantics: SemanticMetric | None = dataclasses.field(default=None, metadata=TRANSIENT)
+    network: NetworkScore = NETWORK_SCORES[0]
+    combine: Combine | None = None
+    probes: int = 16
+    where: ClassVar[str] = "select"
+
+    def __post_init__(self) -> None:
+        choices: dict[str, tuple[str, ...]] = {
+            "criterion": CRITERION_NAMES,
+            "method": METHODS,
+            "network": NETWORK_SCORES,
+        }
+        for name, known in (choices | ({} if self.combine is None else {"combine": COMBINES})).items():
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
+        must_be("select", "settings", self.settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')
+        if self.prior is not None:
+            must_be("select", "prior", self.prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
+        must_be("select", "weights", self.weights, Mapping, 'e.g. {"means": 0.5}')
+        for group, weight in self.weights.items():
+            must_be("select", f"weights of {group}", weight, numbers.Real, 'e.g. {"means": 0.5}')
+        if self.groups is not None:
+            must_be("select", "groups", self.groups, (tuple, list), 'e.g. ("means", "sh")')
+            if odd := [group for group in self.groups if not isinstance(group, str)]:
+                raise ValueError(f"select: groups must be names of groups, got {kind_of(odd[0])}; correct it")
+            object.__setattr__(self, "groups", tuple(self.groups))  # part of a key of the cache
+        if self.blocks is not None:
+            object.__setattr__(self, "blocks", checked_blocks("select", self.blocks, self.method))
+        check_combined("select", self.blocks, self.criterion, self.network, self.combine)
+        if not (isinstance(self.probes, int) and self.probes >= 1):
+            raise ValueError(f"select: probes must be a whole number >= 1, got {self.probes!r}; try 16")
+        if self.semantics is not None:
+            from drgs.information.semantics import SemanticMetric  # with torch, which an option list does not need
+
+            must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
+
+    def blocks_of(self, gaussians: Gaussians, where: str = "select", scene: Scene | None = None) -> tuple[Block, ...]:
+        """The blocks that are scored of a scene.
+
+        Args:
+            gaussians: As they are at some time of it.
+            where: For messages.
+            scene: Itself; None: it is these Gaussians, which do not move.
+        Raises:
+            ValueError: If one is wanted that the scene does not have.
+        """
+        from drgs.information.network_groups import network_groups
+
+        missing = {
+            "semantic": "for Gaussians without features; fit them to a data set with teacher maps"
+            if gaussians.features is None
+            else "",
+            "deformation": "" if scene and network_groups(scene) else "for a scene that no network moves",
+        }
+        if self.blocks is None:
+            if self.method == "fisherrf":
+                return ("geometry",)
+            if self.criterion == "block_logdet":  # which only Gaussians have
+                return ("geometry", *(("semantic",) if not missing["semantic"] else ()))
+            return tuple(block for block in BLOCK_NAMES if not missing.get(block))
+        for block in self.blocks:
+            if missing.get(block):
+                raise ValueError(
+                    f"{where}: blocks must be of what the scene has, got {block} {missing[block]}, or use geometry"
+                )
+        return self.blocks
+
+    def prior_of(self, policy: str = "fisher") -> Prior:
+        """lambda of a policy by this scoring."""
+        if self.prior is not None:
+            return self.prior
+        return Prior(_KNOWN) if policy == "fisher" and self.criterion == "v_opt" else Prior()
+
+    def combined_of(self, blocks: tuple[Block, ...]) -> Combine:
+        """How the scores of these blocks become one."""
+        traced = "deformation" in blocks and self.network != "ratio"
+        return "sum" if len(blocks) < 2 else self.combine or ("zscore" if traced else "sum")

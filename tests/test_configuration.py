@@ -1,0 +1,385 @@
+"""What a fit does is one configuration, of records by subject: made in Python, by options, and by files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from drgs import cli
+from drgs.commands.config_file import config_fields
+from drgs.commands.option_help import EVERYDAY, HEADINGS, help_page, options_in, written
+from drgs.commands.orbit_keys import ORBIT_KEYS, parsed_orbit
+from drgs.commands.renamed import RENAMED, as_written_now
+from drgs.fitting.config import ActiveConfig, FitConfig, SelectionConfig, recorded_config
+from drgs.guards.records import part_of, texts_of, ways_of
+from drgs.information.prior import Prior
+from drgs.settings import RenderSettings
+
+FULL = FitConfig.of(
+    settings=RenderSettings.preset("gsplat", background=(1.0, 0.5, 0.0)),
+    max_steps=12,
+    max_gaussians=50,
+    test_cameras=("cam00",),
+    grid_rate=(0.1, 0.01),
+    policy="random",
+    add=3,
+    blocks=("geometry", "backdrop"),
+    prior=Prior(1e-3, True, {"sh": 0.5}),
+    weights={"sh": 2.0},
+    groups=("means", "sh"),
+    measure=(3, 4),
+)
+
+
+# ------------------------------------------------------------------------------------------------------- in Python
+
+
+def test_any_field_is_named_alone():
+    """`of` and `replace` put a field where it belongs, however deep, and leave the others as they are."""
+    config = FitConfig.of(max_gaussians=7, criterion="eig", save_every=5)
+    assert config.density.max_gaussians == 7
+    assert config.selection.scoring.criterion == "eig"
+    assert config.replace(max_gaussians=9, seed=1) == dataclasses.replace(
+        config, seed=1, density=dataclasses.replace(config.density, max_gaussians=9)
+    )
+    assert config.replace(selection=None, add=4).selection == SelectionConfig(add=4)
+    assert FitConfig.of() == FitConfig()
+    assert FitConfig().selection is None
+
+
+def test_names_are_unique_and_told():
+    """No two records have a field of the same name, and each has a text that `--help-all` shows."""
+    ways = ways_of(FitConfig)  # asserts it
+    assert len(ways) > 70
+    assert set(ways) == set(texts_of(FitConfig))
+    assert all(
+        text[-1] in ".?)" and text[0].isupper() or text.startswith("lambda") for text in texts_of(FitConfig).values()
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"max_gausians": 5},
+            "FitConfig: there must be a field of the name, got 'max_gausians'; did you mean max_gaussians",
+        ),
+        ({"zzz": 5}, "got 'zzz'; none has a name like it"),
+        ({"max_gaussians": 0}, r"fit: max_gaussians must be a whole number in \[1, 1000000000\], got 0"),
+        ({"data": 3}, "fit: data must be a DataConfig, got 3"),
+        ({"policy": "best"}, "fit: policy must be one of fisher"),
+        ({"weights": {"sh": "x"}}, "weights of sh must be"),
+        ({"static_share": 1.0}, "fit: static_share must be below 1"),
+    ],
+)
+def test_mistakes_are_one_line(fields, message):
+    """A name that is misspelt is refused with the nearest, a value with its range."""
+    with pytest.raises(ValueError, match=message) as error:
+        FitConfig.of(**fields)
+    assert "\n" not in str(error.value)
+
+
+def test_what_ran_before_goes_on():
+    """For a release: flat fields make and are read of the records, `ActiveConfig` makes a selection; each says how it
+    is written now.
+    """
+    with pytest.warns(DeprecationWarning, match=r"FitConfig\(max_gaussians=...\) is written FitConfig.of"):
+        config = FitConfig(max_steps=9, max_gaussians=7)
+    assert config == FitConfig.of(max_steps=9, max_gaussians=7)
+    with pytest.warns(DeprecationWarning, match="FitConfig.max_gaussians is written FitConfig.density.max_gaussians"):
+        assert config.max_gaussians == 7
+    with pytest.warns(DeprecationWarning, match="FitConfig.of"):
+        assert dataclasses.replace(config, noise=2.0).density.noise == 2.0
+    with pytest.warns(DeprecationWarning, match="SelectionConfig.of"):
+        chosen = ActiveConfig(policy="random", prior=1e-3, relative_prior=True)
+    assert chosen == SelectionConfig.of(policy="random", prior=Prior(1e-3, True))
+    with pytest.warns(DeprecationWarning, match="SelectionConfig.scoring.criterion"):
+        assert chosen.criterion == "v_opt"
+    with pytest.raises(AttributeError, match="no attribute 'max_gausians'"):
+        config.max_gausians  # noqa: B018
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert FitConfig(max_steps=9) != config
+
+
+# ------------------------------------------------------------------------------------------------------- as files
+
+
+def test_files_hold_the_records():
+    """What is written is nested JSON and reads back as it was, all fields."""
+    record = json.loads(json.dumps(FULL.to_json()))
+    assert FitConfig.from_json(record) == FULL
+    assert record["density"]["max_gaussians"] == 50
+    assert record["selection"]["scoring"]["prior"] == {"value": 1e-3, "relative": True, "groups": {"sh": 0.5}}
+    assert set(record["selection"]["scoring"]) & {"settings", "semantics"} == set()
+
+
+def test_records_of_older_versions_are_read():
+    """All fields of a fit beside each other, those of its selection beside it, lambda a number and a flag; the first
+    had no `restart`, and never did.
+    """
+    flat, active = {}, FULL.replace(prior=Prior(1e-3, True), weights={}, groups=None).selection.flat()
+    for part in FULL.replace(selection=None).to_json().items():
+        flat |= part[1] if isinstance(part[1], dict) and part[0] != "settings" else dict([part])
+    del flat["selection"], active["weights"], active["groups"], active["restart"]
+    assert {"max_gaussians", "settings", "save_every"} <= set(flat)
+    found = recorded_config(flat, active)
+    assert found == FULL.replace(prior=Prior(1e-3, True), weights={}, groups=None, restart="never")
+
+
+TOML = """
+max_steps = 500
+[settings]
+preset = "gsplat"
+max_hits = 5
+[data]
+test_every = 4
+[selection]
+add = 3
+[selection.scoring]
+criterion = "eig"
+prior = {value = 1e-4}
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    """The same as TOML and JSON, and the folder of a run."""
+    (tmp_path / "a.toml").write_text(TOML)
+    (tmp_path / "run").mkdir()
+    record = {"schema": 2, "command": "fit", "data": "scene", "train": ["a"], "test": [], "fit": FULL.to_json()}
+    (tmp_path / "run/config.json").write_text(json.dumps(record))
+    return tmp_path
+
+
+def _fit(*words: str) -> FitConfig:
+    return cli._parse_arguments(["fit", "scene", "-o", "out", *words]).fit_config()
+
+
+def test_a_file_says_what_options_say(files):
+    """Fields that it leaves out have their defaults; a preset is what its settings are put over."""
+    wanted = FitConfig.of(
+        settings=RenderSettings.preset("gsplat", max_hits=5),
+        max_steps=500,
+        test_every=4,
+        add=3,
+        criterion="eig",
+        prior=Prior(1e-4),
+    )
+    assert _fit("--config", str(files / "a.toml")) == wanted
+    (files / "b.json").write_text(json.dumps({"max_steps": 500, "max_gaussians": 9, "data": {"times": 2}}))
+    assert _fit(f"--config={files / 'b.json'}") == FitConfig.of(max_steps=500, max_gaussians=9, times=2)
+
+
+def test_a_run_is_repeated_from_its_config(files):
+    """Every field, those without an option, too: by its folder or by its file."""
+    for name in ("run", "run/config.json"):
+        assert _fit("--config", str(files / name)) == FULL
+
+
+def test_the_command_line_wins(files):
+    """Over a file, both ways of a flag included; `--views all` leaves a file's selection aside."""
+    run = ["--config", str(files / "run")]
+    assert _fit(*run, "--max-gaussians", "8", "--set", "max_hits=3", "--policy", "uniform") == FULL.replace(
+        settings=FULL.settings.replace(max_hits=3), max_gaussians=8, policy="uniform"
+    )
+    assert _fit(*run, "--views", "all") == FULL.replace(selection=None)
+    (files / "on.json").write_text('{"deterministic": true}')
+    assert _fit("--config", str(files / "on.json")).deterministic
+    assert not _fit("--config", str(files / "on.json"), "--no-deterministic").deterministic
+
+
+def test_select_and_reproduce_take_the_same_file(files, tmp_path):
+    """`select` the settings and what scores views; `reproduce` all, over the fits of its scale."""
+    from drgs.studies.plan import plan_of
+
+    args = cli._parse_arguments(["select", "x", "--candidates", "dome", "--config", str(files / "run")])
+    assert args.scoring() == FULL.selection.scoring
+    assert (args.policy, args.settings()) == ("random", FULL.settings)
+    usual, changed = (
+        plan_of("static", "tiny", tmp_path, policies=["random"], fields=fields).study.fit
+        for fields in ({}, config_fields(files / "a.toml"))
+    )
+    assert changed == usual.replace(**{k: x for k, x in config_fields(files / "a.toml").items() if k != "selection"})
+    assert (changed.max_steps, changed.density.max_gaussians) == (500, usual.density.max_gaussians)
+    args = cli._parse_arguments(["reproduce", "static", "-o", "x", "--config", str(files / "a.toml")])
+    assert args.test_every == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("a.toml", "max_steps = ", "a.toml: must be valid TOML, got"),
+        ("a.json", "{", "a.json: must be valid JSON, got"),
+        (
+            "a.toml",
+            "[density]\nmax_gausians = 3",
+            "a.toml: config must hold known fields, got 'max_gausians'; did you mean",
+        ),
+        (
+            "a.toml",
+            "[density]\nmax_gaussians = 'x'",
+            "a.toml: max_gaussians must be a whole number in [1, 1000000000], got",
+        ),
+        ("a.toml", "max_steps = 2024-01-01", "a.toml: max_steps must be a whole number"),
+        ("a.toml", "density = 3", "a.toml: density must be an object with fields of DensityConfig, got the int 3"),
+        ("a.toml", "[settings]\npreset = 'best'", "a.toml: RenderSettings.preset: name must be one of exact"),
+        (
+            "a.toml",
+            "[settings]\nextend = 3",
+            "a.toml: settings must hold known fields, got 'extend'; did you mean extent?",
+        ),
+        ("a.toml", "[settings]\norder = 'entry'", "a.toml: RenderSettings: order='entry'"),
+        ("a.json", "[1]", "a.json: config must be a dict"),
+        ("a.json", "[" * 100_000, "a.json: must be valid JSON, got one that is nested too deeply"),
+        ("a.toml", "a = " + "[" * 100_000, "a.toml: must be valid TOML"),
+        ("a.toml", "#" * (1 << 20) + "##", "a.toml: must be a configuration of at most 1 MiB, is larger"),
+        ("a.yaml", "a: 1", "--config: must be a .toml or .json file, or a run folder, got"),
+        ("nowhere.toml", None, "nowhere.toml: must be a configuration, found none"),
+    ],
+)
+def test_bad_files_are_one_line(tmp_path, capsys, name, text, told):
+    """With the file and the field; nothing else is done."""
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    assert cli.main(["fit", str(tmp_path), "-o", str(tmp_path / "run"), "--config", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert error.startswith("drgs fit: ")
+    assert not (tmp_path / "run").exists()
+
+
+# ------------------------------------------------------------------------------------------- options that have moved
+
+
+@pytest.mark.parametrize(("row", "command"), [(row, command) for row in RENAMED for command in row.commands])
+def test_options_that_moved_work_as_before(row, command, capsys):
+    """Each does what its new spelling does, with a space or `=`, and says that in one line."""
+    value = {"--up": "z", "--center": "1"}.get(row.old, "30")
+    values = [value] * row.values
+    needed = {"select": ["--candidates", "orbit"]}.get(command, [])
+    old = cli._parse_arguments([command, "x", *needed, row.old, *values])
+    said = capsys.readouterr().err
+    new = row.new.format(*values)
+    assert old == cli._parse_arguments([command, "x", *needed, *new.split()])
+    assert capsys.readouterr().err == ""
+    assert said == f"drgs {command}: {row.old} is written {new} now; the old way ends with the next release\n"
+    if row.values == 1:
+        assert cli._parse_arguments([command, "x", *needed, f"{row.old}={value}"]) == old
+
+
+def test_a_moved_option_without_its_value_is_refused(capsys):
+    """As an option that is unknown; and one of another command is left alone."""
+    with pytest.raises(SystemExit):
+        cli._parse_arguments(["render", "x", "--center", "1", "2"])
+    assert "--center" in capsys.readouterr().err
+    assert as_written_now("fit", ["--up", "z"]) == (["--up", "z"], [])
+    with pytest.raises(SystemExit):
+        cli._parse_arguments(["select", "x", "--candidates", "orbit", "--fov", "30"])
+
+
+def test_keys_of_an_orbit():
+    """Several in one text or in several, points with commas in them; a later one wins."""
+    assert parsed_orbit(["elevation=30,span=180", "center=0,-1,2.5,up=z", "span=90"]) == {
+        "elevation": 30.0,
+        "span": 90.0,
+        "center": (0.0, -1.0, 2.5),
+        "up": (0.0, 0.0, 1.0),
+    }
+    assert parsed_orbit(["up=auto"]) == {"up": None}
+    for text, told in (
+        ("elevatoin=3", "--orbit: must be of a known key, got 'elevatoin=3'; did you mean elevation"),
+        ("elevation", "--orbit: must be KEY=VALUE, got 'elevation'"),
+        ("up=w", "--orbit up must be one of auto, x, y, z, minus-x"),
+        ("center=1,2", "--orbit center must be three numbers, X,Y,Z, got '1,2'"),
+        ("span=wide", "--orbit span must be a number, got 'wide'"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            parsed_orbit([text])
+    with pytest.raises(ValueError, match="known key, got 'fov=3'"):
+        parsed_orbit(["fov=3"], [key for key in ORBIT_KEYS if key != "fov"])
+
+
+# -------------------------------------------------------------------------------------------------------------- help
+
+
+@pytest.mark.parametrize("name", cli._OPTIONS)
+def test_help_all_has_every_option(name, capsys):
+    """Each that the parser knows, with a text; `--help` has at most 24 of them and says how many more there are."""
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as end:
+            cli.main([name, word])
+        assert not end.value.code
+    text = capsys.readouterr().out
+    short, whole = (f"usage: drgs {name}{part}" for part in text.split(f"usage: drgs {name}")[1:])
+    found = list(options_in(cli._OPTIONS[name]))
+    assert all(option.text for option in found)
+    for option in found:
+        assert f"  {option.flags}" in whole
+    shown = [option for option in found if f"\n  {option.flags}" in short]
+    assert len(shown) <= 24
+    more = len(found) - len(shown)
+    assert (f"{more} more: drgs {name} --help-all" in short) == (more > 0)
+    assert set(EVERYDAY.get(name, ())) <= {option.name for option in found}
+    assert max(map(len, text.splitlines())) <= 100
+    headings = [line for line in whole.splitlines() if line in HEADINGS]
+    assert headings == [heading for heading in HEADINGS if heading in headings]
+
+
+def test_help_begins_with_what_is_needed():
+    """What a command works on, where it writes, then what is most often said."""
+    fit = [
+        line.split()[:2]
+        for line in help_page("fit", cli._OPTIONS["fit"]).splitlines()
+        if line.startswith("  ") and line[2] != " "
+    ]
+    assert [words[0] for words in fit[:4]] == ["DATA", "-o,", "--config", "--resume"]
+    select = help_page("select", cli._OPTIONS["select"])
+    assert select.index("--candidates") < select.index("--policy") < select.index("--variant")
+    assert "elevation  " in select
+    assert "fov  " not in select
+
+
+def test_help_shows_the_defaults_of_a_file(files, capsys):
+    """With `--config`, what a file says is what is left to be changed."""
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "--config", str(files / "a.toml"), "--help"])
+    assert "Optimizer steps. (default: 500)" in capsys.readouterr().out
+
+
+def test_defaults_are_as_a_person_writes_them():
+    """Fractions and powers of ten; what is written reads back as the same number."""
+    told = {3 / 17: "3/17", 1 / 30: "1/30", 1.6e-4: "1.6e-4", 0.001: "1e-3", 0.05: "0.05", 120.0: "120", 0.0: "0"}
+    assert {value: written(value) for value in told} == told
+    assert written((1.6e-4, 1.6e-6)) == "1.6e-4 1.6e-6"
+    assert [written(x) for x in (None, (), 30_000, "auto", 0.1 + 0.2)] == [
+        "",
+        "",
+        "30000",
+        "auto",
+        "0.30000000000000004",
+    ]
+
+
+def test_help_loads_nothing_heavy():
+    """Neither torch, NumPy nor Dr.Jit; the test of its time is in test_cli.py."""
+    code = (
+        "import sys, drgs.cli\n"
+        "try: drgs.cli.main(['fit', '--help-all'])\n"
+        "except SystemExit: pass\n"
+        "print([x for x in ('torch', 'numpy', 'drjit', 'mitsuba', 'cv2') if x in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_records_are_not_made_of_themselves():
+    """A part is a record, be it optional; plain values, settings and lambda are none."""
+    assert part_of(SelectionConfig | None) is SelectionConfig
+    assert part_of(Prior | None) is part_of(RenderSettings) is part_of(int) is None
