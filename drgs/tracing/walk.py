@@ -97,7 +97,7 @@ class Part:
         stream: Candidate Gaussians of every lane.
         ordered: Rays sort their candidates on the way; else these come in the order in which they are composited.
         center_key: (N,) order keys of Gaussians that are sorted by their centers; None where a ray's own order counts.
-        buffer: Number of hits that a ray is sorted among.
+        buffer: Number of hits that a ray is sorted among; default `BUFFER`.
         first: These rays were not walked before, with a shorter buffer.
         slots: Places of entries and pixels in tables, for rays through tiles; None for others. A hit's place is then
             where it stands in the ray's row and in the tile's list.
@@ -120,7 +120,7 @@ class Part:
         *,
         ordered: bool,
         center_key: Float | None = None,
-        buffer: int = BUFFER,
+        buffer: int | None = None,
         first: bool = True,
         slots: Slots | None = None,
         in_lists: Callable[[], Part] | None = None,
@@ -135,7 +135,7 @@ class Part:
         self.stream = stream
         self.ordered = ordered
         self.center_key = center_key
-        self.buffer = buffer
+        self.buffer = buffer or BUFFER
         self.first = first
         self.slots = slots
         self.in_lists = in_lists
