@@ -171,7 +171,7 @@ def _parse_arguments(argv: list[str]) -> Any:
     for note in notes:
         print(f"drgs {name}: {note}", file=sys.stderr)
     path = named_config(words) if hasattr(options, "config") else None
-    default = None if path is None else default_of(options, config_fields(path), MISSING)
+    default = None if path is None else default_of(options, config_fields(path, words), MISSING)
     if asked := {"-h", "--help", "--help-all"}.intersection(words):
         print(help_page(name, options, "--help-all" in asked, default), end="")
         raise SystemExit(0)
