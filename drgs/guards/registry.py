@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.metadata
 from collections.abc import Iterator, Mapping, MutableMapping
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from drgs.guards.imports import imported_function
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 __all__ = ["Registry"]
 
@@ -102,13 +104,15 @@ class Registry(MutableMapping[str, T], Generic[T]):
 
 
 @functools.cache
-def _entry_points(group: str) -> dict[str, importlib.metadata.EntryPoint]:
+def _entry_points(group: str) -> dict[str, EntryPoint]:
     """Rows of installed packages by name; of two of a name the first that is found."""
-    found: dict[str, importlib.metadata.EntryPoint] = {}
+    import importlib.metadata  # a quarter of what `import drgs.settings` takes, which asks no table
+
+    found: dict[str, EntryPoint] = {}
     for point in importlib.metadata.entry_points(group=group):
         found.setdefault(point.name, point)
     return found
 
 
-def _package(point: importlib.metadata.EntryPoint) -> str:
+def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.value
