@@ -94,7 +94,7 @@ def told(scene: DynamicGaussians, views: list[Camera], probes: int, seed: int, o
 def ratios(found: list[Information], known: int) -> np.ndarray:
     """`eig` of each view after the known ones."""
     H = {name: torch.stack([x[name] for x in found[:known]]).sum(0) for name in found[0]}
-    return np.array([information_gain(x, H).total for x in found[known:]])
+    return np.array([information_gain(x, H, "eig").total for x in found[known:]])
 
 
 def traces(found: list[Information], known: int) -> np.ndarray:

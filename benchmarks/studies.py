@@ -7,7 +7,6 @@ means is in `drgs.studies.experiments.SIZES`.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -98,7 +97,7 @@ def base(name: str, runs: Path, views: int, steps: int) -> tuple:
 def continued(trainer: Trainer, frames: list, steps: int, seed: int = 0) -> Trainer:
     """A copy of a fit that goes on with other frames: schedule stretched, no density control, another order."""
     tensors, _ = trainer.state()
-    config = dataclasses.replace(trainer.config, max_steps=trainer.config.max_steps + steps, refine_stop=0.0, seed=seed)
+    config = trainer.config.replace(max_steps=trainer.config.max_steps + steps, refine_stop=0.0, seed=seed)
     copy = Trainer(config, frames, GaussianRows.from_state({k: v.clone() for k, v in tensors.items()}), trainer.extent)
     copy.step_index = trainer.config.max_steps
     for _ in range(steps):

@@ -1,10 +1,20 @@
 """drgs: differentiable Gaussian rendering with Dr.Jit and Mitsuba 3, on any CPU; CUDA is written and not yet run.
 
     import drgs
-    g = drgs.load_ply("point_cloud.ply")
-    out = drgs.render(g, camera, drgs.RenderSettings.preset("exact"))
 
-Importing this package imports none of its heavy dependencies; names load at first access.
+    dataset = drgs.load_data("scene")
+    drgs.fit(dataset, "runs/scene", drgs.FitConfig(max_steps=500))
+    scene = drgs.load_run("runs/scene").scene
+    train, others = dataset.split()
+    image = drgs.render(scene, others[0].camera.undistorted()).rgb
+
+    known = [view.camera.undistorted() for view in train]
+    candidates = [view.camera.undistorted() for view in others]
+    print(drgs.select_views(scene, candidates, known, k=1).picks[0].name)
+
+    drgs.save_gaussians(scene, "scene.spz")
+
+Importing this package imports none of its heavy dependencies; names and modules load at first access.
 """
 
 from __future__ import annotations
@@ -16,57 +26,100 @@ from drgs import libllvm as _libllvm
 
 __version__ = "0.1.0"
 
-# Public name -> module that defines it.
+# Public name -> module that defines it, and after a colon its name there, where that is another one.
 _NAMES = {
     "Camera": "cameras",
+    "Dataset": "data",
     "DeformationField": "deform",
     "DynamicGaussians": "deform",
+    "FitConfig": "train",
     "Gaussians": "ellipsoids",
+    "Prior": "gain",
     "RenderSettings": "settings",
+    "Scoring": "select",
+    "Selection": "select",
+    "SelectionConfig": "train",
+    "View": "data",
+    "diagonal": "fisher",
+    "fit": "train",
+    "load_data": "data:load",
     "load_gaussians": "codecs",
     "load_ply": "files",
+    "load_run": "fitting.records",
     "rasterization": "rasterize",
     "render": "integrator",
     "render_jvp": "integrator",
     "save_gaussians": "codecs",
     "save_ply": "files",
+    "select_views": "select:select",
 }
 _MODULES = frozenset(
     {
         "cameras",
         "cli",
+        "cluster",
+        "codecs",
         "crossval",
         "data",
         "deform",
+        "display",
+        "dynamics",
         "ellipsoids",
+        "evaluation",
+        "features",
         "files",
         "fisher",
+        "fitting",
         "gain",
+        "guards",
+        "information",
         "integrator",
+        "lab",
         "ladder",
         "metrics",
+        "oracle",
+        "plugin",
+        "policies",
+        "rasterize",
         "reference",
+        "report",
         "runtime",
         "select",
         "settings",
+        "splats",
+        "studies",
         "testing",
+        "tracing",
         "train",
+        "viewing",
+        "volume",
     }
 )
 
 __all__ = [
     "Camera",
+    "Dataset",
     "DeformationField",
     "DynamicGaussians",
+    "FitConfig",
     "Gaussians",
+    "Prior",
     "RenderSettings",
+    "Scoring",
+    "Selection",
+    "SelectionConfig",
+    "View",
     "__version__",
     "data",
     "deform",
+    "diagonal",
     "fisher",
+    "fit",
     "gain",
+    "load_data",
     "load_gaussians",
     "load_ply",
+    "load_run",
     "rasterization",
     "reference",
     "render",
@@ -75,29 +128,58 @@ __all__ = [
     "save_gaussians",
     "save_ply",
     "select",
+    "select_views",
 ]
 
 if TYPE_CHECKING:
     from drgs import cameras as cameras
     from drgs import cli as cli
+    from drgs import cluster as cluster
+    from drgs import codecs as codecs
     from drgs import crossval as crossval
     from drgs import data, deform, fisher, gain, reference, runtime, select
+    from drgs import display as display
+    from drgs import dynamics as dynamics
     from drgs import ellipsoids as ellipsoids
+    from drgs import evaluation as evaluation
+    from drgs import features as features
     from drgs import files as files
+    from drgs import fitting as fitting
+    from drgs import guards as guards
+    from drgs import information as information
     from drgs import integrator as integrator
+    from drgs import lab as lab
     from drgs import ladder as ladder
     from drgs import metrics as metrics
+    from drgs import oracle as oracle
+    from drgs import plugin as plugin
+    from drgs import policies as policies
+    from drgs import rasterize as rasterize
+    from drgs import report as report
     from drgs import settings as settings
+    from drgs import splats as splats
+    from drgs import studies as studies
     from drgs import testing as testing
+    from drgs import tracing as tracing
     from drgs import train as train
+    from drgs import viewing as viewing
+    from drgs import volume as volume
     from drgs.cameras import Camera
     from drgs.codecs import load_gaussians, save_gaussians
+    from drgs.data import Dataset, View
+    from drgs.data import load as load_data
     from drgs.deform import DeformationField, DynamicGaussians
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply
+    from drgs.fisher import diagonal
+    from drgs.fitting.records import load_run
+    from drgs.gain import Prior
     from drgs.integrator import render, render_jvp
     from drgs.rasterize import rasterization
+    from drgs.select import Scoring, Selection
+    from drgs.select import select as select_views
     from drgs.settings import RenderSettings
+    from drgs.train import FitConfig, SelectionConfig, fit
 
 # Before anything can import drjit: it loads libLLVM at once, and the wrong one aborts the process.
 _libllvm.prepare()
@@ -106,7 +188,8 @@ _libllvm.prepare()
 def __getattr__(name: str) -> Any:
     """Load public names and submodules at first access (PEP 562)."""
     if name in _NAMES:
-        value = getattr(importlib.import_module(f"drgs.{_NAMES[name]}"), name)
+        module, _, attribute = _NAMES[name].partition(":")
+        value = getattr(importlib.import_module(f"drgs.{module}"), attribute or name)
     elif name in _MODULES:
         value = importlib.import_module(f"drgs.{name}")
     else:

@@ -3,15 +3,15 @@
 Conventions, stated once for the whole project:
 
 - Camera axes are OpenCV's: +x right, +y down, +z forward (COLMAP and gsplat agree).
-- ``w2c`` (4,4) maps homogeneous world points to camera points, ``c2w`` is its inverse.
-- ``K`` (3,3) is ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels. The image spans [0, width] x [0, height]; the
+- `w2c` (4,4) maps homogeneous world points to camera points, `c2w` is its inverse.
+- `K` (3,3) is `[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]` in pixels. The image spans [0, width] x [0, height]; the
   center of pixel (column i, row j) lies at (i + 0.5, j + 0.5). Resizing an image by s therefore multiplies fx, cx (and
   fy, cy) by s exactly. OpenCV functions that resample images count pixel centers at integers, so they get
-  ``cx - 0.5, cy - 0.5``; functions on points need no shift.
-- Distortion is OpenCV's: model ``opencv`` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model ``opencv_fisheye`` with
-  (k1, k2, k3, k4) on the angle; ``pinhole`` has none.
+  `cx - 0.5, cy - 0.5`; functions on points need no shift.
+- Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model `opencv_fisheye` with
+  (k1, k2, k3, k4) on the angle; `pinhole` has none.
 - Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right, +y
-  up, looking along -z), LLFF ``poses_bounds`` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
+  up, looking along -z), LLFF `poses_bounds` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
   looking along +z). World axes never change, only the camera's.
 """
 
@@ -68,18 +68,21 @@ _SHOWN = 80  # characters of a name in messages
 class Camera:
     """One camera: intrinsics, pose, image size and lens. See the module text for conventions.
 
+        K = drgs.cameras.intrinsics(60.0, 60.0, 32.0, 24.0)
+        pose = drgs.cameras.look_at((3, 0, -1), target=(0, 0, 0), up=(0, -1, 0))
+        camera = drgs.Camera(K, pose, width=64, height=48)
+
     Attributes:
         K: (3,3) float64 intrinsics in pixels.
         w2c: (4,4) world to camera; float64 NumPy, or a torch tensor, kept as it is so that gradients reach it. A
             rotation that rounding has left not quite orthonormal is read as the nearest one, and the camera stays
             where it is; see `rigid`.
-        width, height: image size in pixels.
-        model: ``pinhole``, ``opencv`` or ``opencv_fisheye``.
-        distortion: coefficients in OpenCV's order; empty for ``pinhole``.
-        name: for messages and file names.
-        time: when the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets), or None
-            where that does not matter.
-
+        width, height: Image size in pixels.
+        model: `pinhole`, `opencv` or `opencv_fisheye`.
+        distortion: Coefficients in OpenCV's order; empty for `pinhole`.
+        name: Name in messages and of files.
+        time: Time at which the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets),
+            or None where that does not matter.
     Raises:
         ValueError: K, w2c, size, model, distortion or time is not what it must be.
     """
@@ -166,7 +169,6 @@ class Camera:
 
         Args:
             points: (P,3) world points.
-
         Returns:
             pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses, which may
             see behind themselves.
@@ -176,13 +178,12 @@ class Camera:
         return self._project_local(local), local[:, 2]
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
-        """A Mitsuba ``perspective`` sensor as a dictionary for ``mi.load_dict`` (box filter, one sample a pixel).
+        """A Mitsuba `perspective` sensor as a dictionary for `mi.load_dict` (box filter, one sample a pixel).
 
         Mitsuba's film has square pixels, so fx and fy may differ by no more than 0.1 pixel at the image border.
 
         Args:
-            near, far: clip distances in scene units. Mitsuba's rays start at the near plane.
-
+            near, far: Clip distances in scene units. Mitsuba's rays start at the near plane.
         Raises:
             ValueError: the camera is distorted, skewed or has pixels that are not square.
         """
@@ -318,7 +319,7 @@ def c2w_from_llff(pose: np.ndarray) -> np.ndarray:
 
 
 def c2w_to_mitsuba(c2w: np.ndarray) -> np.ndarray:
-    """OpenCV camera-to-world (4,4) to Mitsuba's ``to_world``."""
+    """OpenCV camera-to-world (4,4) to Mitsuba's `to_world`."""
     return np.asarray(c2w, dtype=np.float64) @ _MITSUBA_FLIP
 
 
@@ -335,9 +336,9 @@ def intrinsics_from_fov(fov: float, width: int, height: int, axis: str = "x") ->
     """(3,3) K of a centered camera with square pixels.
 
     Args:
-        fov: full field of view along ``axis`` in degrees, between 0 and 180.
-        width, height: image size in pixels.
-        axis: ``x`` or ``y``.
+        fov: Full field of view along `axis` in degrees, between 0 and 180.
+        width, height: Image size in pixels.
+        axis: `x` or `y`.
     """
     if not 0.0 < fov < 180.0:
         raise ValueError(f"intrinsics_from_fov: fov must lie between 0 and 180 degrees, got {fov}; correct it")
@@ -348,7 +349,7 @@ def intrinsics_from_fov(fov: float, width: int, height: int, axis: str = "x") ->
 
 
 def look_at(eye: Any, target: Any, up: Any = (0.0, 0.0, 1.0)) -> np.ndarray:
-    """(4,4) float64 w2c of a camera at ``eye`` looking at ``target``, ``up`` (world) pointing up in its image."""
+    """(4,4) float64 w2c of a camera at `eye` looking at `target`, `up` (world) pointing up in its image."""
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     forward = target - eye
     right = np.cross(forward, up)
@@ -381,11 +382,11 @@ def orbit(
 
     Args:
         center: (3,) the point looked at.
-        radius: distance of every camera from it, in scene units.
-        n: number of cameras, evenly spaced; the last one does not repeat the first.
-        elevation: degrees above the plane through ``center`` that is orthogonal to ``up``.
-        width, height: image size in pixels.
-        fov: horizontal field of view in degrees.
+        radius: Distance of every camera from it, in scene units.
+        n: Number of cameras, evenly spaced; the last one does not repeat the first.
+        elevation: Degrees above the plane through `center` that is orthogonal to `up`.
+        width, height: Image size in pixels.
+        fov: Horizontal field of view in degrees.
         up: (3,) world direction that points up; scenes straight out of COLMAP usually have (0, -1, 0).
     """
     if n < 1 or not radius > 0:

@@ -170,8 +170,8 @@ def _parse_arguments(argv: list[str]) -> Any:
     words, notes = as_written_now(name, argv[1:])
     for note in notes:
         print(f"drgs {name}: {note}", file=sys.stderr)
-    path = named_config(words) if "config" in options.__dataclass_fields__ else None
-    default = None if path is None else default_of(options, config_fields(path), MISSING)
+    path = named_config(words) if hasattr(options, "config") else None
+    default = None if path is None else default_of(options, config_fields(path, words), MISSING)
     if asked := {"-h", "--help", "--help-all"}.intersection(words):
         print(help_page(name, options, "--help-all" in asked, default), end="")
         raise SystemExit(0)

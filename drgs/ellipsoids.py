@@ -95,6 +95,9 @@ class DeformableScene(Scene, Protocol):
 class Gaussians:
     """N Gaussians as raw parameters (torch tensors on any device; autograd graphs are kept).
 
+        g = drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh)  # linear scales, opacities in (0, 1)
+        bigger = g.replace(log_scales=g.log_scales + 0.1)
+
     Attributes:
         means: (N, 3) float32 or float64, relative to `origin`.
         quats: (N, 4) wxyz, unnormalized; q and s q (s != 0) are the same rotation.

@@ -31,7 +31,7 @@ def evaluate_run(
         run: What to measure.
         claimed: Its folder, as `drgs.fitting.resume.claim_run` returns it.
         split: `test`, `train` (of an active fit the views that it saw) or `all`.
-        lpips: As `drgs.metrics.evaluate` takes it.
+        lpips: LPIPS for `drgs.metrics.evaluate`.
         strict: Refuse a data set some of whose images are missing.
     Returns:
         What metrics.json holds.

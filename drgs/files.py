@@ -22,8 +22,7 @@ from drgs.guards import outputs
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
-from drgs.guards.ply_headers import EXTRA, extra_kind, read_ply_header
-from drgs.guards.ply_lists import ply_source
+from drgs.guards.ply_headers import EXTRA, extra_kind, ply_source, read_ply_header
 from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:
@@ -59,6 +58,8 @@ _SHOWN = 200  # characters of a reader's own message
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
     """Gaussians from a 3DGS PLY; columns are found by name, in any order.
+
+        g = drgs.load_ply("point_cloud.ply")
 
     Args:
         path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24 or 45 of them, channel by channel),
@@ -112,6 +113,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
     sh = arrays.pop("dc")[:, None, :]
     if rest:
+        # f_rest is stored channel by channel; ours are coefficient by coefficient.
         sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
     if features:
         arrays["features"] = described
@@ -157,6 +159,8 @@ def save_ply(
 ) -> None:
     """Write Gaussians as INRIA's trainer does: binary little-endian float32, normals 0, the same order of columns.
 
+        drgs.save_ply(g, "out.ply", comments=("made by hand",))
+
     `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32. Features, where there
     are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.
 
@@ -183,6 +187,7 @@ def save_ply(
     fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
     means = fields["means"]
     if np.any(g.origin):
+        # In float64 before it is rounded once: float32 offsets would lose their digits to an origin far away.
         means = means.astype(np.float64) + g.origin
     rest = fields["sh"][:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (g.sh.shape[1] - 1))  # channel by channel
     columns = {

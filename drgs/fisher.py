@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any, Unpack
 import torch
 
 from drgs.cameras import Camera
-from drgs.ellipsoids import DeformableScene, Scene
-from drgs.gain import METHODS, Prior, information_gain
+from drgs.ellipsoids import Scene
+from drgs.gain import Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.inputs import (
     Masks,
@@ -40,11 +40,20 @@ from drgs.guards.inputs import (
     some_cameras,
     three_weights,
 )
-from drgs.information.backdrop import CELLS, Sphere, backdrop_sphere, backdrop_variance, opacity_of, painted_opacity
-from drgs.information.columns import by_columns, jacobian_columns
-from drgs.information.groups import GROUPS, Group, Information, groups_of
+from drgs.information.backdrop import (
+    BACKDROP,
+    CELLS,
+    Sphere,
+    backdrop_sphere,
+    backdrop_variance,
+    opacity_of,
+    painted_opacity,
+)
+from drgs.information.choices import METHODS
+from drgs.information.columns import jacobian_columns
+from drgs.information.diagonal import check_same_parameters, diagonal_and_opacity
+from drgs.information.groups import GROUPS, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
-from drgs.information.probes import by_probes
 from drgs.information.replay import Replay
 from drgs.information.semantics import SemanticMetric
 from drgs.runtime import alone
@@ -57,6 +66,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BLOCK",
     "GROUPS",
+    "METHODS",
     "Information",
     "Prior",
     "SemanticMetric",
@@ -98,10 +108,12 @@ def diagonal(
     seed: int = 0,
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
-    seen_opacity: list[torch.Tensor] | None = None,
     **splats: Unpack[SplatTensors],
 ) -> Information:
     """The diagonal of J^T J, summed over views.
+
+        information = drgs.diagonal(g, cameras)
+        information["means"]  # (N, 3)
 
     Args:
         gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
@@ -116,13 +128,12 @@ def diagonal(
             a name in its `parameters()`, such as a weight of a network, is the scene's own tensor (`columns`,
             `probes`), also where its Gaussians have the same name; `rotations` are then those of its `quats`.
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
-        probes, seed: Of method `probes`.
+        probes: Number of random images of method `probes`, of each view.
+        seed: Seed of these.
         semantics: The metric in which features tell about the geometry; None: they do not (`exact`, `columns`,
             `probes`; only `exact` makes use of its `estimate`).
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared, as a fit
             does, so that squares are multiplied by its square; or None: 1. Outside, a view tells nothing.
-        seen_opacity: A list that gets the (H, W) opacity of each view, which methods `exact` and `fisherrf` come to
-            know, for `backdrop`.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
             `height`, and maybe `sh_degree` and `backgrounds`.
@@ -146,43 +157,19 @@ def diagonal(
         backgrounds = scene.backgrounds
         channels = scene.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
-    check_any_scene("fisher.diagonal", gaussians)
-    cameras = some_cameras("fisher.diagonal", cameras)
-    seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
-    check_scene("fisher.diagonal", seen, settings)
-    settings = settings or RenderSettings.preset("exact")
-    wanted = _checked_groups(groups_of(seen, groups, gaussians), method, semantics)
-    if semantics is not None:
-        semantics.check("fisher.diagonal", seen)
-    total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
-    shown = mask_list("fisher.diagonal", masks, cameras)
-    for number, camera in enumerate(cameras):
-        seen = gaussians_at("fisher.diagonal", gaussians, camera)
-        for name, group in wanted.items():
-            _check_same("fisher.diagonal", name, total[name], group.shape(seen))
-        if not len(seen):
-            continue
-        if backgrounds:  # every view has its own
-            settings = settings.replace(background=backgrounds[number])
-        own = {name: group for name, group in wanted.items() if group.owner == "scene"}
-        theirs = {name: group for name, group in wanted.items() if name not in own}
-        network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
-        part: dict[str, torch.Tensor] = {}
-        if method == "columns":
-            part |= by_columns(seen, camera, settings, theirs, weights, semantics, mask=shown[number])
-            part |= by_columns(seen, camera, settings, own, weights, semantics, network, shown[number])
-        elif method == "probes":
-            draw = (probes, seed + number)
-            part |= by_probes(seen, camera, settings, theirs, weights, *draw, semantics, mask=shown[number])
-            if own:
-                part |= by_probes(seen, camera, settings, own, weights, *draw, semantics, network, shown[number])
-        else:
-            replay = Replay(seen, camera, settings, semantics=semantics, mask=shown[number])
-            part |= replay.diagonal(wanted, weights, method == "fisherrf")
-            if seen_opacity is not None:
-                seen_opacity.append(replay.opacity)
-        for name in wanted:
-            total[name] += part[name]
+    total, _ = diagonal_and_opacity(
+        gaussians,
+        cameras,
+        settings,
+        method,
+        groups=groups,
+        channel_weights=weights,
+        probes=probes,
+        seed=seed,
+        semantics=semantics,
+        masks=masks,
+        backgrounds=backgrounds,
+    )
     if "sh" in total:
         total["sh"] = total["sh"][..., :channels]
     return total
@@ -202,28 +189,6 @@ def _scene_of_tensors(gaussians: object, cameras: object, splats: SplatTensors) 
     return scene_of("fisher.diagonal", splats)
 
 
-def _checked_groups(wanted: dict[str, Group], method: str, semantics: SemanticMetric | None) -> dict[str, Group]:
-    """Those of the wanted groups that a method has, which must know tensors of a scene where there are any."""
-    if method not in METHODS:
-        raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    if semantics is not None and method == "fisherrf":
-        raise ValueError("fisher.diagonal: method fisherrf must have no semantics, got some; it is about colors only")
-    for name, group in wanted.items():
-        methods = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
-        if group.owner == "scene" and method not in methods:
-            raise ValueError(
-                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, methods))}, got {method!r}; "
-                "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
-            )
-    known = {name: group for name, group in wanted.items() if method != "fisherrf" or group.fisherrf}
-    if wanted and not known:
-        raise ValueError(
-            f"fisher.diagonal: groups of method fisherrf must have more than {', '.join(wanted)}, which it does not "
-            "know; name another one, or use method exact"
-        )
-    return known
-
-
 @alone
 def blocks(
     gaussians: Scene,
@@ -236,7 +201,7 @@ def blocks(
     """One dense block of J^T J for every Gaussian, summed over views.
 
     Args:
-        gaussians, cameras, settings, channel_weights, semantics, masks: As for `diagonal`.
+        gaussians, cameras, settings, channel_weights, semantics, masks: The same as for `diagonal`.
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
@@ -247,7 +212,7 @@ def blocks(
     total = torch.zeros(count, BLOCK, BLOCK, dtype=torch.float64)
     for camera, mask in zip(cameras, mask_list("fisher.blocks", masks, cameras), strict=True):
         seen = gaussians_at("fisher.blocks", gaussians, camera)
-        _check_same("fisher.blocks", "blocks", total, (len(seen), BLOCK, BLOCK))
+        check_same_parameters("fisher.blocks", "blocks", total, (len(seen), BLOCK, BLOCK))
         if semantics is not None:
             semantics.check("fisher.blocks", seen)
         if len(seen):
@@ -265,14 +230,14 @@ def coverage(
     """(N,) float64 sum over views and pixels of w^2: the information about a color without direction.
 
     Args:
-        gaussians, cameras, settings, masks: As for `diagonal`.
+        gaussians, cameras, settings, masks: The same as for `diagonal`.
     """
     cameras = _cameras_of("fisher.coverage", gaussians, cameras, settings)
     settings = settings or RenderSettings.preset("exact")
     total = torch.zeros(len(gaussians_at("fisher.coverage", gaussians, cameras[0])), dtype=torch.float64)
     for camera, mask in zip(cameras, mask_list("fisher.coverage", masks, cameras), strict=True):
         seen = gaussians_at("fisher.coverage", gaussians, camera)
-        _check_same("fisher.coverage", "coverage", total, (len(seen),))
+        check_same_parameters("fisher.coverage", "coverage", total, (len(seen),))
         if len(seen):
             total += Replay(seen, camera, settings, geometry=False, mask=mask).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
     return total
@@ -292,16 +257,16 @@ def backdrop(
     a row for each cell. See `drgs.information.backdrop`.
 
     Args:
-        gaussians, cameras, settings, channel_weights, masks: As for `diagonal`.
+        gaussians, cameras, settings, channel_weights, masks: The same as for `diagonal`.
         sphere: What the color is painted on, the same for all views that are compared, as `backdrop_sphere` makes it;
             None: infinitely far away.
-        seen_opacity: (H, W) of each view, as `diagonal` finds them on its way; None: they are rendered.
+        seen_opacity: (H, W) of each view, where they are known, as `drgs.render` gives them; None: they are rendered.
     """
     cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
     if seen_opacity is not None and [x.shape for x in seen_opacity] != [(c.height, c.width) for c in cameras]:
         raise ValueError(
             f"fisher.backdrop: seen_opacity must be of the {len(cameras)} views and their sizes, got "
-            f"{[tuple(x.shape) for x in seen_opacity]}; pass what diagonal found of the same views"
+            f"{[tuple(x.shape) for x in seen_opacity]}; pass the alpha that drgs.render gives of the same views"
         )
     settings = settings or RenderSettings.preset("exact")
     weights = three_weights("fisher.backdrop", channel_weights)
@@ -329,11 +294,11 @@ def variance_map(
     semantics it is that of the pixel's color and decoded features together; with channel weights 0, of the latter.
 
     Args:
-        gaussians, camera, settings, channel_weights, semantics: As for `diagonal`.
+        gaussians, camera, settings, channel_weights, semantics: The same as for `diagonal`.
         weights: Group -> tensor shaped like its information; groups that are missing weigh 0. `backdrop`,
             (1536, 3), is that of the color behind what the Gaussians leave open. Those above 3e32, as lambda = 0 makes
             them of what was hardly seen, count as 3e32.
-        sphere: As for `backdrop`.
+        sphere: The same as for `backdrop`.
     """
     seen = gaussians_at("fisher.variance_map", gaussians, camera)
     check_view("fisher.variance_map", seen, camera, settings)
@@ -342,7 +307,7 @@ def variance_map(
     if semantics is not None:
         semantics.check("fisher.variance_map", seen)
     known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
-    shapes = {"backdrop": (CELLS, 3)} | {name: group.shape(seen) for name, group in known.items()}
+    shapes = {BACKDROP: (CELLS, 3)} | {name: group.shape(seen) for name, group in known.items()}
     for name, x in weights.items():
         if name not in shapes:
             raise ValueError(f"fisher.variance_map: weights must be of {', '.join(shapes)}, got {name!r}")
@@ -351,10 +316,10 @@ def variance_map(
             raise ValueError(
                 f"fisher.variance_map: weights of {name} must have shape {shapes[name]}, got {tuple(x.shape)}"
             )
-    behind = weights.get("backdrop")
+    behind = weights.get(BACKDROP)
     if behind is not None and not bool(torch.isfinite(behind).all()):
         raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
-    weights = {name: x for name, x in weights.items() if name != "backdrop"}
+    weights = {name: x for name, x in weights.items() if name != BACKDROP}
     factors = three_weights("fisher.variance_map", channel_weights)
     found = torch.zeros(camera.height, camera.width)
     if len(seen) and weights:
@@ -382,12 +347,3 @@ def _cameras_of(where: str, scene: object, cameras: object, settings: RenderSett
     cameras = some_cameras(where, cameras)
     check_scene(where, gaussians_at(where, scene, cameras[0]), settings)
     return cameras
-
-
-def _check_same(where: str, name: str, total: torch.Tensor, shape: tuple[int, ...]) -> None:
-    """Refuse to add up what views say about Gaussians that are not as many in each."""
-    if tuple(total.shape) != shape:
-        raise ValueError(
-            f"{where}: a scene must have as many Gaussians and coefficients in all views, got {name} of shape "
-            f"{tuple(total.shape)} in the first and {shape} in another; take views of one time"
-        )

@@ -5,7 +5,7 @@ noise on every channel), l the prior's precision lambda, in the inverse squared 
 a dict group -> tensor with one entry a parameter, as `drgs.fisher.diagonal` returns it. docs/information.md says what
 the criteria mean, and where others publish something else under the same names.
 
-References:
+Reference:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771: `eig`, section 3.3.
     [2] Jiang et al., FisherRF, ECCV 2024: `eig` of a diagonal, lambda = 1e-6.
     [3] Wilson et al., POp-GS, CVPR 2025: `logdet` ("D-opt"), `trace_cov` ("T-opt"), one block a Gaussian.
@@ -24,6 +24,7 @@ import torch
 from drgs.guards.arguments import must_be
 from drgs.information.chain import Chain, dense
 from drgs.information.choices import METHODS
+from drgs.information.criteria import CRITERIA, ViewCriterion, criterion_named
 from drgs.information.determinants import ROUNDING, log_determinants
 from drgs.information.prior import Prior
 
@@ -35,8 +36,10 @@ __all__ = [
     "Gain",
     "Information",
     "Prior",
+    "ViewCriterion",
     "block_gain",
     "check",
+    "criterion_named",
     "dense",
     "information_gain",
     "scorer",
@@ -54,7 +57,7 @@ BLOCK_LAYOUT = {
 }
 """Places of the groups in a block of `drgs.fisher.blocks`; of `sh` it holds the base color."""
 
-BLOCKS = "blocks"  # the name under which blocks (N, 13, 13) travel as an Information
+DENSE = "blocks"  # the name under which blocks (N, 13, 13) travel as an Information
 
 _CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is twice as fast
 
@@ -81,7 +84,7 @@ class Gain:
 def information_gain(
     candidate: Information,
     train: Information,
-    criterion: str = "eig",
+    criterion: str,
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
     pool: Information | None = None,
@@ -95,10 +98,11 @@ def information_gain(
 
     Args:
         candidate, train: Same groups and shapes, entries >= 0.
-        criterion: One of `CRITERIA`; `block_logdet` takes {"blocks": (N, 13, 13)}, see `block_gain`.
+        criterion: A name in `CRITERIA`, or `package.module:function` of a function (ratio, variance) -> terms, see
+            `ViewCriterion`; `block_logdet` takes {"blocks": (N, 13, 13)}, see `block_gain`.
         prior: Default `Prior()`, lambda = 1e-6 everywhere.
         weights: Group -> factor >= 0, default 1. `trace_cov` adds variances of different units unless they say how.
-        pool: P, of `v_opt` alone; same groups and shapes.
+        pool: P, of `v_opt` and criteria of one's own that need it; same groups and shapes.
     Raises:
         ValueError: If groups, shapes, criterion or weights are wrong, or an entry is negative, NaN or infinite.
     """
@@ -106,17 +110,18 @@ def information_gain(
         must_be("information_gain", name, value, Mapping, "group -> tensor, as fisher.diagonal returns")
     if prior is not None:
         must_be("information_gain", "prior", prior, Prior, "e.g. drgs.gain.Prior(1e-6)")
-    check("information_gain: train", train, criterion)
-    check("information_gain: candidate", candidate, criterion)
+    signed = criterion_named(criterion, "information_gain").of_blocks
+    check("information_gain: train", train, signed)
+    check("information_gain: candidate", candidate, signed)
     if pool is not None:
         must_be("information_gain", "pool", pool, Mapping, "group -> tensor, as fisher.diagonal returns")
-        check("information_gain: pool", pool, criterion)
+        check("information_gain: pool", pool, signed)
     return scorer(train, criterion, prior, weights, pool)(candidate)
 
 
 def scorer(
     train: Information,
-    criterion: str = "eig",
+    criterion: str,
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
     pool: Information | None = None,
@@ -125,21 +130,20 @@ def scorer(
 
     Candidates are not searched for negative entries, see `check`; NaN or inf in them raises as the score is not finite.
     """
-    if criterion not in CRITERIA:
-        raise ValueError(f"information_gain: criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}")
+    rule = criterion_named(criterion, "information_gain")
     prior = prior or Prior()
-    if (pool is not None) != (criterion == "v_opt"):
+    if (pool is not None) != rule.needs_pool:
         raise ValueError(
-            f"information_gain: pool must be given with criterion v_opt and no other, got {criterion} "
-            f"{'without' if pool is None else 'with'} one; it is the information of all views that will be looked at"
+            f"information_gain: pool must be {'given' if rule.needs_pool else 'None'} with criterion {criterion}, got "
+            f"{'none' if pool is None else 'one'}; it is the information of all views that will be looked at"
         )
-    if criterion == "block_logdet":
+    if rule.term is None:
         if weights:
             raise ValueError(
-                f"information_gain: weights must be None for block_logdet, got {dict(weights)}; a block has no parts"
+                f"information_gain: weights must be None for {criterion}, got {dict(weights)}; a block has no parts"
             )
-        return _Blocks(train[BLOCKS], prior, BLOCK_LAYOUT)
-    return _Diagonal(train, criterion, prior, dict(weights or {}), pool)
+        return _Blocks(train[DENSE], prior, BLOCK_LAYOUT)
+    return _Diagonal(train, criterion, rule.term, prior, dict(weights or {}), pool)
 
 
 def variances(train: Information, prior: Prior | None = None) -> dict[str, torch.Tensor]:
@@ -152,15 +156,22 @@ def variances(train: Information, prior: Prior | None = None) -> dict[str, torch
     lambdas = (prior or Prior()).per_group(train)
     result = {}
     for name, H in train.items():
+        # float64: lambda = 1e-6 beside an H of 1e4 would vanish in float32.
         precision = H.to(torch.float64) + lambdas[name]
         # 1 / 0 would be inf and inf * 0 NaN; a variance of 0 drops the parameter from every criterion.
         result[name] = torch.where(precision > 0, precision.reciprocal(), 0.0)
     return result
 
 
-def check(where: str, information: Information, criterion: str = "eig") -> None:
-    """Raise ValueError, naming group and index, unless every entry is finite and, off blocks, >= 0."""
-    lowest = -math.inf if criterion == "block_logdet" else 0.0
+def check(where: str, information: Information, signed: bool = False) -> None:
+    """Raise ValueError, naming group and index, unless every entry is finite and, but for `signed` ones, >= 0.
+
+    Args:
+        where: What the error begins with.
+        information: The information of one view or of many.
+        signed: Whether entries may be negative, as those off the diagonal of dense blocks.
+    """
+    lowest = -math.inf if signed else 0.0
     for name, x in information.items():
         if not x.numel():
             continue
@@ -178,28 +189,17 @@ def check(where: str, information: Information, criterion: str = "eig") -> None:
 # -------------------------------------------------- parameters taken as independent
 
 
-def _trace_cov(ratio: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-    # 1/a - 1/(a + c) = (1/a) r / (1 + r), r = c/a: no difference of nearly equal numbers; r = inf gives NaN.
-    return ratio.div_(ratio + 1).mul_(variance)
-
-
-# Criterion -> what a parameter adds, of Hc / (H + l), which it may overwrite, and 1 / (H + l); float64. Of `v_opt` the
-# second is P / (H + l).
-_TERMS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
-    "v_opt": _trace_cov,
-    "eig": lambda ratio, variance: ratio,
-    "logdet": lambda ratio, variance: ratio.log1p_(),
-    "trace_cov": _trace_cov,
-}
-CRITERIA = (*_TERMS, "block_logdet")
-"""Names of the criteria; `drgs.select` chooses by the first unless told otherwise."""
-
-
 class _Diagonal:
     """Scores of candidates against a diagonal H."""
 
     def __init__(
-        self, train: Information, criterion: str, prior: Prior, weights: dict, pool: Information | None = None
+        self,
+        train: Information,
+        criterion: str,
+        term: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+        prior: Prior,
+        weights: dict,
+        pool: Information | None = None,
     ):
         for name, weight in weights.items():
             if name not in train:
@@ -207,6 +207,7 @@ class _Diagonal:
             if not 0 <= weight < math.inf:
                 raise ValueError(f"information_gain: weight of {name} must be in [0, inf), got {weight}; correct it")
         self.criterion = criterion
+        self.term = term
         self.weights = weights
         self.inverse = variances(train, prior)
         self.left_out = {name: int((x == 0).sum()) for name, x in self.inverse.items()}
@@ -221,16 +222,16 @@ class _Diagonal:
         _check_alike("candidate", candidate, self.inverse)
         parts = {}
         unseen = {}
-        terms_of = _TERMS[self.criterion]
         for name, variance in self.inverse.items():
             weight = float(self.weights.get(name, 1.0))
             seen_or_not = 0.0
             only_unseen = 0.0
-            rows = _told(candidate[name])
+            rows = _informed_rows(candidate[name])
             each = (candidate[name], variance, self.wanted[name], self.unseen[name])
             chunks = (x[rows].flatten().split(_CHUNK) for x in each)
             for new, known, wanted, is_unseen in zip(*chunks, strict=True):
-                terms = terms_of(new.to(torch.float64, copy=True).mul_(known), wanted)
+                # float64, as ratios span more than float32 has digits for; a copy, which a term may overwrite.
+                terms = self.term(new.to(torch.float64, copy=True).mul_(known), wanted)
                 seen_or_not += float(terms.sum())
                 only_unseen += float(terms @ is_unseen)
             parts[name] = weight * seen_or_not
@@ -249,7 +250,7 @@ def _total(criterion: str, parts: dict[str, float]) -> float:
     return total
 
 
-def _told(candidate: torch.Tensor) -> torch.Tensor | Any:
+def _informed_rows(candidate: torch.Tensor) -> torch.Tensor | Any:
     """Rows of which a view says anything: others have the term 0. `...`, all, where they are most."""
     if candidate.dim() == 0 or candidate.numel() < _CHUNK:
         return ...
@@ -298,8 +299,8 @@ def block_gain(
         ValueError: If shapes are wrong, a value is not finite, or a block is not positive (semi)definite.
     """
     for where, x in (("train", train), ("candidate", candidate)):
-        check(f"block_gain: {where}", {BLOCKS: x}, "block_logdet")
-    return _Blocks(train, prior or Prior(), layout or BLOCK_LAYOUT, rounding)({BLOCKS: candidate})
+        check(f"block_gain: {where}", {DENSE: x}, signed=True)
+    return _Blocks(train, prior or Prior(), layout or BLOCK_LAYOUT, rounding)({DENSE: candidate})
 
 
 class _Blocks:
@@ -327,7 +328,7 @@ class _Blocks:
 
     def __call__(self, candidate: Information) -> Gain:
         """The gain of one candidate."""
-        Hc = candidate[BLOCKS]
+        Hc = candidate[DENSE]
         if Hc.shape != self.H.shape:
             raise ValueError(
                 f"block_gain: candidate must have the shape of train, {tuple(self.H.shape)}, got {tuple(Hc.shape)}; "
@@ -335,6 +336,6 @@ class _Blocks:
             )
         after, repaired = log_determinants([self.H, Hc], self.keep, self.added, self.rounding)
         gains = after - self.before
-        parts = {BLOCKS: float(gains.sum())}
-        unseen = {BLOCKS: float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())}
+        parts = {DENSE: float(gains.sum())}
+        unseen = {DENSE: float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())}
         return Gain(_total("block_logdet", parts), parts, dict(self.left_out), unseen, self.repaired + repaired)

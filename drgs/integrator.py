@@ -42,6 +42,10 @@ def render(
 ) -> Output:
     """Render a view, or several of one size.
 
+        g.means.requires_grad_()
+        out = drgs.render(g, camera, drgs.RenderSettings.preset("fast"), outputs="depth")
+        (out.rgb - photograph).square().mean().backward()  # out.rgb: (H, W, 3); now g.means.grad is there
+
     Args:
         gaussians: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians at `camera.time` are seen.
         camera: A camera, or a list of cameras of one image size. The pose is differentiated when `camera.w2c` is a
@@ -98,6 +102,8 @@ def render_jvp(
     couple_features: bool = True,
 ) -> Output:
     """Forward mode: how a view changes along tangents of its parameters.
+
+        moved = drgs.render_jvp(g, camera, {"camera": torch.eye(6)}).rgb  # (6, H, W, 3): by each twist of the pose
 
     Args:
         gaussians, camera, settings, outputs, couple_features: Arguments of `render` (median depth, count and visibility

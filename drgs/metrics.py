@@ -194,11 +194,11 @@ def evaluate(
     Args:
         g: What is shown, as it is at the time of each view.
         frames: Photographs to compare with; may be empty.
-        settings: As in `drgs.render`. Pixels outside a mask are black in both images.
+        settings: Settings of `drgs.render`. Pixels outside a mask are black in both images.
         lpips: None reports LPIPS as None with a reason.
         pictures: Folder for one PNG a view: photograph, render, and error times 4, side by side; and, with a
             segmentation, NAME.semantics.png: labels, reference, features, and labels over the photograph.
-        segmentation: As `drgs.fitting.segments.segmentation_of` makes it; in words: why there is none.
+        segmentation: Result of `drgs.fitting.segments.segmentation_of`; in words: why there is none.
         moving: Numbers of the classes that move; if there are any, views have `psnr_moving`, too.
     Returns:
         JSON-serializable: `views` (a list of name, size and metrics), `mean` and `median` over them, `variants`,
@@ -321,8 +321,8 @@ def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, spl
     Args:
         g: Fitted with `settings`; what moves is drawn as it is at the time of each view, which a PLY cannot hold.
         frames: Photographs to compare with, at the size of the fit; at most 8 of them, evenly spaced, are looked at.
-        settings: Of the fit.
-        split: Where the frames come from, to be recorded.
+        settings: Settings of the fit.
+        split: Split of the frames, to be recorded.
     Returns:
         JSON-serializable: `preset` (the viewers'), `psnr` and `own_psnr` (means in dB, through that preset and through
         `settings`), `split`, `views` (names), `width` and `height` of the first; None if there is no view, or

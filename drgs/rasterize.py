@@ -87,6 +87,8 @@ def rasterization(
 ) -> tuple[torch.Tensor, torch.Tensor, dict]:
     """Draw Gaussians from C cameras, as `gsplat.rasterization` does.
 
+        colors, alphas, info = drgs.rasterization(means, quats, scales, opacities, rgb, viewmats, Ks, width, height)
+
     Args:
         means: (..., N, 3), world frame.
         quats: (..., N, 4) wxyz, not necessarily normalized.

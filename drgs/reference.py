@@ -1,9 +1,9 @@
 """The float64 oracle: every ray against every Gaussian, from the equations, not from the fast code.
 
 All (ray, Gaussian) pairs are evaluated densely with torch in float64, so that torch.autograd gives
-the gradients; nothing is left out except where a setting says so. Ray ``o + t d`` with |d| = 1,
-local frame ``o' = S^-1 R^T (o - mu)``, ``d' = S^-1 R^T d``, peak ``t* = -o'.d' / d'.d'``,
-``rho^2 = |o' x d'|^2 / |d'|^2``, ``a`` opacity of a hit, ``w = a T`` its weight. Which hits exist
+the gradients; nothing is left out except where a setting says so. Ray `o + t d` with |d| = 1,
+local frame `o' = S^-1 R^T (o - mu)`, `d' = S^-1 R^T d`, peak `t* = -o'.d' / d'.d'`,
+`rho^2 = |o' x d'|^2 / |d'|^2`, `a` opacity of a hit, `w = a T` its weight. Which hits exist
 and how they are ordered carries no gradient; results that hang on that are marked `ambiguous`.
 """
 
@@ -104,10 +104,8 @@ def render(
         exact_ties: Keys that are equal make a pixel `ambiguous`, too: a renderer that rounds in another way, or sorts
             without the index, may have either order.
         effect: The change of a weight that matters to `ambiguous`.
-
     Returns:
         `ReferenceOutput` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
-
     Raises:
         ValueError: If `ewa` meets rays or distortion, or a camera is needed and missing.
     """

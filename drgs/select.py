@@ -1,7 +1,8 @@
 """Which cameras to add: policies over information, and simple baselines.
 
 A policy is a function from a `Pool` to a `Selection`; adding one is writing it in `drgs.policies` and naming it in
-`POLICIES`. How a score comes from information is a `Scoring`; its criteria are in gain.py.
+`POLICIES` (`drgs.information.choices`), or `POLICIES["mine"] = mine` in a script. How a score comes from information
+is a `Scoring`; its criteria are in information/criteria.py.
 
     fisher      `criterion` of the Fisher information (gain.py)
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
@@ -24,15 +25,13 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
-from drgs.gain import CRITERIA, METHODS, Information
+from drgs.gain import CRITERIA, METHODS, Information, criterion_named
 from drgs.guards.arguments import kind_of, must_be
-from drgs.guards.imports import imported_function
 from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.cache import Cache
+from drgs.information.choices import POLICIES, check_named
 from drgs.information.pool import Pick, Pool, Selection, Workers
 from drgs.information.scoring import Scoring
-from drgs.policies.informed import coverage, fisher, fisherrf, moments
-from drgs.policies.spread import farthest, random, uniform
 
 __all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "policy_named", "select"]
 
@@ -60,6 +59,9 @@ def select(
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
 
+        chosen = drgs.select_views(g, candidates=cameras[2:], train=cameras[:2], k=2)
+        [pick.name for pick in chosen.picks], chosen.scores
+
     With k = 1 one candidate's information is held at a time (criterion `v_opt`: that of all, where it fits); with k > 1
     that of all, 4 bytes a parameter and view.
     k picks at once are those of k calls in a row that move each pick from `candidates` to `train` (`uniform` and
@@ -74,12 +76,12 @@ def select(
         k: How many.
         policy: A name in `POLICIES`, or `package.module:function` of a function like those: `Pool` to `Selection`.
         scoring: How views are scored; default `Scoring()`.
-        rng: Of `random`; default one that lives as long as the process. Give a run its own, and keep it.
+        rng: Generator of `random`; default one that lives as long as the process. Give a run its own, and keep it.
         masks: One for each view of `train`, as `drgs.fisher.diagonal` takes them: what is outside was not learned from.
             Candidates have none. Only `fisher`, `coverage` and policies that are made of these use masks.
         empty_outside: Nothing is outside of the masks, as of an object's: what these views leave open there is known
             to be empty (block `backdrop`).
-        cache: Where to look for and keep information of single views.
+        cache: Cache where information of single views is looked for and kept.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
             Not done where scores can rise (a relative lambda, lambda = 0, or z-scores).
         progress: Called with (views done, views) after each view.
@@ -87,7 +89,7 @@ def select(
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
         workers: Processes that compute what single views tell, here or on other machines
             (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
-        **fields: Of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
+        **fields: Fields of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, information is negative, NaN
@@ -109,6 +111,7 @@ def select(
     if workers is not None and information is not None:
         raise ValueError("select: workers must be None with information, got both; a function is called here")
     scored = _scoring(scoring, fields)
+    criterion_named(scored.criterion, "select")  # else the first view's information would be computed before
     if information is not None:
         _check_beside(policy, scored)
     pool = Pool(
@@ -186,13 +189,8 @@ def policy_named(name: str) -> Callable[[Pool], Selection]:
     Raises:
         ValueError: If there is none.
     """
-    if isinstance(name, str) and ":" in name:
-        return imported_function("--policy", name)
-    if name not in POLICIES:
-        raise ValueError(
-            f"select: policy must be one of {', '.join(POLICIES)}, or package.module:function, got {name!r}; choose one"
-        )
-    return POLICIES[name]
+    check_named("select", POLICIES, name)
+    return POLICIES.find("--policy", name)
 
 
 def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:
@@ -206,15 +204,3 @@ def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:
     if fields:
         raise ValueError(f"select: {', '.join(fields)} must be fields of scoring, got both; put them into Scoring(...)")
     return scoring
-
-
-POLICIES: dict[str, Callable[[Pool], Selection]] = {
-    "fisher": fisher,
-    "fisherrf": fisherrf,
-    "coverage": coverage,
-    "moments": moments,
-    "farthest": farthest,
-    "uniform": uniform,
-    "random": random,
-}
-"""Name -> policy."""

@@ -1,8 +1,8 @@
 """Every choice the renderer makes, as one frozen record, and the presets that other systems correspond to.
 
 A field here is an accuracy/speed (or a compatibility) choice that a user can name, switch and measure. Nothing that
-changes an image lives anywhere else. Symbols: ``a`` opacity of one hit, ``alpha_i`` opacity of Gaussian i,
-``T`` transmittance in front of a hit, ``rho`` Mahalanobis distance of a ray to a mean.
+changes an image lives anywhere else. Symbols: `a` opacity of one hit, `alpha_i` opacity of Gaussian i,
+`T` transmittance in front of a hit, `rho` Mahalanobis distance of a ray to a mean.
 """
 
 from __future__ import annotations

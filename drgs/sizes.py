@@ -21,7 +21,9 @@ def reduced_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
 
 
 def at_most(camera: Camera, pixels: int) -> Camera:
-    """The camera with its image reduced to at most so many pixels."""
+    """The camera with its image reduced to at most so many pixels; itself where it has no more."""
+    if camera.width * camera.height <= pixels:
+        return camera
     return camera.resized(*reduced_size(camera, pixels))
 
 

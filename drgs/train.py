@@ -26,7 +26,18 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveViews
-from drgs.fitting.config import ActiveConfig, FitConfig, SelectionConfig
+from drgs.fitting.config import (
+    ActiveConfig,
+    DataConfig,
+    DensityConfig,
+    FeatureConfig,
+    FitConfig,
+    LossConfig,
+    MotionConfig,
+    RateConfig,
+    SavingConfig,
+    SelectionConfig,
+)
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
@@ -48,7 +59,21 @@ if TYPE_CHECKING:
     from drgs.fitting.parts import Parts
     from drgs.information.pool import Workers
 
-__all__ = ["ActiveConfig", "FitConfig", "FitResult", "SelectionConfig", "Trainer", "fit"]
+__all__ = [
+    "ActiveConfig",
+    "DataConfig",
+    "DensityConfig",
+    "FeatureConfig",
+    "FitConfig",
+    "FitResult",
+    "LossConfig",
+    "MotionConfig",
+    "RateConfig",
+    "SavingConfig",
+    "SelectionConfig",
+    "Trainer",
+    "fit",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +87,7 @@ class FitResult:
 
     Attributes:
         gaussians: The Gaussians, also in `run.point_cloud`; those of a scene that moves are at rest.
-        metrics: As in metrics.json.
+        metrics: Contents of metrics.json.
         run: The run folder.
         seconds: Wall time of all steps, of resumed runs together.
     """
@@ -86,8 +111,11 @@ def fit(
 ) -> FitResult:
     """Fit Gaussians to a data set and write a run folder.
 
+        result = drgs.fit(drgs.load_data("scene"), "runs/scene", drgs.FitConfig(max_steps=3000))
+        result.metrics["mean"]["psnr"]  # of the held-out views
+
     Args:
-        dataset: As `drgs.data.load` returns it.
+        dataset: Result of `drgs.data.load`.
         out_dir: The run folder: new, or with `resume` one that a fit of the same config has begun.
         config: What to do; the defaults if left out. With a `selection` the fit begins with a few views and chooses
             more on the way; the data set is best loaded with `lazy=True` and without points, so that nothing of views

@@ -1,9 +1,9 @@
 """The true volume: emission and absorption of the summed densities along a ray, in float64.
 
 Sorted compositing treats each Gaussian as a point on the ray. Here they overlap: Gaussian i has on a ray the density
-``s_i(t) = tau_i N(t; t*_i, 1/|d'_i|)`` with ``tau_i = softplus(logit_i) exp(-rho_i^2 / 2)``, of which a single one is
-exactly ``response="integral"``, and ``C = int_0^inf T(t) sum_i s_i(t) c_i dt + T_end background``. The optical depth
-``-log T(t) = sum_i tau_i (Phi(u_i(t)) - Phi(u_i(0)))``, ``u_i(t) = (t - t*_i) |d'_i|``, is closed form, hence every
+`s_i(t) = tau_i N(t; t*_i, 1/|d'_i|)` with `tau_i = softplus(logit_i) exp(-rho_i^2 / 2)`, of which a single one is
+exactly `response="integral"`, and `C = int_0^inf T(t) sum_i s_i(t) c_i dt + T_end background`. The optical depth
+`-log T(t) = sum_i tau_i (Phi(u_i(t)) - Phi(u_i(0)))`, `u_i(t) = (t - t*_i) |d'_i|`, is closed form, hence every
 interval of a ray can be integrated on its own: intervals are halved until none is long against a Gaussian in it, then
 until the 10-point Gauss rule agrees with the 21-point Kronrod rule that contains it.
 """
@@ -123,7 +123,8 @@ def render_volume(
 
     Args:
         g, cam, rays: Arguments of `drgs.reference.render`; gradients reach the raw parameters and a torch `w2c`.
-        settings: Only `background`, `near` and `sh_direction` apply; default `RenderSettings.preset("exact")`.
+        settings: Settings of which `background`, `near` and `sh_direction` apply; default
+            `RenderSettings.preset("exact")`.
         window: (x, y, width, height) in pixels: only these of the camera's image.
         tolerance: An interval is halved until its error estimate falls below tolerance times its weight T(a) - T(b);
             the estimates of a ray then sum to at most tolerance * alpha times the largest color.

@@ -14,6 +14,7 @@ from drgs import fisher
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.gain import Prior, information_gain, variances
 from drgs.information.backdrop import CELLS, Sphere, backdrop_cells, backdrop_sphere
+from drgs.information.diagonal import diagonal_and_opacity
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings
 
@@ -236,8 +237,7 @@ def test_opacity_of_the_diagonal(blob, ring, preset):
     normal = torch.randn(50, 12, generator=torch.Generator().manual_seed(0))
     g = drgs.Gaussians(normal[:, :3], normal[:, 3:7], normal[:, 7:10] - 2, normal[:, 10], 0.3 * torch.ones(50, 1, 3))
     for scene in (blob, g):
-        found = []
-        fisher.diagonal(scene, ring[:3], settings, seen_opacity=found)
+        diagonal, found = diagonal_and_opacity(scene, ring[:3], settings, "exact")
         assert [x.shape for x in found] == [(18, 24)] * 3
         for opacity, camera in zip(found, ring, strict=False):
             np.testing.assert_allclose(opacity, drgs.render(scene, camera, settings).alpha, atol=6e-6)
@@ -245,6 +245,8 @@ def test_opacity_of_the_diagonal(blob, ring, preset):
         given = fisher.backdrop(scene, ring[:3], settings, seen_opacity=found)
         np.testing.assert_allclose(given, wanted, rtol=1e-4, atol=1e-4)
         assert wanted.sum() > 100
+        for name, x in fisher.diagonal(scene, ring[:3], settings).items():
+            assert torch.equal(x, diagonal[name])
     with pytest.raises(ValueError, match="seen_opacity must be of the 2 views and their sizes"):
         fisher.backdrop(blob, ring[:2], settings, seen_opacity=found)
 

@@ -308,4 +308,4 @@ def test_windows_of_zstandard(tmp_path):
 def test_messages_about_runs_are_short(tmp_path):
     """A schema of thousands of letters."""
     (tmp_path / "config.json").write_text(json.dumps({"schema": "1" * 5000}))
-    refused(lambda path: Run(path).config(), tmp_path, "schema must be 1, got '1+; fit again")
+    refused(lambda path: Run(path).config(), tmp_path, "schema must be 1 or 2, got '1+; fit again")

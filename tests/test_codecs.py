@@ -16,7 +16,7 @@ import torch
 from splat_samples import NAMES, N, glb_document, smallest_three, sog_scene, unit, write_sample
 
 import drgs
-from drgs.codecs import load_gaussians, save_gaussians
+from drgs.codecs import CODECS, Codec, load_gaussians, readable, save_gaussians
 from drgs.codecs.bounded import pixels_of_webp
 from drgs.codecs.values import flipped, logits_of_bytes, logits_of_opacities
 from drgs.oracle import sh_basis
@@ -277,3 +277,36 @@ def test_scenes_of_no_gaussians(tmp_path):
     for suffix in ("ply", "spz", "glb"):
         save_gaussians(g, tmp_path / f"a.{suffix}")
         assert len(load_gaussians(tmp_path / f"a.{suffix}")) == 0
+
+
+def load_rows(path):
+    """Gaussians of a file that begins with ROWS: 14 float32 each, SH of degree 0."""
+    rows = torch.from_numpy(np.frombuffer(path.read_bytes()[4:], np.float32).reshape(-1, 14).copy())
+    means, quats, log_scales, logits, dc = rows.split([3, 4, 3, 1, 3], dim=1)
+    return drgs.Gaussians(means, quats, log_scales, logits[:, 0], dc[:, None])
+
+
+def encode_rows(g):
+    """What `load_rows` reads."""
+    columns = [g.means, g.quats, g.log_scales, g.logit_opacities[:, None], g.sh[:, 0]]
+    return b"ROWS" + torch.cat(columns, dim=1).numpy().tobytes()
+
+
+def test_a_codec_of_a_script(tmp_path, rng, capsys):
+    """A row of the table is enough: files are told by their mark, `drgs convert` reads and writes them."""
+    write_sample(tmp_path / "a.splat", "a.splat", rng)
+    rows, ply = tmp_path / "a.rows", tmp_path / "b.ply"
+    assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 2
+    assert "a.rows must end with .ply, .spz, .glb, got .rows; choose one of these" in capsys.readouterr().err
+    CODECS["rows"] = Codec(".rows", load_rows, lambda path, head: head.startswith(b"ROWS"), encode=encode_rows)
+    try:
+        assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 0
+        rows.rename(tmp_path / "a.bin")
+        assert drgs.cli.main(["convert", str(tmp_path / "a.bin"), str(ply), "--quiet"]) == 0
+        assert ".sog, .glb and .rows, a SOG folder" in readable()
+    finally:
+        del CODECS["rows"]
+    found, wanted = drgs.load_ply(ply).parameters(), load_gaussians(tmp_path / "a.splat").parameters()
+    assert all(torch.equal(x, found[name]) for name, x in wanted.items())
+    with pytest.raises(ValueError, match="is of no format that is known"):
+        load_gaussians(tmp_path / "a.bin")

@@ -107,6 +107,19 @@ def test_what_ran_before_goes_on():
         assert FitConfig(max_steps=9) != config
 
 
+def test_active_of_fit_goes_on(tmp_path):
+    """`fit(active=...)` is the config's selection: it is that which a data set without views is refused for."""
+    from drgs.data import Dataset
+    from drgs.train import fit
+
+    nothing = Dataset(tmp_path, "transforms", [])
+    with (
+        pytest.warns(DeprecationWarning, match="is written fit"),
+        pytest.raises(ValueError, match="active: there must be at least one training view"),
+    ):
+        fit(nothing, tmp_path / "run", active=SelectionConfig(), progress=False)
+
+
 # ------------------------------------------------------------------------------------------------------- as files
 
 
@@ -194,6 +207,13 @@ def test_the_command_line_wins(files):
     assert not _fit("--config", str(files / "on.json"), "--no-deterministic").deterministic
 
 
+def test_only_a_person_names_functions_of_others(files):
+    """A run by a policy of one's own is repeated where the command line names the policy, too."""
+    (files / "own.toml").write_text("[selection]\npolicy = 'mine:policy'\nadd = 2")
+    again = _fit("--config", str(files / "own.toml"), "--policy", "mine:policy")
+    assert again == FitConfig.of(policy="mine:policy", add=2)
+
+
 def test_select_and_reproduce_take_the_same_file(files, tmp_path):
     """`select` the settings and what scores views; `reproduce` all, over the fits of its scale."""
     from drgs.studies.plan import plan_of
@@ -239,6 +259,12 @@ def test_select_and_reproduce_take_the_same_file(files, tmp_path):
         ("a.json", "[" * 100_000, "a.json: must be valid JSON, got one that is nested too deeply"),
         ("a.toml", "a = " + "[" * 100_000, "a.toml: must be valid TOML"),
         ("a.toml", "#" * (1 << 20) + "##", "a.toml: must be a configuration of at most 1 MiB, is larger"),
+        (
+            "a.toml",
+            "[selection]\npolicy = 'os:abort'",
+            "a.toml: policy must be a name in a file, got 'os:abort', which would be imported; add --policy os:abort",
+        ),
+        ("a.toml", "[selection.scoring]\ncriterion = 'os:abort'", "a.toml: criterion must be a name in a file"),
         ("a.yaml", "a: 1", "--config: must be a .toml or .json file, or a run folder, got"),
         ("nowhere.toml", None, "nowhere.toml: must be a configuration, found none"),
     ],

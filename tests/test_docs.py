@@ -14,9 +14,9 @@ import tomllib
 import pytest
 from doc_pages import PAGES, ROOT, blocks, elsewhere, figures, inline_commands, lines_of, make_folder, smaller
 
-import drgs.gain
-import drgs.select
 from drgs import cli
+from drgs.information.choices import BLOCKS, POLICIES
+from drgs.information.criteria import CRITERIA
 
 # What has tests of its own, which run the very blocks.
 _README = ROOT / "README.md"
@@ -45,9 +45,8 @@ def test_blocks_run(page, made, tmp_path, monkeypatch, capsys):
     shutil.copytree(made, folder)
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
-    for owner, name in ((drgs.select, "POLICIES"), (drgs.gain, "_TERMS")):  # which pages add to
-        monkeypatch.setattr(owner, name, dict(getattr(owner, name)))
-    monkeypatch.setattr(drgs.gain, "CRITERIA", drgs.gain.CRITERIA)
+    for registry in (POLICIES, CRITERIA, BLOCKS):  # which pages add to
+        monkeypatch.setattr(registry, "_rows", dict(registry._rows))
     names: dict = {"__name__": "docs"}
     for block in blocks(page):
         where = f"{_name(page)}:{block.line}"

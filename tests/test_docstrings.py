@@ -9,15 +9,6 @@ from collections.abc import Iterator
 import pytest
 from test_architecture import modules
 
-# Rooms, and modules, that are still to be rewritten; a test fails where one of them has nothing left to rewrite.
-TO_DO = {
-    *("codecs", "data", "dynamics", "fitting", "guards", "information", "policies", "studies", "tracing"),
-    *("cameras", "deform", "ellipsoids", "evaluation", "fisher", "integrator", "metrics", "oracle", "rasterize"),
-    *("gain", "reference", "select", "settings", "train", "viewing.uncertainty", "volume"),
-    *("commands.compared_maps", "commands.fisher", "commands.moments", "commands.orbits", "commands.painters"),
-    *("commands.render", "commands.scene_input", "commands.viewed", "commands.viewpoints"),
-}
-
 SECTIONS = re.compile(r"(Args|Attributes|Returns|Yields|Raises|Gradients|References?):(.*)")
 ARGUMENT = re.compile(r"    (\*{0,2}[\w`.]+(?:(?:,| and) \*{0,2}[\w`.]+)*): (.*)")
 
@@ -72,30 +63,13 @@ def faults(lines: list[str]) -> Iterator[str]:
             yield f"another dialect's section: {line}"
 
 
-def room_of(module: str) -> str | None:
-    """The entry of `TO_DO` that a module belongs to."""
-    return next((room for room in TO_DO if module == room or module.startswith(f"{room}.")), None)
-
-
-@pytest.fixture(scope="module")
-def found() -> dict[str, list[str]]:
-    """Module -> faults of its docstrings."""
-    made: dict[str, list[str]] = {}
+def test_arguments_are_no_fragments():
+    """Each description of an argument or attribute can be read by itself, and sections follow one another closely."""
+    found: dict[str, list[str]] = {}
     for module, name, lines in docstrings():
         for fault in faults(lines):
-            made.setdefault(module, []).append(f"{name}: {fault}")
-    return made
-
-
-def test_arguments_are_no_fragments(found):
-    """Each description of an argument or attribute can be read by itself, and sections follow one another closely."""
-    assert {module: told for module, told in found.items() if room_of(module) is None} == {}
-
-
-def test_what_is_to_do_is_not_done(found):
-    """A room that has been rewritten is taken off the list."""
-    left = {room_of(module) for module in found}
-    assert {room for room in TO_DO if room not in left} == set()
+            found.setdefault(module, []).append(f"{name}: {fault}")
+    assert found == {}
 
 
 @pytest.mark.parametrize(

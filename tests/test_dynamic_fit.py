@@ -16,8 +16,8 @@ import torch
 
 from drgs import cli
 from drgs.cameras import orbit
+from drgs.data import Dataset, View
 from drgs.data.checks import read_image
-from drgs.data.views import Dataset, View
 from drgs.deform import DynamicGaussians, FieldConfig
 from drgs.display.pictures import to_bytes, write_png
 from drgs.ellipsoids import Gaussians
@@ -209,7 +209,7 @@ def test_nothing_of_it_where_nothing_can_move(dataset, tmp_path, monkeypatch):
         found.append(run.point_cloud.read_bytes())
         assert load_run(run).scene is not None
     assert found[0] == found[1]
-    all_times = fit(dataset, tmp_path / "all.run", dataclasses.replace(how, dynamics="ignore"), progress=False)
+    all_times = fit(dataset, tmp_path / "all.run", how.replace(dynamics="ignore"), progress=False)
     assert not all_times.run.config().get("times")
 
 

@@ -14,7 +14,7 @@ from test_times import Drift
 from test_train import FAST, config, dataset, random_rows, scene  # noqa: F401 (a fixture)
 
 from drgs.cameras import orbit
-from drgs.data.views import Dataset, View
+from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.files import load_ply, load_state, save_state
 from drgs.fitting.config import SelectionConfig
@@ -134,7 +134,7 @@ def test_a_scene_that_moves_is_fitted_at_the_times_of_its_views(rng):
     rates = {**dict.fromkeys(truth.tensors, 0.0), "velocities": lambda part: 0.05 * (1 - part)}
     parts = Parts([Photometric(0.0)], rates, scene=moving)
     rows = GaussianRows({**truth.tensors, "velocities": torch.zeros(12, 3)})
-    trainer = Trainer(dataclasses.replace(cfg, sh_degree=0, refine_stop=0.0), frames, rows, 3.0, parts)
+    trainer = Trainer(cfg.replace(sh_degree=0, refine_stop=0.0), frames, rows, 3.0, parts)
     steps(trainer, 60)
     error = (rows.tensors["velocities"].detach() - velocities).norm(dim=1)
     assert float(error.median()) < float(velocities.norm(dim=1).median()) / 3

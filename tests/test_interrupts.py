@@ -174,7 +174,7 @@ def test_pycolmap_does_not_take_sigterm(tmp_path):
     code = (
         "import signal, os; from drgs.guards import interrupts\n"
         "with interrupts.between_steps() as is_interrupted:\n"
-        "    from drgs.data.native import pycolmap\n"
+        "    from drgs.data.colmap_bindings import pycolmap\n"
         "    os.kill(os.getpid(), signal.SIGTERM); print(is_interrupted(), flush=True)\n"
     )
     pytest.importorskip("pycolmap")
@@ -187,4 +187,4 @@ def test_pycolmap_is_imported_in_one_place():
     """Else the first import elsewhere would take SIGTERM."""
     folder = Path(interrupts.__file__).parents[1]
     lines = [(path.name, line.strip()) for path in folder.rglob("*.py") for line in path.read_text().splitlines()]
-    assert [name for name, line in lines if line == "import pycolmap"] == ["native.py"]
+    assert [name for name, line in lines if line == "import pycolmap"] == ["colmap_bindings.py"]

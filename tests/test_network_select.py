@@ -11,8 +11,9 @@ from test_network_information import swarm
 from drgs import fisher
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import Prior, information_gain
+from drgs.information import diagonal
+from drgs.information.blocks import NetworkQuestion, SceneBlocks, SeenView
 from drgs.information.combine import asked_of
-from drgs.information.semantics import SemanticMetric
 from drgs.select import POLICIES, Cache, Scoring, select
 from drgs.settings import RenderSettings
 
@@ -59,7 +60,7 @@ def test_ratio_joins_the_groups(views, cache):
     still = [fisher.diagonal(scene.at(cam.time), cam, FAST) for cam in (*train, *candidates)]
     for i, parts in enumerate(found.parts, 1):
         assert list(parts) == ["means", "rotations", "log_scales", "logit_opacities", "sh", "grid", "mlp"]
-        want = information_gain(told[i], told[0]).parts | information_gain(still[i], still[0]).parts
+        want = information_gain(told[i], told[0], "eig").parts | information_gain(still[i], still[0], "eig").parts
         for name, x in parts.items():
             assert x == pytest.approx(want[name], rel=1e-4), name  # information is kept in float32
         assert found.scores[i - 1] == pytest.approx(sum(parts.values()))
@@ -123,18 +124,18 @@ def test_a_trace_needs_nothing_known(views, cache, network):
 def test_a_trace_does_not_ask_known_views(views, monkeypatch, blocks):
     """Probes of the network are pulled back at the candidates alone; other blocks ask known views as ever."""
     scene, cams = views
-    asked = {"network": [], "diagonal": []}
-    for name, names in asked.items():
-        plain = getattr(fisher, name)
+    asked = {"network": [], "diagonal_and_opacity": []}
+    for (name, names), module in zip(asked.items(), (fisher, diagonal), strict=True):
+        plain = getattr(module, name)
 
         def spy(scene, camera, *rest, plain=plain, names=names, **options):
             names.append(camera.name)
             return plain(scene, camera, *rest, **options)
 
-        monkeypatch.setattr(fisher, name, spy)
+        monkeypatch.setattr(module, name, spy)
     pick(scene, cams[2:4], cams[:2], 2, blocks=blocks, network="trace")
     assert asked["network"] == [x.name for x in cams[2:4]]
-    assert asked["diagonal"] == ([x.name for x in cams[:4]] if "geometry" in blocks else [])
+    assert asked["diagonal_and_opacity"] == ([x.name for x in cams[:4]] if "geometry" in blocks else [])
     asked["network"].clear()
     pick(scene, cams[2:4], cams[:2], 2, blocks=blocks)  # a ratio needs what is known
     assert asked["network"] == [x.name for x in cams[:4]]
@@ -196,13 +197,14 @@ def test_rows_of_the_image_are_those_of_the_other_blocks():
     scene = swarm(g.replace(features=torch.randn(8, 4)))
     cams = [dataclasses.replace(cam, time=t, w2c=cam.w2c.detach()) for t in (0.0, 1.0)]
     score = lambda *blocks: Scoring(blocks=blocks, network="trace")  # noqa: E731
-    metric = SemanticMetric.of(None, 4)
+    asked_by = lambda *blocks: asked_of(SceneBlocks.of(scene, score(*blocks), cams))[0]  # noqa: E731
     told = {}
     for blocks in (("deformation",), ("geometry", "deformation"), ("semantic", "deformation")):
-        asked = asked_of(score(*blocks), blocks, metric)[0][-1]
-        assert asked.function == "network"
-        told[blocks[0]] = sum(float(x) for x in asked(scene, cams[1], FAST).values())
-    both = asked_of(score("geometry", "semantic", "deformation"), ("geometry", "semantic", "deformation"), metric)[0]
+        question = asked_by(*blocks)[-1].question
+        assert isinstance(question, NetworkQuestion)
+        view = SeenView(scene, cams[1], FAST)
+        told[blocks[0]] = sum(float(x) for x in question.information(view).values())
+    both = asked_by("geometry", "semantic", "deformation")
     assert [one.block for one in both] == ["geometry", "semantic", "deformation"]
     assert told["deformation"] == told["geometry"]
     assert told["semantic"] != told["geometry"]

@@ -15,7 +15,7 @@ from drgs.commands.option_help import options_in
 from drgs.data import sfm
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.guards.records import hints_of, part_of, texts_of, ways_of
-from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Policy
+from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Criterion, Policy
 from drgs.settings import PRESETS, RenderSettings
 
 
@@ -46,8 +46,9 @@ def test_fit_options_are_the_fields_of_its_records():
     assert set(fields) - set(offered) == {"settings", "selection"}
     for name in sorted(set(fields) & set(offered) - carried - {"prior"}):
         assert getattr(options.Fit, name) == fields[name], name
-        # Help shows the names of policies; a config may hold the name of somebody's own.
-        assert offered[name] == (Policy | str if name == "policy" else _type_of(name)), name
+        # Help shows the names of policies and criteria; a config may hold the name of somebody's own.
+        own = {"policy": Policy | str, "criterion": Criterion | str}
+        assert offered[name] == own.get(name, _type_of(name)), name
         assert shown[name].text == texts[name], name
     assert not carried & set(shown)
     assert options.Fit(data="x", output="y").given_prior() is fields["prior"] is None
@@ -84,7 +85,8 @@ def test_choices_are_what_there_is():
     for command in (options.Fit, options.Select):
         named, _ = _choices(command, "policy")
         assert typing.get_args(named) == tuple(select.POLICIES) == POLICY_NAMES
-        assert _choices(command, "criterion") == CRITERION_NAMES == gain.CRITERIA
+        named, _ = _choices(command, "criterion")
+        assert typing.get_args(named) == tuple(gain.CRITERIA) == CRITERION_NAMES
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
     parameters = inspect.signature(sfm.run_sfm).parameters

@@ -57,6 +57,17 @@ def test_a_broken_entry_point_is_one_line(package):
         Registry("test", "drgs.test", {})["broken"]
 
 
+def test_rows_of_one_type(package):
+    """Where rows must have a type, another one is refused when it is assigned, or found in another package."""
+    table = Registry("test", "drgs.test", {"plain": 1}, int)
+    table["more"] = 2
+    with pytest.raises(ValueError, match=r"^test 'less': must be a builtins.int, got str; make one of it$"):
+        table["less"] = "2"
+    assert "less" not in table
+    with pytest.raises(ValueError, match=r"^test 'twice' of others: must be a builtins.int, got function; "):
+        table["twice"]
+
+
 def test_names_that_a_user_types(package):
     """A row, or a function of any module; else the line that lists all rows."""
     table = Registry("test", "drgs.test", {"plain": abs})

@@ -291,7 +291,7 @@ def test_greedy_is_greedy(rng):
     H = {name: (pool["c0"][name].float() + pool["c4"][name].float().double()) for name in pool["c0"]}
     left = [name for name in pool if name not in ("c0", "c4")]
     for pick in found.picks:
-        scores = {name: information_gain(pool[name], H, weights={"means": 0.5}).total for name in left}
+        scores = {name: information_gain(pool[name], H, "eig", weights={"means": 0.5}).total for name in left}
         best = max(scores, key=scores.get)
         assert pick.name == best
         assert pick.score == pytest.approx(scores[best], rel=1e-6)
@@ -449,7 +449,7 @@ def test_scene_that_moves(world):
     H = fisher.diagonal(moving.at(1.0), known)
     for camera, score in zip(cameras, found.scores, strict=True):
         part = fisher.diagonal(moving.at(camera.time), camera)
-        assert score == pytest.approx(information_gain(part, H).total, rel=1e-5)
+        assert score == pytest.approx(information_gain(part, H, "eig").total, rel=1e-5)
     assert found.scores[0] != pytest.approx(found.scores[1], rel=1e-2)
     assert select(moving, cameras, known, cache=cache, blocks=("geometry",)).computed == 0
     # The speed moves nothing at time 0; other groups are other information.

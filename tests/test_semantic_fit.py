@@ -441,7 +441,7 @@ def test_labels_are_measured_against_the_data_set(run, taught, monkeypatch, caps
 @pytest.mark.parametrize("kind", ["labels", "map"])
 def test_references_are_looked_at_before_the_first_step(taught, tmp_path, monkeypatch, kind):
     """A held-out view with labels of no class, or NaN in its map, is refused when hours of fitting are yet to come."""
-    test = taught.split(config(**FIT).test_every)[1][0]
+    test = taught.split(config(**FIT).data.test_every)[1][0]
     if kind == "labels":
         write_png(tmp_path / "bad.png", np.full((SIZE, SIZE, 3), 77 / 255))
         bad, message = {"label_path": tmp_path / "bad.png"}, "bad.png: must hold classes .* got 77"

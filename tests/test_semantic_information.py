@@ -19,7 +19,7 @@ from drgs.data.camera_lists import save_cameras_json
 from drgs.files import load_state, save_ply
 from drgs.fisher import SemanticMetric
 from drgs.fitting.config import SelectionConfig
-from drgs.information.moments import moments_map
+from drgs.information.maps import moments_map
 from drgs.oracle import sh_colors
 from drgs.select import CRITERIA, POLICIES, Cache, select
 from drgs.settings import RenderSettings

@@ -18,7 +18,7 @@ from drgs import cli, metrics
 from drgs.cameras import orbit
 from drgs.commands.eval import print_table, viewers_line
 from drgs.commands.eval import run as run_eval
-from drgs.data.views import Dataset, View
+from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state

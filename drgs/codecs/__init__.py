@@ -17,15 +17,15 @@ from __future__ import annotations
 
 import logging
 import os
-import zipfile
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.codecs.folders import file_of_folder, refuse_checkpoint
+from drgs.codecs.codec import Codec
+from drgs.codecs.folders import file_of_folder, is_checkpoint, refuse_checkpoint
 from drgs.files import atomic_write, load_ply, save_ply
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
+from drgs.guards.registry import Registry
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,23 +34,35 @@ if TYPE_CHECKING:
 
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["READ", "WRITTEN", "check_suffix", "load_gaussians", "save_gaussians"]
+__all__ = ["CODECS", "Codec", "check_suffix", "load_gaussians", "readable", "save_gaussians"]
 
-READ = ".ply, .spz, .splat, .ksplat, .sog and .glb, a SOG folder or a model folder of INRIA's"
-WRITTEN = (".ply", ".spz", ".glb")
-_MADE_BY = {
-    ".sog": "`npx @playcanvas/splat-transform -g cpu {ply} {path}`, or SuperSplat (superspl.at/editor)",
-    ".splat": "`python convert.py {ply} --output {path}` of github.com/antimatter15/splat, or SuperSplat "
-    "(superspl.at/editor)",
-    ".ksplat": "`node util/create-ksplat.js {ply} {path}` of github.com/mkkellogg/GaussianSplats3D",
-    ".compressed.ply": "`npx @playcanvas/splat-transform {ply} {path}`, or SuperSplat (superspl.at/editor)",
-}
-"""What makes a file that is only read of a PLY."""
+CODECS: Registry[Codec] = Registry(
+    "format of Gaussians",
+    "drgs.codecs",
+    {
+        "packed_ply": "drgs.codecs.packed_ply:PACKED_PLY",
+        "ply": Codec(".ply", load_ply, lambda path, head: head.startswith((b"ply\n", b"ply\r")), by_suffix=False),
+        "spz": "drgs.codecs.spz:SPZ",
+        "splat": "drgs.codecs.splat:SPLAT",
+        "ksplat": "drgs.codecs.ksplat:KSPLAT",
+        "sog": "drgs.codecs.sog:SOG",
+        "glb": "drgs.codecs.gltf:GLB",
+    },
+    Codec,
+)
+"""Formats of Gaussians, in the order in which they are asked whether a file is theirs; those of other packages and
+scripts come after these. PLY is written by `drgs.save_ply`, which alone has room for more columns.
+"""
+
+_HEAD = 1 << 18  # bytes: the longest header of a PLY
+_WHATEVER_THE_SUFFIX = (b"version https://git-lfs", b"PK\x03\x04")  # pointers and archives, which no reader opens
 _log = logging.getLogger(__name__)
 
 
 def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gaussians:
     """Gaussians from a file or folder of any format that is read, in the axes of 3DGS PLY files.
+
+        g = drgs.load_gaussians("point_cloud.ply")
 
     The format is found by the first bytes; .splat and .ksplat, which have no mark, by their suffix. SPZ and glTF have
     other axes than PLY files: they are turned, SH included (drgs/codecs/spz.py, drgs/codecs/gltf.py).
@@ -58,8 +70,8 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
     Args:
         path: A .ply (3DGS's or SuperSplat's compressed one), .spz, .splat, .ksplat, .sog or .glb; a folder of a SOG
             scene or its meta.json; a model folder of INRIA's, whose latest iteration is taken.
-        as_stored: Of an SPZ, keep the axes of the file: some writers leave out the turn that its specification asks
-            for.
+        as_stored: Keep the axes of the file, where the format (SPZ) has others than PLY: some writers leave out the
+            turn that its specification asks for.
     Returns:
         float32 `Gaussians`. Where a byte stands for an opacity of 0 or 1, or a scale is 0, its logit or logarithm is
         finite (drgs/codecs/values.py).
@@ -68,30 +80,35 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
         ValueError: If it is damaged, of another kind (which is named, with the way round), or holds values that are
             not finite (the first index is named).
     """
-    from drgs.codecs import gltf, ksplat, packed_ply, sog, splat, spz
     from drgs.guards.inputs import check_path
 
     path = check_path("load_gaussians", path)
     if path.is_dir():
         found = file_of_folder(path)
         if found is None:
-            raise FileNotFoundError(f"{path}: must hold Gaussians, holds no file that is known; name one of {READ}")
+            raise FileNotFoundError(
+                f"{path}: must hold Gaussians, holds no file that is known; name one of {readable()}"
+            )
         path = found
     elif not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file of Gaussians, found none; check the path")
-    kind = _kind(path)
-    if kind == "spz":
-        return spz.load_spz(path, as_stored)
-    readers = {"packed": packed_ply.load_packed_ply, "sog": sog.load_sog, "glb": gltf.load_glb}
-    readers |= {"splat": splat.load_splat, "ksplat": ksplat.load_ksplat}
-    if kind in readers:
-        return readers[kind](path)
-    if kind == "checkpoint":
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    codec = _codec_of(path, head)
+    if codec is not None:
+        return codec.load_as_stored(path) if as_stored and codec.load_as_stored else codec.load(path)
+    if is_checkpoint(path, head):
         refuse_checkpoint(path)
-    if kind == "ply":
-        return load_ply(path)
     refuse_foreign(path, "a file of Gaussians")
-    raise ValueError(f"{path}: must be a file of Gaussians, is of no format that is known; what is read: {READ}")
+    raise ValueError(f"{path}: must be a file of Gaussians, is of no format that is known; what is read: {readable()}")
+
+
+def readable() -> str:
+    """What `load_gaussians` reads, for messages."""
+    suffixes = dict.fromkeys(codec.suffix for codec in CODECS.values())
+    # Without .compressed.ply, which ends with .ply, too.
+    *others, last = [x for x in suffixes if not any(x != other and x.endswith(other) for other in suffixes)]
+    return f"{', '.join(others)} and {last}, a SOG folder or a model folder of INRIA's"
 
 
 def save_gaussians(
@@ -103,16 +120,16 @@ def save_gaussians(
 ) -> None:
     """Write Gaussians in the format of a suffix: .ply, .spz (version 3) or .glb (KHR_gaussian_splatting); atomically.
 
+        drgs.save_gaussians(g, "scene.spz")
+
     Args:
-        g: In the axes of 3DGS PLY files; SPZ and glTF get theirs.
+        g: Gaussians in the axes of 3DGS PLY files; SPZ and glTF get theirs.
         path: The file.
         extra, comments: Columns and lines that only a PLY has room for; see `save_ply`.
     Raises:
         ValueError: If the suffix is another one, a parameter is not finite (the first index is named), or the format
             cannot hold it.
     """
-    from drgs.codecs.gltf import encode_glb
-    from drgs.codecs.spz import encode_spz
     from drgs.guards.inputs import check_path, check_scene
 
     if isinstance(g, str | os.PathLike):
@@ -130,7 +147,8 @@ def save_gaussians(
     g.validate("save_gaussians")
     if g.features is not None:
         _log.warning("%s: left out the %d semantic features, %s has no room", path, g.features.shape[1], suffix)
-    data = (encode_spz if suffix == ".spz" else encode_glb)(_plain(g))
+    encode = next(codec.encode for codec in CODECS.values() if codec.suffix == suffix and codec.encode)
+    data = encode(_plain(g))
     with atomic_write(path) as file:
         file.write(data)
 
@@ -141,19 +159,23 @@ def check_suffix(where: str, path: Path) -> str:
     Raises:
         ValueError: If no such format is written; of those that are only read it says which program makes one.
     """
-    # A PLY as it is under SuperSplat's name for what it compresses would be taken for compressed.
-    suffix = ".compressed.ply" if path.name.lower().endswith(".compressed.ply") else path.suffix.lower()
-    if suffix in WRITTEN:
-        return suffix
-    known = f"{where}: {path.name} must end with {', '.join(WRITTEN)}, got {suffix or 'no suffix'}"
-    if path.name.lower() == "meta.json":
-        suffix = ".sog"  # the index of the same, in a folder
-    if suffix not in _MADE_BY:
+    name = path.name.lower()
+    written = [".ply", *(codec.suffix for codec in CODECS.values() if codec.encode)]
+    # The longest: a PLY as it is under SuperSplat's name for what it compresses would be taken for compressed.
+    found = [codec for codec in CODECS.values() if name.endswith(codec.suffix) and name != codec.suffix]
+    codec = max(found, key=lambda codec: len(codec.suffix), default=None)
+    if codec is not None and codec.suffix in written:
+        return codec.suffix
+    got = (codec.suffix if codec else path.suffix.lower()) or "no suffix"
+    known = f"{where}: {path.name} must end with {', '.join(written)}, got {got}"
+    if name == "meta.json":
+        codec = CODECS["sog"]  # the index of the same, in a folder
+    if codec is None or not codec.made_by:
         raise ValueError(f"{known}; choose one of these")
-    ply = path.with_name(("scene" if path.name.lower() == "meta.json" else path.name[: -len(suffix)]) + ".ply")
+    ply = path.with_name(("scene" if name == "meta.json" else path.name[: -len(codec.suffix)]) + ".ply")
     raise ValueError(
         f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
-        f"{_MADE_BY[suffix].format(ply=ply, path=path)}"
+        f"{codec.made_by.format(ply=ply, path=path)}"
     )
 
 
@@ -162,49 +184,20 @@ def _plain(g: Gaussians) -> Gaussians:
     import numpy as np
     import torch
 
+    # A file holds values: nothing of it is differentiated.
     values = {name: x.detach().cpu() for name, x in g.parameters().items() if name != "features"}
     if np.any(g.origin):
+        # In float64 before it is rounded once: float32 offsets near 0 would lose their digits to an origin far away.
         values["means"] = values["means"].double() + torch.from_numpy(np.asarray(g.origin, np.float64))
     floats = {name: x.float() for name, x in values.items()}
     return g.replace(**floats, features=None, origin=np.zeros(3))
 
 
-def _kind(path: Path) -> str | None:
-    """Of a file, by its first bytes; by its suffix where a format has no mark."""
-    with path.open("rb") as file:
-        head = file.read(1 << 18)  # the header of a PLY
-    suffix = path.suffix.lower()
-    if head.startswith((b"ply\n", b"ply\r")):
-        return "packed" if b" packed_position" in head.partition(b"\nend_header")[0] else "ply"
-    if head.startswith(b"version https://git-lfs"):
+def _codec_of(path: Path, head: bytes) -> Codec | None:
+    """The codec of a file, by its first bytes; by its suffix where none recognizes them."""
+    for codec in CODECS.values():
+        if codec.recognizes is not None and codec.recognizes(path, head):
+            return codec
+    if head.startswith(_WHATEVER_THE_SUFFIX):
         return None
-    if head.startswith(b"NGSP") or (head.startswith(b"\x1f\x8b") and _begin(head).startswith(b"NGSP")):
-        return "spz"
-    if head.startswith(b"glTF"):
-        return "glb"
-    if head.startswith(b"PK\x03\x04"):
-        return _kind_of_zip(path)
-    if path.name == "meta.json" and b'"means"' in head:
-        return "sog"
-    return {".splat": "splat", ".ksplat": "ksplat", ".ckpt": "checkpoint", ".sog": "sog", ".spz": "spz"}.get(suffix)
-
-
-def _begin(head: bytes) -> bytes:
-    """The first bytes of a gzip stream."""
-    try:
-        return zlib.decompressobj(wbits=31).decompress(head, 16)
-    except zlib.error:
-        return b""
-
-
-def _kind_of_zip(path: Path) -> str | None:
-    """Of a zip archive, by the names in it."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        names = []
-    if any(name.rpartition("/")[2] == "data.pkl" for name in names) or path.suffix.lower() == ".ckpt":
-        return "checkpoint"
-    known = any(name.rpartition("/")[2] == "meta.json" for name in names)
-    return "sog" if known or path.suffix.lower() == ".sog" else None
+    return next((x for x in CODECS.values() if x.by_suffix and x.suffix == path.suffix.lower()), None)

@@ -191,6 +191,7 @@ def pixels_of_webp(where: str, data: bytes, least: int, most: int) -> np.ndarray
     if image is None or image.dtype != np.uint8 or image.shape[:2] != (height, width) or image.ndim != 3:
         raise ValueError(f"{where}: must be a readable WebP image, is none; {_DAMAGED}")
     if image.shape[2] == 3:
+        # OpenCV has blue first; an image without alpha is opaque.
         return np.dstack([image[..., ::-1], np.full((height, width), 255, np.uint8)])
     return np.ascontiguousarray(image[..., [2, 1, 0, 3]])
 

@@ -1,4 +1,4 @@
-"""Folders that other programs leave behind, and which file in them holds the Gaussians.
+"""Folders and archives that other programs leave behind, and which file in them holds the Gaussians.
 
 INRIA's 3DGS   point_cloud/iteration_*/point_cloud.ply, of the highest iteration; cameras.json, where it is there.
                cfg_args, a line of Python, is neither run nor read.
@@ -9,9 +9,10 @@ Nerfstudio     config.yml and checkpoints: pickles, which are not read; `ns-expo
 from __future__ import annotations
 
 import re
+import zipfile
 from pathlib import Path
 
-__all__ = ["cameras_of_model", "file_of_folder", "refuse_checkpoint"]
+__all__ = ["cameras_of_model", "file_of_folder", "is_checkpoint", "names_in_archive", "refuse_checkpoint"]
 
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 
@@ -43,6 +44,27 @@ def file_of_folder(folder: Path) -> Path | None:
     if folder.name == models or (folder / models).is_dir() or any(folder.glob("step-*.ckpt")):
         refuse_checkpoint(folder)
     return None
+
+
+def names_in_archive(path: Path) -> set[str]:
+    """Names, without their folders, of the files in a zip archive; none of one that is damaged."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name.rpartition("/")[2] for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return set()
+
+
+def is_checkpoint(path: Path, head: bytes) -> bool:
+    """Whether a file is a checkpoint of PyTorch: an archive with a pickle, or called so.
+
+    Args:
+        path: The file.
+        head: Its first bytes.
+    """
+    if head.startswith(b"PK\x03\x04") and "data.pkl" in names_in_archive(path):
+        return True
+    return path.suffix.lower() == ".ckpt" and not head.startswith(b"version https://git-lfs")
 
 
 def refuse_checkpoint(path: Path) -> None:

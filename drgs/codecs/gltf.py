@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
 from drgs.ellipsoids import Y_00
 from drgs.guards.json_files import check_json, parse_json
@@ -27,7 +28,7 @@ from drgs.guards.json_files import check_json, parse_json
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["encode_glb", "load_glb"]
+__all__ = ["GLB", "encode_glb", "load_glb"]
 
 _AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"
@@ -49,10 +50,12 @@ def encode_glb(g: Gaussians) -> bytes:
     quats = g.quats.numpy().astype(np.float64)
     quats /= np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    # float64, rounded once: exp and sigmoid of float32 are off by a last digit or two.
     opacities = g.logit_opacities.double().sigmoid().numpy()
     scales = g.log_scales.double().exp().numpy()
     sh = g.sh.numpy()
     colors = np.column_stack([sh[:, 0] * Y_00 + 0.5, opacities])
+    # A scale that float32 cannot hold becomes infinite, and is refused below.
     with np.errstate(over="ignore"):
         arrays = {
             "POSITION": g.means.numpy(),
@@ -245,4 +248,8 @@ class _Accessors:
         raw = np.ndarray((count, width), dtype, self._buffer, start + offset, (stride, dtype.itemsize))
         if not accessor.get("normalized"):
             return raw.astype(np.float32)
+        # -128 of a normalized byte, and -32768 of a short, are -1 as their neighbors are: ranges are symmetric.
         return np.maximum(raw.astype(np.float32) / one, -1.0)
+
+
+GLB = Codec(".glb", load_glb, lambda path, head: head.startswith(b"glTF"), by_suffix=False, encode=encode_glb)

@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.splat import LEAST_FLOAT
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["load_ksplat"]
+__all__ = ["KSPLAT", "load_ksplat"]
 
 _HEADER = 4096
 _SECTION = 1024
@@ -139,6 +140,7 @@ def _decoded(
     means = rows["mean"]
     if level:
         centers = _bucket_centers(path, data, section)
+        # float64: 16 bits less their middle wrap around in the type that they are stored in.
         means = (means.astype(np.float64) - section.steps) * (section.block / 2 / section.steps) + centers
     stored = rows["sh"].astype(np.float32)
     if level == 2:
@@ -148,6 +150,7 @@ def _decoded(
     for d in range(1, section.degree + 1):
         width = 2 * d + 1
         block = stored[:, 3 * at : 3 * (at + width)].reshape(-1, 3, width)
+        # Stored channel by channel; ours are coefficient by coefficient.
         sh[:, at : at + width] = block.transpose(0, 2, 1)
         at += width
     return means, rows["quat"].astype(np.float32), rows["scale"].astype(np.float32), rows["color"], sh
@@ -170,3 +173,10 @@ def _bucket_centers(path: Path, data: bytes, section: _Section) -> np.ndarray:
     stride = section.bucket_bytes
     raw = np.frombuffer(data, np.uint8, stride * section.buckets, at).reshape(section.buckets, stride)[:, :12]
     return np.ascontiguousarray(raw).view("<f4")[bucket].astype(np.float64)
+
+
+KSPLAT = Codec(
+    ".ksplat",
+    load_ksplat,
+    made_by="`node util/create-ksplat.js {ply} {path}` of github.com/mkkellogg/GaussianSplats3D",
+)

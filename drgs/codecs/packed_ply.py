@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
-from drgs.guards.ply_headers import read_ply_header
-from drgs.guards.ply_lists import ply_source
+from drgs.guards.ply_headers import ply_source, read_ply_header
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.guards.ply_headers import PlyElement
 
-__all__ = ["load_packed_ply"]
+__all__ = ["PACKED_PLY", "load_packed_ply"]
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -54,6 +54,7 @@ def load_packed_ply(path: Path) -> Gaussians:
             raise ValueError(f"{path}: the {name} column {lists[0]} must be a number, is a list; {_ADVICE}")
     chunks, vertex = ply["chunk"].data, ply["vertex"].data
     chunk = np.arange(count) // _CHUNK
+    # In the order of this machine's bytes, and without a sign: the bits are shifted apart.
     position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
     rgba = np.stack([color >> shift & 255 for shift in (24, 16, 8, 0)], axis=1)
     colors = rgba[:, :3] / 255.0
@@ -122,4 +123,19 @@ def _higher(rows: np.ndarray, coefficients: int) -> np.ndarray:
     table = (np.arange(256, dtype=np.float32) + 0.5) / 256
     table[[0, 255]] = 0, 1
     values = (table - 0.5) * 8
+    # Stored channel by channel; ours are coefficient by coefficient.
     return values[stored].reshape(-1, 3, coefficients).transpose(0, 2, 1)
+
+
+def _is_packed(path: Path, head: bytes) -> bool:
+    """Whether a PLY has packed columns in its header."""
+    return head.startswith((b"ply\n", b"ply\r")) and b" packed_position" in head.partition(b"\nend_header")[0]
+
+
+PACKED_PLY = Codec(
+    ".compressed.ply",
+    load_packed_ply,
+    _is_packed,
+    by_suffix=False,
+    made_by="`npx @playcanvas/splat-transform {ply} {path}`, or SuperSplat (superspl.at/editor)",
+)

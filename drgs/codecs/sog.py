@@ -21,13 +21,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.codecs.bounded import Archive, pixels_of_webp
+from drgs.codecs.codec import Codec
+from drgs.codecs.folders import is_checkpoint, names_in_archive
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
 from drgs.guards.json_files import check_json, parse_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["load_sog"]
+__all__ = ["SOG", "load_sog"]
 
 _META = 4 << 20  # bytes
 _PALETTE = 64  # rows of SH side by side
@@ -82,6 +84,7 @@ class _Reader:
         low, high = (self._image("means", i) for i in (0, 1))  # first: they are as large as the count says
         degree = self._degree()
         check_count(self.path, self.count, SH_COUNTS[degree])
+        # Two bytes make a whole number of 16 bits.
         code = low[:, :3].astype(np.float64) + 256.0 * high[:, :3]
         wide = self._lerped("means", code / 65535, 3)
         with np.errstate(over="ignore"):  # what float32 cannot hold is refused
@@ -143,7 +146,7 @@ class _Reader:
         return quats_of_smallest(codes[:, 3].astype(int) - 252, (codes[:, :3] / 127.5 - 1.0) / 2**0.5)
 
     def _degree(self) -> int:
-        """Of the SH. Version 1 tells by the width of the palette's image."""
+        """Degree of the SH; version 1 tells it by the width of the palette's image."""
         if not self.has_sh:
             return 0
         if self.version == 1:
@@ -195,3 +198,19 @@ class _Reader:
         most = 4 * self.count + (1 << 16)
         codes = self._pixels("shN", 1, self.count, most).reshape(-1, 4)[: self.count].astype(np.int64)
         return codes[:, 0] + 256 * codes[:, 1]
+
+
+def _is_sog(path: Path, head: bytes) -> bool:
+    """Whether it is an archive with a meta.json, or the meta.json of a folder."""
+    if head.startswith(b"PK\x03\x04"):
+        known = path.suffix.lower() == ".sog" or "meta.json" in names_in_archive(path)
+        return known and not is_checkpoint(path, head)
+    return path.name == "meta.json" and b'"means"' in head
+
+
+SOG = Codec(
+    ".sog",
+    load_sog,
+    _is_sog,
+    made_by="`npx @playcanvas/splat-transform -g cpu {ply} {path}`, or SuperSplat (superspl.at/editor)",
+)

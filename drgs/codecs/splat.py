@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["LEAST_FLOAT", "load_splat"]
+__all__ = ["LEAST_FLOAT", "SPLAT", "load_splat"]
 
 LEAST_FLOAT = float(np.finfo(np.float32).tiny)
 """What a float32 scale of 0 is taken for: the least normal number, a log scale of -87.3."""
@@ -45,3 +46,11 @@ def load_splat(path: Path) -> Gaussians:
         logits_of_bytes(rows["opacity"]),
         dc_of_colors(rows["color"] / 255.0),
     )
+
+
+SPLAT = Codec(
+    ".splat",
+    load_splat,
+    made_by="`python convert.py {ply} --output {path}` of github.com/antimatter15/splat, or SuperSplat "
+    "(superspl.at/editor)",
+)

@@ -27,12 +27,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.bounded import GzipReader, unzstd
+from drgs.codecs.codec import Codec
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["encode_spz", "load_spz"]
+__all__ = ["SPZ", "encode_spz", "load_spz"]
 
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
 _COLOR = 0.15
@@ -50,7 +51,7 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
 
     Args:
         path: The file; versions 2 and 3 may be packed with gzip or not.
-        as_stored: In the file's own axes, not in those of PLY files.
+        as_stored: Keep the file's own axes, in place of those of PLY files.
     Raises:
         ValueError: If it is damaged, of another version, or has extensions that may change what values mean.
     """
@@ -64,6 +65,7 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
     if degree > 3:
         _log.warning("%s: left out the SH coefficients of degree 4, there is no such color here", path)
     bytes_of = {name: np.frombuffer(x, np.uint8) for name, x in (("p", positions), ("c", colors), ("s", scales))}
+    # Three bytes, the lowest first, of a whole number with a sign.
     fixed = bytes_of["p"].reshape(count, 3, 3).astype(np.int32)
     fixed = fixed[..., 0] | fixed[..., 1] << 8 | fixed[..., 2] << 16
     means = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed) / 2.0**bits
@@ -203,6 +205,7 @@ def encode_spz(g: Gaussians) -> bytes:
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[..., :3]
     clipped: dict[str, int] = {}
+    # float64: a logit that was read from a byte must go back to that byte.
     opacities = 255 * g.logit_opacities.double().sigmoid().numpy()
     sh = g.sh.numpy()
     parts = (
@@ -245,7 +248,27 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
         largest = np.where(is_stored & (steps[:, i] > steps.max(1) - 2), i, largest)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
     others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+    # Where the component left out is second by a step, the largest is above sqrt(1/2), and 9 bits end at 511.
     magnitude = np.minimum(np.floor(np.abs(others) * _SMALLEST + 0.5), 511).astype(np.uint32)
     codes = magnitude | np.where(np.signbit(others), 512, 0).astype(np.uint32)
     shifted = largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
     return shifted.astype("<u4")
+
+
+def _is_spz(path: Path, head: bytes) -> bool:
+    """Whether it begins with the mark of SPZ, packed with gzip or not."""
+    if not head.startswith(b"\x1f\x8b"):
+        return head.startswith(b"NGSP")
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 16).startswith(b"NGSP")
+    except zlib.error:
+        return False
+
+
+SPZ = Codec(
+    ".spz",
+    load_spz,
+    _is_spz,
+    load_as_stored=lambda path: load_spz(path, as_stored=True),
+    encode=encode_spz,
+)

@@ -72,7 +72,9 @@ def logits_of_bytes(opacity: np.ndarray) -> np.ndarray:
 
 def logits_of_opacities(opacity: np.ndarray) -> np.ndarray:
     """Logits of float32 opacities; 0 and 1 become `LOGIT_ENDS`, others outside are NaN."""
+    # float64: 1 - x of float32 has no digits left next to 1.
     x = opacity.astype(np.float64)
+    # 0 and 1, whose logarithms are infinite, are replaced below; what is outside becomes NaN and is refused.
     with np.errstate(invalid="ignore", divide="ignore"):
         logits = np.log(x) - np.log1p(-x)
     return np.where(x == 0, LOGIT_ENDS[0], np.where(x == 1, LOGIT_ENDS[1], logits))
@@ -116,6 +118,7 @@ def quats_of_smallest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     quats = np.empty((n, 4))
     stored = np.arange(4)[None, :] != largest[:, None]
     quats[stored] = others.reshape(-1)
+    # Squares of three smaller components are 3/4 at most, but a file may claim more than 1.
     quats[np.arange(n), largest] = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(1)))
     return quats
 

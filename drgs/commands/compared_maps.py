@@ -9,53 +9,53 @@ import torch
 
 from drgs import fisher
 from drgs.display import pictures
-from drgs.information.maps import fisherrf_map
-from drgs.information.moments import moments_map
+from drgs.information.blocks import add
+from drgs.information.maps import fisherrf_map, moments_map
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.fisher import Told
+    from drgs.ellipsoids import Scene
     from drgs.gain import Prior
+    from drgs.settings import RenderSettings
 
-__all__ = ["Rivals"]
+__all__ = ["ComparedMaps"]
 
 _SMALL = 200  # pixels of width, below which a picture is enlarged by a whole number
 
 
-class Rivals:
+class ComparedMaps:
     """Maps of `moments`, of `fisherrf` and of every block, of views that are compared with known ones.
 
     Args:
-        told: Whose scene and blocks they are of.
+        scene: The scene that is seen.
+        settings: Settings of the renderer.
         prior: lambda.
     """
 
-    def __init__(self, told: Told, prior: Prior) -> None:
-        self.told = told
+    def __init__(self, scene: Scene, settings: RenderSettings, prior: Prior) -> None:
+        self.scene = scene
+        self.settings = settings
         self.prior = prior
         self.known: dict[str, torch.Tensor] = {}  # as FisherRF's code computes it
 
     def know(self, camera: Camera) -> None:
         """Add a known view."""
-        told = self.told
-        for name, x in fisher.diagonal(told.scene, camera, told.settings, "fisherrf").items():
-            self.known[name] = self.known[name] + x if name in self.known else x
+        add(self.known, fisher.diagonal(self.scene, camera, self.settings, "fisherrf"))
 
     def row(self, camera: Camera, blocks: dict[str, np.ndarray]) -> np.ndarray:
         """(H, W, 3) uint8: the view as it is rendered, then the maps, each on a scale of its own.
 
         Args:
-            camera: Of the view.
+            camera: The camera of the view.
             blocks: Block -> (H, W) variance map.
         """
-        told = self.told
-        with torch.no_grad():
-            seen = told.scene.at(camera.time)
-        image = render(seen.replace(features=None), camera, told.settings, outputs=()).rgb.cpu().numpy()
+        with torch.no_grad():  # a picture
+            seen = self.scene.at(camera.time)
+        image = render(seen.replace(features=None), camera, self.settings, outputs=()).rgb.cpu().numpy()
         maps = {
-            "moments": moments_map(seen, camera, told.settings).numpy(),
-            "fisherrf": fisherrf_map(seen, camera, self.known, self.prior, told.settings).numpy(),
+            "moments": moments_map(seen, camera, self.settings).numpy(),
+            "fisherrf": fisherrf_map(seen, camera, self.known, self.prior, self.settings).numpy(),
             **blocks,
         }
         times = max(1, -(-_SMALL // camera.width))

@@ -33,14 +33,18 @@ def named_config(words: Sequence[str]) -> Path | None:
     return None if found is None else Path(found)
 
 
-def config_fields(path: Path) -> dict[str, Any]:
+def config_fields(path: Path, words: Sequence[str] = ()) -> dict[str, Any]:
     """The fields that a file states, by their names in `FitConfig` and its parts.
 
     Where it has a selection, `selection` is among them, and its fields beside it.
 
+    Args:
+        path: The file, or a run folder.
+        words: Words of the command line, which alone may name functions of other packages.
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no TOML or JSON, or names an unknown field, or a value has another type or is out of range.
+        ValueError: If it is no TOML or JSON, or names an unknown field, or a value has another type or is out of range,
+            or is a function of another package that the command line does not name, too.
     """
     path = path / "config.json" if path.is_dir() else path
     kinds = {".json": read_json, ".toml": read_toml}
@@ -64,6 +68,13 @@ def config_fields(path: Path) -> dict[str, Any]:
     except (ValueError, NotImplementedError) as error:
         text = str(error).removeprefix(f"{FitConfig.where}: ")
         raise ValueError(f"{path}: {text}" + ("" if ";" in text else f"; {_ADVICE}")) from None
+    for name in ("policy", "criterion"):
+        # Importing runs a module: that is for the person at the command line to ask for, not for a file from elsewhere.
+        if ":" in str(fields.get(name, "")) and not any(word.partition("=")[0] == f"--{name}" for word in words):
+            raise ValueError(
+                f"{path}: {name} must be a name in a file, got {fields[name]!r}, which would be imported; add "
+                f"--{name} {fields[name]} if you trust it"
+            )
     return fields
 
 
@@ -72,7 +83,7 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
 
     Args:
         options: The dataclass of the command.
-        fields: As `config_fields` returns them; those that the command has no use for are passed over.
+        fields: Result of `config_fields`; what the command has no use for is passed over.
         required: What stands for an option that has no default.
     """
     given = dict(fields)
@@ -80,7 +91,7 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
     if settings is not None:
         given["preset"], differences = settings.nearest_preset()
         given["overrides"] = tuple(override(name, x) for name, x in differences.items())
-        if "background" in options.__dataclass_fields__:
+        if hasattr(options, "background"):
             given["background"] = settings.background
         elif settings.background != RenderSettings.background:
             given["overrides"] += (override("background", settings.background),)

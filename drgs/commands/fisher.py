@@ -21,41 +21,29 @@ import numpy as np
 import torch
 
 from drgs import fisher
-from drgs.commands.compared_maps import Rivals
+from drgs.commands.compared_maps import ComparedMaps
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, save_state, write_json
-from drgs.fisher import GROUPS, Information
-from drgs.gain import Prior, check, information_gain, variances
+from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.guards.outputs import claim
-from drgs.information.network_groups import NETWORK_GROUPS
-from drgs.information.semantics import SemanticMetric
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks, add, together
 from drgs.select import Scoring
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from drgs.cameras import Camera
-    from drgs.commands.options import Fisher
+    from drgs.commands.options import Fisher, View
     from drgs.commands.viewpoints import Known
-    from drgs.ellipsoids import Scene
-    from drgs.information.backdrop import Sphere
     from drgs.settings import RenderSettings
 
-__all__ = ["KINDS", "MAP_PRIOR", "Told", "added", "map_weights", "run"]
+__all__ = ["KINDS", "asked_blocks", "map_weights", "run"]
 
 KINDS = ("variance", "share")  # of maps
-MAP_PRIOR = Prior(1.0)  # with which the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/active-static.md)
-# Block -> groups that it says nothing about.
-_OTHERS = {
-    "geometry": ("features", "backdrop", *NETWORK_GROUPS),
-    "semantic": ("sh", "backdrop", *NETWORK_GROUPS),
-    "deformation": (*GROUPS, "backdrop"),
-    "backdrop": (*GROUPS, *NETWORK_GROUPS),
-}
 
 
 def run(args: Fisher) -> None:
@@ -82,23 +70,23 @@ def run(args: Fisher) -> None:
         views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(timed(views, args, given), args.limit)
     names = pictures.file_names([camera.name for camera in views])
-    told = Told.of(given, args, settings, [*known.cameras, *views])
-    rivals = Rivals(told, prior) if args.maps else None
-    output.check(f"{name}.{kind}.png" for name in names for kind in (*told.kinds, *(["maps"] if rivals else [])))
+    blocks = asked_blocks(args, given, settings, [*known.cameras, *views])
+    compared = ComparedMaps(given.scene, settings, prior) if args.maps else None
+    kinds = [*_map_kinds(blocks.names), *(["maps"] if compared else [])]
+    output.check(f"{name}.{kind}.png" for name in names for kind in kinds)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
-        by_block: dict[str, Information] = {}
+        by_block: dict[str, dict[str, torch.Tensor]] = {}
         for camera in known.cameras:
-            for block, part in told.said(camera).items():
+            for block, part in blocks.information(camera).items():
                 check(f"fisher: view {camera.name}", part)
-                old = by_block.get(block, {})
-                by_block[block] = {name: x + old[name] if old else x for name, x in part.items()}
-            if rivals:
-                rivals.know(camera)
+                add(by_block.setdefault(block, {}), part)
+            if compared:
+                compared.know(camera)
             bar.advance()
-        H = added(by_block)
+        H = together(by_block)
         rows = []
         for camera, name in zip(views, names, strict=True):
-            rows.append(_view(args, told, camera, name, H, prior, rivals))
+            rows.append(_view(args, blocks, camera, name, H, prior, compared))
             bar.advance()
     groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
     header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
@@ -111,9 +99,9 @@ def run(args: Fisher) -> None:
         "gaussians": len(given.gaussians),
         "method": args.method,
         "prior": prior.to_json(),
-        "blocks": list(told.blocks),
-        "semantics": told.metric.to_json() if told.metric else None,
-        "probes": args.probes if "deformation" in told.blocks or args.method == "probes" else None,
+        "blocks": list(blocks.names),
+        "semantics": blocks.metric.to_json() if blocks.metric else None,
+        "probes": args.probes if "deformation" in blocks.names or args.method == "probes" else None,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
@@ -126,94 +114,24 @@ def run(args: Fisher) -> None:
         _print(args, known, groups, rows, source)
 
 
-@dataclasses.dataclass(frozen=True)
-class Told:
-    """What of an image is asked about the scene.
+def asked_blocks(
+    args: Fisher | View, given: SceneInput, settings: RenderSettings, cameras: Sequence[Camera]
+) -> SceneBlocks:
+    """What the options ask of the images of all these cameras; of a run, features count in the metric of its decoder.
 
-    Attributes:
-        scene, settings, method, probes: As for `drgs.fisher.diagonal` and `drgs.fisher.network`.
-        blocks: The blocks that count.
-        metric: In which features count, where `semantic` is among them.
-        sphere: What the block `backdrop` is painted on.
+    Raises:
+        ValueError: If a block is named that the scene does not have.
     """
-
-    scene: Scene
-    settings: RenderSettings
-    method: str
-    probes: int
-    blocks: tuple[str, ...]
-    metric: SemanticMetric | None
-    sphere: Sphere | None
-
-    @classmethod
-    def of(cls, given: SceneInput, args: Fisher, settings: RenderSettings, cameras: Sequence[Camera]) -> Told:
-        """As the options say, of a run in the metric of its decoder, and of all these cameras."""
-        g = given.gaussians
-        scoring = Scoring(method=args.method, blocks=args.blocks)
-        blocks = scoring.blocks_of(g, "fisher", given.scene)
-        metric = None
-        if "semantic" in blocks:
-            assert g.features is not None  # else there is no such block
-            metric = given.semantics() or SemanticMetric.of(None, g.features.shape[1])
-        sphere = fisher.backdrop_sphere(given.scene, cameras) if "backdrop" in blocks else None
-        return cls(given.scene, settings, args.method, args.probes, blocks, metric, sphere)
-
-    @property
-    def kinds(self) -> list[str]:
-        """Of maps, as in the names of their files."""
-        parts = ["", *(f"{block}." for block in self.blocks)] if len(self.blocks) > 1 else [""]
-        return [part + kind for part in parts for kind in KINDS]
-
-    def options(self, block: str) -> dict[str, Any]:
-        """Of what `drgs.fisher` computes, for the rows of one block; of the deformation for those of the others."""
-        if block == "backdrop":
-            return {"sphere": self.sphere}
-        rows: dict[str, Any] = {"probes": self.probes} if block == "deformation" else {}
-        counted = self.blocks if block == "deformation" else (block,)
-        if "semantic" in counted:
-            rows["semantics"] = self.metric
-            if "geometry" not in counted:
-                rows["channel_weights"] = (0.0, 0.0, 0.0)
-        return rows
-
-    def own(self, block: str, information: Information) -> Information:
-        """Without what a block says nothing about."""
-        return {name: x for name, x in information.items() if name not in _OTHERS[block]}
-
-    def said(self, camera: Camera) -> dict[str, Information]:
-        """What each block of a view says."""
-        found: dict[str, Information] = {}
-        for block in self.blocks:
-            options = self.options(block)
-            if block == "deformation":
-                found[block] = fisher.network(self.scene, camera, self.settings, **options)
-                continue
-            if block == "backdrop":
-                found[block] = {block: fisher.backdrop(self.scene, camera, self.settings, **options)}
-                continue
-            if self.method == "probes":
-                options["probes"] = self.probes
-            said = fisher.diagonal(self.scene, camera, self.settings, self.method, **options)
-            found[block] = self.own(block, said)
-        return found
-
-    def maps(self, camera: Camera, weights: Information) -> dict[str, np.ndarray]:
-        """Block -> (H, W) map of its rows."""
-        found = {}
-        for block in self.blocks:
-            mapped = fisher.network_variance_map if block == "deformation" else fisher.variance_map
-            own = self.own(block, weights)
-            found[block] = mapped(self.scene, camera, own, settings=self.settings, **self.options(block)).numpy()
-        return found
+    scoring = Scoring(
+        settings=settings, method=args.method, blocks=args.blocks, semantics=given.semantics(), probes=args.probes
+    )
+    return SceneBlocks.of(given.scene, scoring, cameras, "fisher")
 
 
-def added(by_block: dict[str, Information]) -> Information:
-    """What all blocks together say."""
-    total: dict[str, torch.Tensor] = {}
-    for part in by_block.values():
-        for name, x in part.items():
-            total[name] = total[name] + x if name in total else x
-    return total
+def _map_kinds(names: Sequence[str]) -> list[str]:
+    """Kinds of the maps of these blocks, as in the names of their files."""
+    parts = ["", *(f"{block}." for block in names)] if len(names) > 1 else [""]
+    return [part + kind for part in parts for kind in KINDS]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,7 +139,11 @@ class GroupSummary:
     """What the known views say about a group of parameters: a summary of its information's entries.
 
     Attributes:
-        sum: Of the entries; `blocks`: of those from each block of the image.
+        shape: Shape of the information.
+        sum: Sum of the entries.
+        median_of_positive: Median of the entries above 0; None where there are none.
+        zero: Number of entries that are 0: nothing is known of these parameters.
+        blocks: Block of the image -> sum of the entries that come from it.
     """
 
     shape: list[int]
@@ -232,7 +154,7 @@ class GroupSummary:
 
     @classmethod
     def of(cls, x: torch.Tensor, by_block: dict[str, Information], name: str) -> GroupSummary:
-        """Of the information of a group."""
+        """The summary of a group's information, which each block has a part in."""
         positive = x[x > 0]
         median = float(positive.median()) if positive.numel() else None
         parts = {block: float(part[name].sum()) if name in part else 0.0 for block, part in by_block.items()}
@@ -249,7 +171,7 @@ class MapSummary:
 
     @classmethod
     def of(cls, values: np.ndarray) -> MapSummary:
-        """Of a map."""
+        """The summary of an (H, W) map."""
         return cls(float(values.sum(dtype=np.float64)), float(values.mean()), float(values.max()))
 
 
@@ -266,12 +188,12 @@ class MappedView:
     """What a view shows.
 
     Attributes:
-        name, camera: The view's.
-        files: Its maps.
+        name, camera: Name and camera of the view.
+        files: Names of the files with its maps.
         gain: What it would add to the known views, by criterion.
         variance, share: Its maps, of all blocks together.
         blocks: Block of the image -> kind -> the map of that block alone.
-        pose: With --pose, else None.
+        pose: What it says about its own pose, with --pose; else None.
     """
 
     name: str
@@ -312,12 +234,21 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
 
 
 def _view(
-    args: Fisher, told: Told, camera: Camera, name: str, H: Information, prior: Prior, rivals: Rivals | None
+    args: Fisher,
+    asked: SceneBlocks,
+    camera: Camera,
+    name: str,
+    H: Information,
+    prior: Prior,
+    compared: ComparedMaps | None,
 ) -> MappedView:
     """Maps of one view, and what it says."""
-    Hc = added(told.said(camera))
+    Hc = together(asked.information(camera))
     weights = dict(zip(KINDS, map_weights(H, Hc, prior), strict=True))
-    maps = {kind: told.maps(camera, x) for kind, x in weights.items()}
+    maps = {
+        kind: {block: x.numpy() for block, x in asked.variance_maps(camera, of_kind).items()}
+        for kind, of_kind in weights.items()
+    }
     files = []
     totals = {}
     for kind, parts in maps.items():
@@ -326,15 +257,15 @@ def _view(
         for prefix, values in shown.items():
             files.append(f"{name}.{prefix}{kind}.png")
             pictures.write_png(args.output / files[-1], pictures.map_picture(values))
-    if rivals:
+    if compared:
         files.append(f"{name}.maps.png")
-        pictures.write_png(args.output / files[-1], rivals.row(camera, maps["variance"]))
+        pictures.write_png(args.output / files[-1], compared.row(camera, maps["variance"]))
     pose = None
     if args.pose:
-        found = fisher.pose_information(told.scene, camera, told.settings)
+        found = fisher.pose_information(asked.scene, camera, asked.scoring.settings)
         pose = PoseSummary(found.tolist(), torch.linalg.eigvalsh(found).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
-    blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in told.blocks}
+    blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in asked.names}
     return MappedView(camera.name, camera, files, gain, *(MapSummary.of(totals[kind]) for kind in KINDS), blocks, pose)
 
 

@@ -40,7 +40,7 @@ def at_times(cameras: list[Camera], text: str | None, frames: int, given: SceneI
     """The cameras with the times that they are drawn at.
 
     Args:
-        cameras: As `--cameras` says; at least one.
+        cameras: The cameras of `--cameras`; at least one.
         text: What `--time` says; None: their own times or, where they have none, all times of the run, evenly.
         frames: How many of one camera, if the time alone moves.
         given: What is drawn; where it stands still, times mean nothing, and cameras stay as they are.
@@ -97,10 +97,10 @@ def write_plys(scene: Scene, cameras: list[Camera], folder: Path, moving: bool, 
 
     Args:
         scene: What is drawn.
-        cameras: Whose times count.
-        folder: Of the files, named as `ply_names` says.
-        moving: Only those that move.
-        features: With their features, if they have any.
+        cameras: Cameras whose times count.
+        folder: Folder of the files, which are named as `ply_names` says.
+        moving: Whether only Gaussians that move are written.
+        features: Whether they are written with their features, if they have any.
     Returns:
         JSON-serializable: file, time and number of Gaussians of each.
     Raises:

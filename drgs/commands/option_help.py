@@ -99,10 +99,10 @@ class Option:
     """A line of the page.
 
     Attributes:
-        name: Of the field.
-        flags: As it is written, `-o, --output PATH`, of a positional argument `DATA`.
+        name: Name of the field.
+        flags: Spelling on the command line: `-o, --output PATH`, of a positional argument `DATA`.
         text: What it does.
-        default: As a person writes it; empty where there is none or the text says it.
+        default: Default in a person's spelling; empty where there is none or the text says it.
         heading: One of `HEADINGS`.
         positional, required: Whether it stands without a name, and whether it must.
     """
@@ -170,7 +170,7 @@ def options_in(kind: type, instance: Any = None) -> Iterator[Option]:
 
     Args:
         kind: The dataclass.
-        instance: Whose values are the defaults; None: those of the dataclass.
+        instance: Options whose values are the defaults; None: the defaults are the dataclass's.
     """
     hints = typing.get_type_hints(kind, include_extras=True)
     texts = _texts(kind)

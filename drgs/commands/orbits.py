@@ -53,7 +53,7 @@ class Wish:
     Attributes:
         up: (3,) world direction.
         center: (3,) world point that all frames look at.
-        distance: Of every frame from the center, in scene units.
+        distance: Distance of every frame from the center, in scene units.
         elevation: Degrees above the center.
         span: Degrees that the frames cover; below 360 they stay in the middle of what the cameras cover.
         fov: Horizontal field of view in degrees.
@@ -102,11 +102,11 @@ def scene_orbit(
     """An orbit around the middle of the Gaussians, outliers aside, as close as all frames show them.
 
     Args:
-        gaussians: At least one.
+        gaussians: Gaussians to turn around, at least one.
         frames: Number of cameras.
         width, height: Pixels.
         wish: What is fixed; else up is -y, as COLMAP's worlds stand, the elevation 20 and the field of view 45 degrees.
-        returns: On less than a full circle go back and forth, else evenly from end to end.
+        returns: Whether an orbit of less than a full circle goes back and forth; else evenly from end to end.
     Raises:
         ValueError: If there is no Gaussian.
     """
@@ -149,11 +149,11 @@ def capture_orbit(
 
     Args:
         cameras: The photographs'.
-        frames, width, height, returns: As in `scene_orbit`.
+        frames, width, height, returns: The same as in `scene_orbit`.
         wish: What is fixed; else center, distance, elevation, up, span and lens are the photographs'.
         distance_of: How far away what a camera looks at is (`seen_distance`), or None if it sees nothing. Asked where
             the axes are parallel, so that they meet nowhere.
-        beyond: Where the axes meet go all the way round, past what the cameras cover; and follow no path.
+        beyond: Whether to go all the way round where the axes meet, past what the cameras cover, and to follow no path.
     Returns:
         The cameras and what they do in words; none where the photographs say nothing (there are fewer than two, or
         they look apart and lie apart, or `beyond` they look at no common point).

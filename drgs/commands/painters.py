@@ -29,9 +29,9 @@ def painters(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, 
     """What draws each kind of picture.
 
     Args:
-        kinds: Of `PAINTINGS`.
+        kinds: Names in `PAINTINGS`.
         given: The Gaussians, with the decoder and the classes of their run.
-        scene: Where they are from, for messages.
+        scene: The file or run that they are from, for messages.
     Raises:
         ValueError: If they have no features, or there is no decoder or no class to call them by.
     """

@@ -10,7 +10,7 @@ from tyro.conf import Fixed, Suppress, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from drgs.guards.records import Record, hints_of, part_of, texts_of
-from drgs.information.choices import Policy
+from drgs.information.choices import Criterion, Policy
 
 __all__ = ["BLOCKS_TEXT", "CAMERAS_TEXT", "CARRIED", "HIDDEN", "OF_RECORD", "options_of"]
 
@@ -39,7 +39,8 @@ CARRIED: Any = Suppress[Fixed[Any]]
 """Type of a field that no option sets."""
 
 _SPECS = {"blocks": BLOCKS_TEXT, "test_cameras": CAMERAS_TEXT}
-_TYPES: dict[str, Any] = {"policy": Policy | str}  # help shows the names; a function of one's own has another
+# Help shows the names; a function of one's own has another.
+_TYPES: dict[str, Any] = {"policy": Policy | str, "criterion": Criterion | str}
 _CARRIED = ("weights", "groups")  # mappings and lists of names, which a file says better than a line
 
 
@@ -50,8 +51,8 @@ def options_of(kind: type[Record], only: Collection[str] = (), without: Collecti
 
     Args:
         kind: The record.
-        only: Fields that become options; none: all but
-        without: these. Parts that are named are left out as a whole.
+        only: Fields that become options; none: all but those of `without`.
+        without: Fields that do not, and parts that are left out as a whole.
     """
     fields = list[tuple[str, Any, Any]]()
     _collect(kind, kind(), set(only), set(without), fields)

@@ -57,7 +57,7 @@ def run(args: Reproduce) -> None:
             args.policies,
             (args.test_every, args.test_offset),
             weights,
-            {} if args.config is None else config_fields(args.config),
+            {} if args.config is None else config_fields(args.config, ("--policy",)),  # each cell has its own
         )
         write_json(out / _GIVEN, known)
         for note in plan.notes:

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.codecs import READ, load_gaussians
+from drgs.codecs import load_gaussians, readable
 from drgs.codecs.folders import file_of_folder
 from drgs.files import Run
 from drgs.fitting.records import FitRecord, is_run, load_run
@@ -74,7 +74,8 @@ class SceneInput:
             if file_of_folder(path) is not None:
                 return cls(load_gaussians(path))
             raise FileNotFoundError(
-                f"{path}: must be a run folder, found no config.json of a fit; run `drgs fit` first, or name {READ}"
+                f"{path}: must be a run folder, found no config.json of a fit; run `drgs fit` first, or name "
+                f"{readable()}"
             )
         run = Run(path)
         loaded = load_run(run)

@@ -16,7 +16,8 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
 from drgs.guards.outputs import check_file
-from drgs.select import Selection, select
+from drgs.information.criteria import criterion_named
+from drgs.select import Selection, policy_named, select
 
 if TYPE_CHECKING:
     from drgs.commands.options import Select
@@ -37,6 +38,8 @@ def run(args: Select) -> None:
     settings = args.settings()  # refuses what cannot be, before anything is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     wanted = args.scoring()  # before files are read, too
+    policy_named(args.policy)
+    criterion_named(args.criterion, "--criterion")
     given = SceneInput.of(args)
     settings = given.over_background(settings)
     scoring = dataclasses.replace(wanted, settings=settings, semantics=given.semantics())
@@ -57,8 +60,9 @@ def run(args: Select) -> None:
             progress=bar.update,
             workers=workers,
         )
-    nothing = [None] * len(candidates)
-    rows = zip(candidates, selection.scores, selection.parts or nothing, selection.unseen or nothing, strict=True)
+    shown = [{"index": i, "name": camera.name} for i, camera in enumerate(candidates)]
+    timely = [{**one, "time": camera.time} for one, camera in zip(shown, candidates, strict=True)]
+    cameras = [{"camera": described(camera)} for camera in candidates]
     report = {
         "schema": SCHEMA,
         "command": "select",
@@ -68,31 +72,14 @@ def run(args: Select) -> None:
         "criterion": args.criterion if args.policy == "fisher" else None,
         "method": args.method,
         "prior": scoring.prior_of(args.policy).to_json(),
-        "blocks": selection.blocks,
-        "semantics": selection.semantics,
-        "network": selection.network,
-        "combine": selection.combine,
+        **selection.blocks_json(),
         "seed": args.seed,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
         "source": source,
-        "picks": [
-            {"rank": rank, **dataclasses.asdict(pick), "camera": described(candidates[pick.index])}
-            for rank, pick in enumerate(selection.picks, 1)
-        ],
-        "candidates": [
-            {
-                "index": i,
-                "name": camera.name,
-                "time": camera.time,
-                "score": score,
-                "parts": parts,
-                "unseen": unseen,
-                "camera": described(camera),
-            }
-            for i, (camera, score, parts, unseen) in enumerate(rows)
-        ],
+        "picks": [{"rank": rank, **pick} for rank, pick in enumerate(selection.picks_json(shown, cameras), 1)],
+        "candidates": selection.candidates_json(timely, cameras),
         "left_out": selection.left_out,
         "notes": selection.notes,
         "evaluations": selection.evaluations,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.commands.fisher import MAP_PRIOR, Told, added
+from drgs.commands.fisher import asked_blocks
 from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
 from drgs.commands.painters import PAINTINGS, painters
@@ -18,6 +18,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.files import Run, state_header
 from drgs.fitting.records import fitted_views
 from drgs.guards.foreign import refuse_foreign
+from drgs.information.blocks import MAP_PRIOR, together
 from drgs.viewing.layers import layers_of
 from drgs.viewing.placed_views import PlacedView, Ranking, placed_views_of, read_ranking
 from drgs.viewing.poses import pose_of
@@ -49,7 +50,8 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     """What is looked at.
 
     Args:
-        args, given: Of the command line.
+        args: The options of the command line.
+        given: The scene that they name.
         before: What was looked at, where a file has changed: browsers stay where they are.
     Raises:
         FileNotFoundError, ValueError: If a file that was named is not there or damaged.
@@ -168,12 +170,12 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
         cameras = [camera for camera in cameras if camera.time is not None]
     if not cameras:
         return None
-    told = Told.of(given, args, given.settings("fast"), cameras)
+    blocks = asked_blocks(args, given, given.settings("fast"), cameras)
     prior = args.given_prior() or MAP_PRIOR
     return Uncertainty(
         cameras,
-        lambda camera: added(told.said(camera)),
-        lambda camera, weights: sum(told.maps(camera, weights).values()),
+        lambda camera: together(blocks.information(camera)),
+        lambda camera, weights: blocks.variance_map(camera, weights).numpy(),
         prior,
     )
 

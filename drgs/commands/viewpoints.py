@@ -77,7 +77,7 @@ class Source:
 
         Args:
             option, text: Name and value of the option.
-            made: Which of `orbit` and `dome` it may be.
+            made: Those of `orbit` and `dome` that it may be.
             given: What the command looks at.
         """
         if text in made:

@@ -1,6 +1,4 @@
-"""Data sets: ``drgs.data.load(path)`` finds out which format a folder has and returns a
-`Dataset`.
-"""
+"""Data sets: `drgs.data.load(path)` finds out which format a folder has, and returns a `Dataset`."""
 
 from __future__ import annotations
 
@@ -9,23 +7,25 @@ import shlex
 from pathlib import Path
 
 from drgs.data.checks import list_images
-from drgs.data.colmap import MODEL_FOLDERS, find_model, load_colmap
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.guesses import scene_extent
-from drgs.data.llff import load_llff
-from drgs.data.multicamera import find_camera_folders, frame_folders, load_cameras
-from drgs.data.neu3d import POSES_BOUNDS, find_posed_frames, find_videos, load_neu3d
+from drgs.data.llff import POSES_BOUNDS
+from drgs.data.multicamera import frame_folders
 from drgs.data.points import added_points, initial_points, triangulated_count, triangulated_points
-from drgs.data.replica import POSES, load_replica
-from drgs.data.semantics import Semantics, attach
-from drgs.data.train_meta import META, load_train_meta
-from drgs.data.transforms import find_transforms, load_transforms
+from drgs.data.replica import POSES
+from drgs.data.semantics import Semantics
+from drgs.data.sidecars import attach
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import check_times
-from drgs.data.views import Dataset, View
+from drgs.data.views import View
 from drgs.guards.foreign import refuse_foreign
+from drgs.guards.registry import Registry
 
 __all__ = [
+    "LOADERS",
     "Dataset",
+    "Format",
     "Semantics",
     "View",
     "added_points",
@@ -35,6 +35,25 @@ __all__ = [
     "triangulated_count",
     "triangulated_points",
 ]
+
+LOADERS: Registry[Format] = Registry(
+    "data set format",
+    "drgs.loaders",
+    {
+        "transforms": "drgs.data.transforms:TRANSFORMS",
+        "neu3d": "drgs.data.neu3d:NEU3D",
+        "train_meta": "drgs.data.train_meta:TRAIN_META",
+        "cameras": "drgs.data.multicamera:CAMERA_FOLDERS",
+        "neu3d_frames": "drgs.data.neu3d:NEU3D_FRAMES",
+        "colmap": "drgs.data.colmap:COLMAP",
+        "llff": "drgs.data.llff:LLFF",
+        "replica": "drgs.data.replica:REPLICA",
+    },
+    Format,
+)
+"""Formats of data sets, in the order in which they are asked whether a folder is theirs; those of other packages and
+scripts come after these, so that no folder changes its meaning when something is installed.
+"""
 
 
 def load(
@@ -53,84 +72,65 @@ def load(
     """Load a data set; its format is found out from its files. No image is decoded, but the first and the last frame of
     each video, to check its time stamps.
 
-    Looked for, in this order: ``transforms.json`` or ``transforms_{train,val,test}.json`` (D-NeRF's too); videos
-    ``cam*.mp4`` beside ``poses_bounds.npy`` (Neural 3D Video); ``train_meta.json`` (Dynamic 3D Gaussians); folders of
-    frames ``cam00``, ``cam01``, ... beside a COLMAP model, also in ``sparse_``, or beside ``poses_bounds.npy``; a
-    COLMAP model in ``.``, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; ``poses_bounds.npy``; ``traj_w_c.txt``
+        dataset = drgs.load_data("scene")
+        train, test = dataset.split()
+        photograph = test[0].image()  # (H, W, 3) float32 in [0, 1], of test[0].camera.undistorted()
+
+    Looked for, in this order: `transforms.json` or `transforms_{train,val,test}.json` (D-NeRF's too); videos
+    `cam*.mp4` beside `poses_bounds.npy` (Neural 3D Video); `train_meta.json` (Dynamic 3D Gaussians); folders of
+    frames `cam00`, `cam01`, ... beside a COLMAP model, also in `sparse_`, or beside `poses_bounds.npy`; a
+    COLMAP model in `.`, `sparse/0`, `sparse` or `colmap/sparse/0`; `poses_bounds.npy`; `traj_w_c.txt`
     (Replica, as Semantic-NeRF renders it). A JSON or npy file may be named itself.
 
     Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
-    (``cam03/0007``), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
+    (`cam03/0007`), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
     frame's number. A frame of a video is decoded when its image is asked for. The first camera is held out at all
-    times, unless ``test_meta.json`` says which are.
+    times, unless `test_meta.json` says which are.
 
     Args:
-        path: folder or file.
-        test_every: every how many views `Dataset.split` holds one out; 0 for none.
+        path: Folder or file.
+        test_every: Every how many views `Dataset.split` holds one out; 0 for none.
         test_offset: index, by name, of the first view that is held out, below `test_every`.
-        background: color in [0,1] that images with an alpha channel are composited on.
-        lazy: open no image, mask or depth file at all: cameras have the size that the camera file states, until
+        background: Color in [0,1] that images with an alpha channel are composited on.
+        lazy: Open no image, mask or depth file at all: cameras have the size that the camera file states, until
             `View.checked` compares it with the image. Where intrinsics are angles and no size is stated (Blender), all
             views get the size of the first training image, the only one opened.
         points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
             from all its images; of a model of synchronous cameras, those are read that two cameras show which are not
             held out.
-        strict: refuse a data set that lists images which are not there. By default at least 3 must be left; the
+        strict: Refuse a data set that lists images which are not there. By default at least 3 must be left; the
             missing ones are named in the log and held in `Dataset.absent`.
-        semantics: look for a teacher's maps and for labels (`drgs.data.semantics`); False leaves them alone.
-        times: how many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
+        semantics: Look for a teacher's maps and for labels (`drgs.data.sidecars`); False leaves them alone.
+        times: How many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
             if there are no more; `Dataset.frames` says which. D-NeRF's photographs are all used.
-        test_cameras: names of synchronous cameras that `Dataset.split` holds out at all times, which wins over
+        test_cameras: Names of synchronous cameras that `Dataset.split` holds out at all times, which wins over
             `test_every`; None: those that the format holds out; empty: none.
-
     Raises:
-        FileNotFoundError: nothing there, photos without poses, or too few of the photos.
+        FileNotFoundError: Nothing there, photos without poses, or too few of the photos.
         ValueError: a file that is damaged or says something that cannot be.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: must be a data set, found no such file or folder; check the path")
-    if path.is_file():
-        loader = {".json": load_transforms, ".npy": load_llff}.get(path.suffix)
-        if path.name == META:
-            loader = load_train_meta
-        elif path.name == POSES_BOUNDS and (find_videos(path.parent) or find_posed_frames(path.parent)):
-            path, loader = path.parent, load_neu3d
-        if loader is None:
-            refuse_foreign(path, "a data set")
-            raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
-    elif find_transforms(path):
-        loader = load_transforms
-    elif find_videos(path):
-        loader = load_neu3d
-    elif (path / META).is_file():
-        loader = load_train_meta
-    elif find_camera_folders(path):
-        loader = load_cameras
-    elif find_posed_frames(path):
-        loader = load_neu3d
-    elif find_model(path):
-        loader = load_colmap
-    elif (path / POSES_BOUNDS).is_file():
-        if (found := list_videos(path)) and not (path / "images").is_dir():
-            raise FileNotFoundError(
-                f"{path}: videos of {POSES_BOUNDS} must be named cam00.mp4, cam01.mp4, ..., got {found[0].name}; "
-                "rename them in the order of its rows"
-            )
-        loader = load_llff
-    elif (path / POSES).is_file():
-        loader = load_replica
-    else:
-        raise _nothing_found(path)
+    name = _format_of(path)
     if isinstance(times, bool) or not isinstance(times, int) or times < 1:
         raise ValueError(f"load: times must be a whole number >= 1, got {times!r}; correct it")
     if isinstance(test_cameras, str):
         raise ValueError(
             f"load: test_cameras must be a tuple of names, got {test_cameras!r}; write ({test_cameras!r},)"
         )
-    held_out = {"test_every": test_every, "test_offset": test_offset, "times": times, "test_cameras": test_cameras}
-    dataset = loader(path, background=background, lazy=lazy, points=points, strict=strict, **held_out)
+    options = {
+        "background": background,
+        "lazy": lazy,
+        "points": points,
+        "strict": strict,
+        "test_every": test_every,
+        "test_offset": test_offset,
+        "times": times,
+        "test_cameras": test_cameras,
+    }
+    dataset = LOADERS[name].read(name, path, options)
     dataset.test_every = test_every
     dataset.test_offset = test_offset
     if test_cameras is not None:
@@ -140,6 +140,25 @@ def load(
     if semantics:
         attach(dataset, lazy)
     return dataset
+
+
+def _format_of(path: Path) -> str:
+    """Name of the first format that recognizes a folder or file.
+
+    Raises:
+        FileNotFoundError: If none does, for a folder.
+        ValueError: If none does, for a file.
+    """
+    for name, form in LOADERS.items():
+        if form.recognizes(path):
+            return name
+    if not path.is_file():
+        raise _nothing_found(path)
+    for name, form in LOADERS.items():
+        if form.suffix and form.suffix == path.suffix:
+            return name
+    refuse_foreign(path, "a data set")
+    raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
 
 
 def _nothing_found(path: Path) -> FileNotFoundError:
@@ -162,13 +181,5 @@ def _nothing_found(path: Path) -> FileNotFoundError:
         )
     for sequence in sorted(path.glob(f"*/{POSES}"))[:1]:
         return FileNotFoundError(f"{path}: must be one sequence of Replica, found several; name {sequence.parent}")
-    looked = [
-        "transforms.json",
-        "transforms_{train,val,test}.json",
-        *MODEL_FOLDERS,
-        POSES_BOUNDS,
-        META,
-        POSES,
-        "images",
-    ]
+    looked = [*(name for form in LOADERS.values() for name in form.looks_for), "images"]
     return FileNotFoundError(f"{path}: must be a data set, found none (looked for {', '.join(looked)}); check the path")

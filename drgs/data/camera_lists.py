@@ -39,7 +39,7 @@ _ENTRY = {"width": float, "height": float, "fx": float, "fy": float, "position":
 
 
 def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
-    """Write cameras in INRIA's ``cameras.json`` layout, with cx, cy and a camera's time, if any, added; atomically.
+    """Write cameras in INRIA's `cameras.json` layout, with cx, cy and a camera's time, if any, added; atomically.
 
     Raises:
         ValueError: a camera is distorted or skewed (the layout has no room for that).
@@ -80,8 +80,8 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
     cx, cy, time].
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not that layout, or a camera that cannot be; names the first one.
+        FileNotFoundError: No such file.
+        ValueError: Not that layout, or a camera that cannot be; names the first one.
     """
     path = Path(path)
     cameras = []
@@ -161,7 +161,7 @@ def camera_described(where: str, value: object) -> Camera:
 
     Args:
         where: The file and the place in it, for messages.
-        value: As parsed.
+        value: What was parsed of the JSON.
     Raises:
         ValueError: If it is nothing of the kind, or no camera can be so.
     """

@@ -114,6 +114,7 @@ class Focus:
         turn = np.radians(start + (0.0 if span >= 360 else span / 2))
         distance = np.linalg.norm(outward, axis=1)
         sines = outward @ up / np.maximum(distance, 1e-12)  # a camera at the center has 0 / 0: level
+        # A camera straight above has a sine that exceeds 1 by rounding, of which arcsin is NaN.
         elevation = np.degrees(np.arcsin(np.clip(np.median(sines[inside]), -1, 1)))
         middle = np.cos(turn) * first + np.sin(turn) * second
         return middle, span, float(np.median(distance[inside])), float(elevation)
@@ -148,6 +149,7 @@ def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:
         return []
     poses = np.stack([camera.c2w for camera in cameras])
     walked = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    # The product of two axes of length 1 exceeds 1 by rounding, of which arccos is NaN.
     turned = np.degrees(np.arccos(np.clip((poses[1:, :3, 2] * poses[:-1, :3, 2]).sum(axis=1), -1, 1)))
     typical = max(float(np.median(walked)), 1e-12)  # a divisor, and most of them may not have moved at all
     breaks = np.flatnonzero((walked > _JUMP * typical) | (turned > _TURN)) + 1
@@ -200,6 +202,7 @@ def _covered(azimuths: np.ndarray) -> tuple[float, float, np.ndarray]:
     Args:
         azimuths: (V,) degrees.
     """
+    # Stable: cameras of one azimuth keep their order on every machine.
     order = np.argsort(azimuths, kind="stable")
     around = azimuths[order]
     gaps = np.diff(around, append=around[0] + 360)

@@ -92,9 +92,8 @@ def read_text(path: Path, what: str, largest: int) -> str:
     Args:
         what: It must be, for messages, e.g. "a list of poses".
         largest: Bytes that it may have.
-
     Raises:
-        FileNotFoundError: no such file.
+        FileNotFoundError: No such file.
         ValueError: larger, of another format, or bytes that are no text.
     """
     if not path.is_file():
@@ -109,12 +108,12 @@ def read_text(path: Path, what: str, largest: int) -> str:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read a plain numeric ``.npy`` array; the shape in its header is checked against the file
+    """Read a plain numeric `.npy` array; the shape in its header is checked against the file
     size first.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a numeric npy file, or shorter than its header claims.
+        FileNotFoundError: No such file.
+        ValueError: Not a numeric npy file, or shorter than its header claims.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a .npy file, found none; check the path")
@@ -157,10 +156,10 @@ def _check_npy(where: str, file: IO[bytes], size: int) -> None:
 
 
 def check_npz(path: Path) -> list[str]:
-    """The names of the arrays of an ``.npz`` archive, none of which claims more bytes than the file can hold.
+    """The names of the arrays of an `.npz` archive, none of which claims more bytes than the file can hold.
 
     Raises:
-        ValueError: another archive, or one that lies.
+        ValueError: Another archive, or one that lies.
     """
     names = []
     with _reading_archive(path, "arrays of numbers"), zipfile.ZipFile(path) as archive:
@@ -176,11 +175,11 @@ def check_npz(path: Path) -> list[str]:
 
 
 def read_npz(path: Path, name: str) -> np.ndarray:
-    """Read one plain numeric array of an ``.npz`` archive.
+    """Read one plain numeric array of an `.npz` archive.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no such archive or array, or as `read_npy`.
+        FileNotFoundError: No such file.
+        ValueError: No such archive or array, or as `read_npy`.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be an .npz file, found none; check the path")
@@ -220,7 +219,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of an image; only the header is read, where it says so.
 
     Raises:
-        ValueError: not an image, of no or more than 2^31 pixels, or of more than its file can hold.
+        ValueError: Not an image, of no or more than 2^31 pixels, or of more than its file can hold.
     """
     if is_heif(path):
         return heif_size(path)
@@ -242,8 +241,8 @@ def read_image(path: Path) -> np.ndarray:
     they are turned, these are the pixels that are shown, in 8 bits.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an image that can be decoded, or one whose data end early.
+        FileNotFoundError: No such file.
+        ValueError: Not an image that can be decoded, or one whose data end early.
     """
     import cv2
 
@@ -288,6 +287,7 @@ def unit_range(data: np.ndarray, path: Path) -> np.ndarray:
     if data.dtype == np.uint16:
         return data.astype(np.float32) / np.float32(65535)
     if data.dtype.kind == "f":
+        # Images of floats may hold light beyond white, which no rendering is compared with.
         return np.clip(data.astype(np.float32), 0.0, 1.0)
     raise ValueError(f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it")
 

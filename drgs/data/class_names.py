@@ -1,4 +1,4 @@
-"""What the numbers in label images mean: ``classes.json``, ``classes.txt``, and Replica's ``info_semantic.json``."""
+"""What the numbers in label images mean: `classes.json`, `classes.txt`, and Replica's `info_semantic.json`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ _ADVICE = 'write {"classes": [{"id": 1, "name": "wall"}, ...]}'
 def read_class_names(path: Path) -> tuple[dict[int, str], set[int]]:
     """The classes that a file names, in its order.
 
-    JSON: an object with ``classes``, a list of objects with ``id`` and ``name`` (drgs, Replica), or a list of names,
-    which are 1, 2, .... Text: a line a class, ``NUMBER NAME``, or names alone, which are 1, 2, ....
+    JSON: an object with `classes`, a list of objects with `id` and `name` (drgs, Replica), or a list of names,
+    which are 1, 2, .... Text: a line a class, `NUMBER NAME`, or names alone, which are 1, 2, ....
 
     Returns:
         Number in label images -> name; and the numbers of what is no class (`NO_CLASS`).
-
     Raises:
         FileNotFoundError: No such file.
         ValueError: Not that layout, a number twice, or no class at all.

@@ -1,4 +1,4 @@
-"""COLMAP models, binary and text, read with ``pycolmap.Reconstruction`` after their sizes have been checked."""
+"""COLMAP models, binary and text, read with `pycolmap.Reconstruction` after their sizes have been checked."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import file_inside
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.masks import mask_file
-from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
-from drgs.data.views import Dataset, View
+from drgs.data.resizing import fit_to_image
+from drgs.data.view_checks import go_on_without, make_unique
+from drgs.data.views import View
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
+__all__ = ["COLMAP", "MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 # COLMAP's model numbers and parameter counts, for the camera models that drgs renders.
@@ -33,7 +36,7 @@ _REQUIRED = ("cameras", "images", "points3D")
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of a COLMAP model at or below ``path``, or None."""
+    """The folder of a COLMAP model at or below `path`, or None."""
     for folder in (path, *(path / name for name in MODEL_FOLDERS)):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
@@ -46,18 +49,16 @@ def load_colmap(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
-    """Load a COLMAP data set: a model, and ``images`` beside it (``masks`` too, if there is such a
+    """Load a COLMAP data set: a model, and `images` beside it (`masks` too, if there is such a
     folder).
 
     Args:
-        path: the data set, or the model's own folder.
-        background: color that images with alpha are composited on.
-        lazy, points, strict: open no image, read no points and observations, need every image, see `drgs.data.load`.
-
+        path: The data set, or the model's own folder.
+        background: Color that images with alpha are composited on.
+        lazy, points, strict: Open no image, read no points and observations, need every image, see `drgs.data.load`.
     Raises:
-        FileNotFoundError: no model, no ``images`` folder, or too few of the images that the model lists.
+        FileNotFoundError: No model, no `images` folder, or too few of the images that the model lists.
         ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
     """
     model = find_model(path)
@@ -105,8 +106,11 @@ def load_colmap(
     )
 
 
+COLMAP = Format(lambda path: find_model(path) is not None, load_colmap, MODEL_FOLDERS)
+
+
 def _image_folder(path: Path, model: Path) -> Path:
-    """``images`` beside the model or above it."""
+    """`images` beside the model or above it."""
     tried = []
     for base in (path, model, *model.parents[:3]):
         folder = base / "images"
@@ -163,13 +167,15 @@ def model_points(reconstruction: Any, model: Path, seen_by: set[int] | None = No
     return points, colors
 
 
-# ------------------------------------------------------------------------------------ checks before
-# pycolmap reads
-
-
 def read_model(model: Path, points: bool = True) -> object:
-    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file
-    does not hold. Without `points`, points3D is not opened and observations are skipped.
+    """The reconstruction; every file is walked first, so that pycolmap meets no size that the file does not hold.
+
+    Args:
+        model: Folder of the model.
+        points: False: points3D is not opened, and observations of images are skipped.
+    Raises:
+        FileNotFoundError: If a file of the model is missing.
+        ValueError: If one is damaged, or has a camera model that drgs does not render.
     """
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name in _REQUIRED:
@@ -196,7 +202,7 @@ def read_model(model: Path, points: bool = True) -> object:
 
 def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
     """What pycolmap reads in a folder; errors name the model."""
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
@@ -330,7 +336,7 @@ def _parameter_count(path: Path, number: int) -> int:
     for model_number, parameters in _MODELS.values():
         if model_number == number:
             return parameters
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     try:
         name = pycolmap.CameraModelId(number).name
@@ -384,11 +390,11 @@ def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
 
 
 def _image_lines(lines: list[tuple[int, str]]) -> Iterator[tuple[int, list[str], tuple[int, str] | None]]:
-    """Of each image of images.txt: the number of its first line, the 10 words of this, of which the last is the name,
-    and its line of observations; None where the file ends before.
+    """The number of the first line of each image of images.txt, the 10 words of this line, of which the last is the
+    name, and its line of observations; None where the file ends before.
 
     Args:
-        lines: Their numbers and texts, without comments.
+        lines: Numbers and texts of the file's lines, without comments.
     """
     index = 0
     while index < len(lines):

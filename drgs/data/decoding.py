@@ -47,7 +47,6 @@ def walk(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int],
         version: Size and time of change; what was found is kept until these change.
         is_mp4: It lists its frames.
         tell: Gets the number of frames that were decoded, where all are.
-
     Raises:
         ValueError: One that OpenCV cannot open, or that ends before its header says.
     """
@@ -63,9 +62,8 @@ def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, tell: Ca
     """(H, W, 3) uint8, RGB, of a frame; of the videos read last, some stay open.
 
     Args:
-        path, version, is_mp4, tell: As for `walk`.
-        index: Of the frame as it is shown, from 0.
-
+        path, version, is_mp4, tell: The arguments of `walk`.
+        index: Number of the frame as it is shown, from 0.
     Raises:
         ValueError: It cannot be decoded.
     """

@@ -38,7 +38,7 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
     it; 1.0 without points.
 
     Args:
-        cameras: at least one.
+        cameras: Cameras, at least one.
         points: (P,3) world points, used only in that case.
     """
     if not cameras:
@@ -62,11 +62,11 @@ def points_beside(
     a grid get none; the other cells, of all views alike, as many each.
 
     Args:
-        views: at least one.
+        views: Views, at least one.
         points: (P,3) triangulated ones.
         shown: (V,P) which of them each view shows; one shows one at least.
-        count: of new points.
-        rng: of pixels and depths.
+        count: Number of new points.
+        rng: Generator of pixels and depths.
     """
     cameras = [view.camera.undistorted() for view in views]
     own = [camera.project(points[mine]) for camera, mine in zip(cameras, shown, strict=True)]
@@ -77,6 +77,7 @@ def points_beside(
     shares = np.array(
         [len(pixels) / camera.width / camera.height for pixels, camera in zip(open_pixels, cameras, strict=True)]
     )
+    # Where no pixel is open all shares are 0, and so are the numbers, not NaN.
     numbers = np.floor(count * np.cumsum(np.append(0, shares)) / max(shares.sum(), 1e-12)).astype(int)
     found, colors = [], []
     for view, camera, (places, depths), allowed, number in zip(
@@ -111,6 +112,7 @@ def _open_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
     """Flat indices of the pixels inside the mask in whose cell none of the places (P,2) is."""
     across, down = (-(-size // _CELLS) for size in (camera.width, camera.height))
     taken = np.zeros((_CELLS, _CELLS), bool)
+    # Points that project outside count for the cell at the edge: the size need not be a multiple of the cells.
     columns, rows = (places // (across, down)).astype(int).clip(0, _CELLS - 1).T
     taken[rows, columns] = True
     is_open = ~np.kron(taken, np.ones((down, across), bool))[: camera.height, : camera.width]
@@ -120,7 +122,7 @@ def _open_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
 
 
 def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.random.Generator) -> np.ndarray:
-    """For each flat pixel the index of one of the places (P,2) that are nearest to it."""
+    """Index, for each flat pixel, of one of the places (P,2) that are nearest to it."""
     centers = np.stack([pixels % width, pixels // width], axis=-1) + 0.5
     count = min(_NEAREST, len(places))
     which = rng.integers(0, count, len(pixels))
@@ -185,11 +187,12 @@ def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.nd
     K = camera.K
     y = (pixels // camera.width + 0.5 - K[1, 2]) / K[1, 1]
     x = (pixels % camera.width + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    # Depth maps are float32; a world may be far from its origin, where that has no digits left.
     local = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[:, None].astype(np.float64)
     c2w = camera.c2w
     return local @ c2w[:3, :3].T + c2w[:3, 3]
 
 
 def subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of all, or of ``limit`` random ones in their order."""
+    """Indices of all, or of `limit` random ones in their order."""
     return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))

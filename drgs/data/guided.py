@@ -69,6 +69,7 @@ def detect(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) ->
     """
     import cv2
 
+    # Luma of BT.601, as OpenCV makes it. Rounding may lead above 255, which a byte would wrap around.
     gray = np.round(255 * image @ np.array([0.299, 0.587, 0.114], image.dtype)).clip(0, 255).astype(np.uint8)
     sift = cv2.SIFT_create(nfeatures=_MOST, contrastThreshold=_CONTRAST)
     points, descriptors = sift.detectAndCompute(gray, None if mask is None else mask.astype(np.uint8))
@@ -77,6 +78,7 @@ def detect(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) ->
     pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
     # A descriptor may be all 0.
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
+    # SIFT refines places to fractions of a pixel, which may leave the image.
     columns, rows = (np.clip(pixels[:, i].astype(int), 0, image.shape[1 - i] - 1) for i in (0, 1))
     return Features(
         camera,
@@ -92,7 +94,7 @@ class Matches:
     """Pictures and what has been matched between them, so that one more costs only its own pairs.
 
     Attributes:
-        pictures: In the order in which they were added.
+        pictures: Pictures in the order in which they were added.
     """
 
     def __init__(self):
@@ -137,6 +139,7 @@ def _match(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray
     x, y, z = relative[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
     F = np.linalg.inv(b.camera.K).T @ essential @ np.linalg.inv(a.camera.K)
+    # float32: the product below has as many numbers as there are pairs, and its band is pixels wide.
     homogeneous = _homogeneous(b.pixels).astype(np.float32)
     rays_a, rays_b = a.rays(), b.rays()
     rows = []
@@ -159,6 +162,7 @@ def _match(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray, np.ndarray
     keep &= _best(j, likeness, a.pixels[i], len(b.pixels))
     i, j = i[keep], j[keep]
     points, depth_a, depth_b, angle = _meet(a.camera.center, b.camera.center, rays_a[i], rays_b[j])
+    # Rays that meet at a camera center have a depth of 0; the sign of the depths drops them below.
     with np.errstate(divide="ignore", invalid="ignore"):
         size = (a.sizes[i] * depth_a / a.camera.K[0, 0]) / (b.sizes[j] * depth_b / b.camera.K[0, 0])
     good = (depth_a > 0) & (depth_b > 0) & (angle > _LEAST_ANGLE)
@@ -204,6 +208,7 @@ def _meet(
     depth_a = (along_a - between * along_b) / sine
     depth_b = (between * along_a - along_b) / sine
     points = 0.5 * (eye_a + depth_a[:, None] * rays_a + eye_b + depth_b[:, None] * rays_b)
+    # The product of two directions of length 1 exceeds 1 by rounding, of which arccos is NaN.
     return points, depth_a, depth_b, np.degrees(np.arccos(np.clip(between, -1, 1)))
 
 
@@ -224,6 +229,7 @@ def _tracks(
     picture_of = np.repeat(np.arange(len(pictures)), np.diff(starts))
     # Every match's point against the features that its two are matched with, which are the two themselves as well.
     ends = np.concatenate([edges, edges[:, ::-1]])
+    # Stable: edges of one end stay in the order in which they were found, so that tracks do, too.
     ends = ends[np.argsort(ends[:, 0], kind="stable")]
     first = np.searchsorted(ends[:, 0], edges)
     count = np.searchsorted(ends[:, 0], edges, side="right") - first

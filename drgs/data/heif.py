@@ -51,9 +51,8 @@ def heif_as_jpeg(path: Path, quality: int) -> bytes:
     Args:
         path: HEIC or AVIF.
         quality: 1 to 100.
-
     Raises:
-        ValueError: as `read_heif`.
+        ValueError: As `read_heif`.
     """
     _need_library(path)
     return _decoder.ask("jpeg", path, quality).tobytes()

@@ -75,7 +75,7 @@ def _webp(head: bytes, file: Any) -> tuple[int, int] | None:
 
 
 def _tiff(head: bytes, file: Any) -> tuple[int, int] | None:
-    """Of the first directory, of a BigTIFF too."""
+    """(width, height) in the first directory of a TIFF, also of a BigTIFF; None where it does not say."""
     order = "<" if head[:2] == b"II" else ">"
     is_big = 43 in head[2:4]
     place, number, length = ("Q", "Q", 20) if is_big else ("I", "H", 12)
@@ -95,7 +95,7 @@ def _tiff(head: bytes, file: Any) -> tuple[int, int] | None:
 
 
 def _jpeg(head: bytes, file: Any) -> tuple[int, int] | None:
-    """From the frame header, None if there is none."""
+    """(width, height) in the frame header of a JPEG; None if there is none."""
     file.seek(2)
     while True:
         marker = file.read(2)

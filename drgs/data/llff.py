@@ -1,4 +1,4 @@
-"""LLFF data sets: ``poses_bounds.npy`` and the photos in ``images``, paired in the order of their
+"""LLFF data sets: `poses_bounds.npy` and the photos in `images`, paired in the order of their
 names.
 """
 
@@ -10,29 +10,39 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import inverse_pose, list_images, read_npy
-from drgs.data.view_checks import fit_to_image, make_unique
-from drgs.data.views import Dataset, View
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
+from drgs.data.resizing import fit_to_image
+from drgs.data.videos import list_videos
+from drgs.data.view_checks import make_unique
+from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 
-__all__ = ["load_llff", "pose_rows", "row_camera"]
+__all__ = ["LLFF", "POSES_BOUNDS", "load_llff", "pose_rows", "row_camera"]
+
+POSES_BOUNDS = "poses_bounds.npy"
 
 
-def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), lazy: bool = False, **_) -> Dataset:
+def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0), lazy: bool = False) -> Dataset:
     """Load an LLFF data set: (N,17) rows of a 3x5 matrix [pose | height, width, focal] and two
     depth bounds.
 
     Args:
-        path: the folder, or the ``.npy`` file.
-        background: color that images with alpha are composited on.
-        lazy: open no image, see `drgs.data.load`.
-
+        path: The folder, or the `.npy` file.
+        background: Color that images with alpha are composited on.
+        lazy: Open no image, see `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file, or no ``images``.
-        ValueError: not an (N,17) array, another number of images, or a pose that is not one.
+        FileNotFoundError: No such file, no `images`, or videos in their place whose names do not say their order.
+        ValueError: Not an (N,17) array, another number of images, or a pose that is not one.
     """
-    file = path if path.is_file() else path / "poses_bounds.npy"
-    rows = pose_rows(file)
+    file = path if path.is_file() else path / POSES_BOUNDS
     folder = file.parent / "images"
+    if (videos := list_videos(file.parent)) and not folder.is_dir():
+        raise FileNotFoundError(
+            f"{path}: videos of {file.name} must be named cam00.mp4, cam01.mp4, ..., got {videos[0].name}; "
+            "rename them in the order of its rows"
+        )
+    rows = pose_rows(file)
     if not folder.is_dir():
         raise FileNotFoundError(f"{file}: the photos must lie in {folder}, found no such folder; move them there")
     images = list_images(folder)
@@ -58,14 +68,18 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
     return Dataset(path, "llff", views)
 
 
+LLFF = Format(lambda path: (path / POSES_BOUNDS).is_file(), load_llff, (POSES_BOUNDS,), suffix=".npy")
+
+
 def pose_rows(file: Path) -> np.ndarray:
-    """(N, 17) float64 rows of a ``poses_bounds.npy``; ValueError if it is none."""
+    """(N, 17) float64 rows of a `poses_bounds.npy`; ValueError if it is none."""
     rows = read_npy(file)
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
         raise ValueError(f"{file}: must have shape (N, 17), got {rows.shape}; this is no LLFF file")
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
         raise ValueError(f"{file}: poses must be finite, got NaN or Inf in row {bad[0]}; remove it and its image")
+    # Cameras are float64, whatever the file was saved as.
     return rows.astype(np.float64)
 
 

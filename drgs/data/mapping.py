@@ -101,18 +101,17 @@ def map_photos(
     """COLMAP's incremental mapping.
 
     Args:
-        database: with verified matches.
-        image_dir: that names in it are relative to.
-        folder: that COLMAP writes models into; must exist. Its log lies there meanwhile.
+        database: COLMAP's database, with verified matches.
+        image_dir: Folder that the names in the database are relative to.
+        folder: Folder that COLMAP writes models into; it must exist. Its log lies there meanwhile.
         options: pycolmap.IncrementalPipelineOptions.
         total: photographs.
-        progress: called with ("mapping", poses found in the current model, total), also from another thread.
-        doing: called with what is being done, in words, also from another thread.
-
+        progress: Called with ("mapping", poses found in the current model, total), also from another thread.
+        doing: Called with what is being done, in words, also from another thread.
     Returns:
         pycolmap's models by number; empty if no two photographs could be connected.
     """
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     told = _Told(total, progress, doing)
     told.still()
@@ -130,7 +129,7 @@ def map_photos(
 @contextlib.contextmanager
 def _followed(folder: Path, told: _Told) -> Iterator[None]:
     """COLMAP's log goes to a file in a folder, and `told` hears of every line soon after it is written."""
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     log = pycolmap.logging
     before = log.minloglevel, log.logtostderr, log.alsologtostderr, log.stderrthreshold
@@ -171,15 +170,15 @@ def _followed(folder: Path, told: _Told) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class PhotoGroups:
-    """What photographs fell apart into.
+    """The groups that photographs fell apart into, one of them the model that was kept.
 
     Attributes:
-        kept: names of the photographs of the model that was kept, sorted.
-        others: names of those of each other model, the largest first. Models may share photographs.
-        alone: names of the photographs that are in no model.
-        gaps: where photographs are missing, the best first: one of the kept model, one that is not in it, and how many
-            verified matches they share, 0 where no two share any and the two are merely neighbors by name.
-        featureless: names and numbers of features of those photographs alone that have next to none.
+        kept: Names of the photographs of the model that was kept, sorted.
+        others: Names of those of each other model, the largest first. Models may share photographs.
+        alone: Names of the photographs that are in no model.
+        gaps: Pairs between which photographs are missing, the best first: one of the kept model, one that is not in it,
+            and how many verified matches they share, 0 where no two share any and the two are merely neighbors by name.
+        featureless: Names and numbers of features of those photographs alone that have next to none.
     """
 
     kept: tuple[str, ...]
@@ -209,9 +208,9 @@ class PhotoGroups:
         """Whole sentences for people; none where every photograph is in the kept model.
 
         Args:
-            names: of all photographs, in their order.
-            is_masked: whether masks said where features may lie.
-            is_sequential: whether only photographs near each other by name were compared.
+            names: Names of all photographs, in their order.
+            is_masked: Whether masks said where features may lie.
+            is_sequential: Whether only photographs near each other by name were compared.
         """
         if len(self.kept) == len(names):
             return []
@@ -249,7 +248,7 @@ class PhotoGroups:
 
 def _evidence(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
     """Number of features by photograph, and of verified matches by pair."""
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     with pycolmap.Database.open(database) as handle:
         images = {image.image_id: image.name for image in handle.read_all_images()}
@@ -290,7 +289,7 @@ def _gaps(
 
 
 def _around(ordered: Sequence[int], at: int) -> Sequence[int]:
-    """Of places in rising order, those next to one."""
+    """The one or two of the places, in rising order, that are next to a place."""
     right = bisect.bisect(ordered, at)
     return ordered[max(0, right - 1) : right + 1]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.data.checks import image_size, read_image, unit_range
-from drgs.data.view_checks import nearest_resized
+from drgs.data.resizing import nearest_resized
 from drgs.guards.foreign import is_file
 
 __all__ = ["ALPHA_MASKS", "feature_mask", "mask_file", "masked_photo", "masks_of", "read_mask"]
@@ -22,7 +22,7 @@ _SHOWN = 3  # photographs without a mask that a message names
 
 
 def mask_file(masks: Path, name: str) -> Path | None:
-    """The mask of an image in a folder: COLMAP's own ``NAME.EXT.png``, or ``NAME.png``; None without one."""
+    """The mask of an image in a folder: COLMAP's own `NAME.EXT.png`, or `NAME.png`; None without one."""
     for candidate in (masks / f"{name}.png", (masks / name).with_suffix(".png")):
         if is_file(candidate):
             return candidate
@@ -39,12 +39,12 @@ def read_mask(path: Path) -> np.ndarray:
 
 
 def masks_of(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
-    """Where the mask of each photograph is: its mask in a folder, or, of ``"alpha"``, the photograph itself.
+    """Where the mask of each photograph is: its mask in a folder, or, of `"alpha"`, the photograph itself.
 
     No mask is decoded.
 
     Raises:
-        FileNotFoundError: no such folder, or a photograph has no mask there.
+        FileNotFoundError: No such folder, or a photograph has no mask there.
         ValueError: a folder without masks.
     """
     if masks == ALPHA_MASKS:
@@ -80,9 +80,8 @@ def feature_mask(photo: Path, mask: Path) -> np.ndarray:
     Args:
         photo: The photograph.
         mask: Its mask; the photograph itself for its alpha channel.
-
     Raises:
-        ValueError: no alpha channel, another shape than the photograph's, or nothing is kept.
+        ValueError: No alpha channel, another shape than the photograph's, or nothing is kept.
     """
     if mask == photo:
         raw = read_image(photo)
@@ -115,5 +114,6 @@ def masked_photo(photo: Path, kept: np.ndarray) -> np.ndarray:
     """
     pixels = read_image(photo)
     pixels = np.ascontiguousarray(pixels[..., :3]) if pixels.ndim == 3 else pixels
+    # The mean is a float64; the photograph keeps its own 8 or 16 bits.
     pixels[kept == 0] = pixels[kept > 0].mean(axis=0).astype(pixels.dtype)
     return pixels

@@ -26,7 +26,7 @@ _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few feature
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """COLMAP's log kept off the terminal, errors included: they arrive as exceptions. Signals end a command there."""
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
@@ -53,16 +53,16 @@ def extract(
 
     Args:
         database: file, made if absent.
-        folder, names: the images, relative to the folder.
+        folder, names: Folder of the images, and their names in it.
         camera_model: COLMAP's name.
-        shared_camera: one camera for all images, or one each.
-        max_image_size: pixels on the longer side above which images are shrunk; 0 for never.
-        wide_baseline: affine shapes and pooled scales: connects views further apart, at 2.5 times
+        shared_camera: One camera for all images, or one each.
+        max_image_size: Pixels on the longer side above which images are shrunk; 0 for never.
+        wide_baseline: Affine shapes and pooled scales: connects views further apart, at 2.5 times
             the cost.
-        masks: folder with ``NAME.EXT.png`` of every image, of its size: no features where it is 0.
-        progress: called with ("features", done, total).
+        masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
+        progress: Called with ("features", done, total).
     """
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -100,10 +100,10 @@ def state_focal_lengths(database: Path, folder: Path) -> None:
     """Give cameras the focal lengths that the EXIF of photographs states, where features came from copies without it.
 
     Args:
-        database: with features of images whose names are those in the folder.
-        folder: the photographs.
+        database: COLMAP's database, with features of images whose names are those in the folder.
+        folder: The photographs.
     """
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     with pycolmap.Database.open(database) as handle:
         first = {image.camera_id: image.name for image in reversed(handle.read_all_images())}
@@ -126,13 +126,13 @@ def match(
     """Match image pairs and verify them geometrically; results go to the database.
 
     Args:
-        database: with features.
-        pairs: image names.
-        seed: of the random sampling in the verification.
-        guided: look for more matches once the epipolar geometry of a pair is known.
-        progress: called with ("matching", done, total).
+        database: COLMAP's database, with features.
+        pairs: Names of the two images of each pair.
+        seed: Seed of the random sampling in the verification.
+        guided: Look for more matches once the epipolar geometry of a pair is known.
+        progress: Called with ("matching", done, total).
     """
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -161,7 +161,7 @@ def match(
 @contextlib.contextmanager
 def _numbered(database: Path) -> Iterator[dict[str, str]]:
     """Name -> number that the images of a database are called by meanwhile: COLMAP splits a list of pairs at spaces."""
-    from drgs.data.native import pycolmap
+    from drgs.data.colmap_bindings import pycolmap
 
     with pycolmap.Database.open(database) as handle:
         images = handle.read_all_images()
@@ -177,7 +177,7 @@ def _numbered(database: Path) -> Iterator[dict[str, str]]:
 
 
 def sequential_pairs(names: list[str], window: int) -> list[tuple[str, str]]:
-    """Each name with the ``window`` names after it, and with powers of two beyond, to bridge
+    """Each name with the `window` names after it, and with powers of two beyond, to bridge
     gaps.
     """
     steps = set(range(1, window + 1)) | {2**k for k in range(16) if 2**k > window}
@@ -190,8 +190,7 @@ def nearby_pairs(centers: np.ndarray, axes: np.ndarray, neighbors: int) -> list[
     Args:
         centers: (V,3) camera centers.
         axes: (V,3) unit viewing directions.
-        neighbors: partners of each camera; all pairs if there are no more cameras than that.
-
+        neighbors: Partners of each camera; all pairs if there are no more cameras than that.
     Returns:
         index pairs (i, j), i < j.
     """
@@ -203,5 +202,6 @@ def nearby_pairs(centers: np.ndarray, axes: np.ndarray, neighbors: int) -> list[
     # nothing.
     cost = distance / max(float(np.median(distance)), 1e-12) + 2.0 * (1.0 - axes @ axes.T)
     np.fill_diagonal(cost, np.inf)
+    # Stable: of equal costs, as on a regular circle, the lower index wins on every machine.
     nearest = np.argsort(cost, axis=1, kind="stable")[:, :neighbors]
     return sorted({(min(i, j), max(i, j)) for i in range(count) for j in nearest[i].tolist()})

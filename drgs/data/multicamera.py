@@ -1,7 +1,7 @@
-"""Synchronous cameras as folders of frames, ``cam00/frame_00000.png``, and a COLMAP model that has one image of each.
+"""Synchronous cameras as folders of frames, `cam00/frame_00000.png`, and a COLMAP model that has one image of each.
 
-That image is named by its camera: ``cam00.png``, ``cam00/frame_00000.png``, or as 4DGaussians makes them, with the
-camera's number, ``image0.jpg`` (its ``multipleview`` layout, with the model in ``sparse_``).
+That image is named by its camera: `cam00.png`, `cam00/frame_00000.png`, or as 4DGaussians makes them, with the
+camera's number, `image0.jpg` (its `multipleview` layout, with the model in `sparse_`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import list_images
 from drgs.data.colmap import find_model, model_camera, model_points, read_model
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous
-from drgs.data.views import Dataset
 
-__all__ = ["add_model_points", "find_camera_folders", "frame_folders", "frames_of", "load_cameras"]
+__all__ = ["CAMERA_FOLDERS", "add_model_points", "frame_folders", "frames_of", "load_cameras"]
 
 _NUMBER = re.compile(r"(?<!\d)(\d{1,20})$")  # at the end of a name
 _MODEL = "sparse_"  # where 4DGaussians has it
@@ -31,7 +32,7 @@ _ROUNDING = 1e-6  # of coordinates in text; one camera alone has no extent
 _log = logging.getLogger(__name__)
 
 
-def find_camera_folders(path: Path) -> list[Path]:
+def _find_camera_folders(path: Path) -> list[Path]:
     """The folders of two cameras or more that have frames; empty where there are none, or no COLMAP model with them."""
     return [] if _model(path) is None else frame_folders(path)
 
@@ -51,22 +52,20 @@ def load_cameras(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
     """Load folders of frames. A frame's number is at the end of its file's name; frames of one number are of one time.
 
     Points are those of the model that images of at least two cameras show which are not held out.
 
     Args:
-        path: the folder.
-        background, times, test_cameras, lazy, points, strict: see `drgs.data.load`.
-
+        path: The folder.
+        background, times, test_cameras, lazy, points, strict: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: too few of the frames are there, or with `strict` a camera without a pose.
+        FileNotFoundError: Too few of the frames are there, or with `strict` a camera without a pose.
         ValueError: a damaged model, none of whose images is named by a camera, cameras that move, or two frames of one
             number.
     """
-    model, folders = _model(path), find_camera_folders(path)
+    model, folders = _model(path), _find_camera_folders(path)
     reconstruction = read_model(model, points)
     images = _images_of(reconstruction, model, [folder.name for folder in folders])
     posed = {name: found[0] for name, found in images.items()}
@@ -94,6 +93,11 @@ def load_cameras(
     return dataset
 
 
+CAMERA_FOLDERS = Format(
+    lambda path: path.is_dir() and bool(_find_camera_folders(path)), load_cameras, ("cam*/ beside a COLMAP model",)
+)
+
+
 def frames_of(folders: Sequence[Path], times: int) -> tuple[tuple[int, ...], dict[str, dict[int, Path]]]:
     """The numbers of the frames that are used, and the file of each by the name of the camera; some may not exist."""
     found = {folder: _numbered(_frame_folder(folder)) for folder in folders}
@@ -111,12 +115,12 @@ def frames_of(folders: Sequence[Path], times: int) -> tuple[tuple[int, ...], dic
 
 
 def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras: tuple[str, ...] | None) -> None:
-    """Take the points of a COLMAP model of the first frame, if there is one in ``frame0`` or in the data set's folder.
+    """Take the points of a COLMAP model of the first frame, if there is one in `frame0` or in the data set's folder.
 
     Its images are named by the cameras, and it must have their poses: else its world is another one.
 
     Args:
-        dataset: Without points.
+        dataset: Data set that has no points yet.
         cameras: Name -> camera.
         test_cameras: Names of those that are held out; None: those of the data set.
     """
@@ -137,7 +141,7 @@ def add_model_points(dataset: Dataset, cameras: dict[str, Camera], test_cameras:
 
 
 def _extent(cameras: Iterable[Camera]) -> float:
-    """Of the cameras' places, along the axis where it is largest."""
+    """Extent of the cameras' places along the axis where it is largest, in scene units."""
     return float(np.ptp([camera.center for camera in cameras], axis=0).max())
 
 
@@ -188,7 +192,7 @@ def _model(path: Path) -> Path | None:
 
 
 def _frame_folder(camera: Path) -> Path:
-    """Where the frames of a camera are: in its folder, or in ``images`` there."""
+    """Where the frames of a camera are: in its folder, or in `images` there."""
     return camera / "images" if (camera / "images").is_dir() else camera
 
 
@@ -199,6 +203,7 @@ def _images_of(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[s
         if number := _NUMBER.search(name):
             by_number[int(number[1])].append(name)
     images = {image_id: reconstruction.images[image_id] for image_id in reconstruction.reg_image_ids()}
+    # By name: COLMAP numbers images in the order in which its threads finish them.
     for image_id, image in sorted(images.items(), key=lambda item: item[1].name):
         parts = PurePosixPath(image.name).with_suffix("").parts
         owner = next((part for part in reversed(parts) if part in names), None)

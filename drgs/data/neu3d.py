@@ -1,7 +1,7 @@
-"""Neural 3D Video (Li et al., CVPR 2022): a video a camera, ``cam00.mp4``, ..., and LLFF's ``poses_bounds.npy`` with a
-row for each, in the order of their names. ``cam00`` is the test view of that data set.
+"""Neural 3D Video (Li et al., CVPR 2022): a video a camera, `cam00.mp4`, ..., and LLFF's `poses_bounds.npy` with a
+row for each, in the order of their names. `cam00` is the test view of that data set.
 
-In place of videos there may be folders of their frames, ``cam00/images/0000.png``, ..., as 4DGaussians takes them out.
+In place of videos there may be folders of their frames, `cam00/images/0000.png`, ..., as 4DGaussians takes them out.
 """
 
 from __future__ import annotations
@@ -10,28 +10,32 @@ import logging
 import re
 from pathlib import Path
 
-from drgs.data.llff import pose_rows, row_camera
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
+from drgs.data.llff import POSES_BOUNDS, pose_rows, row_camera
 from drgs.data.multicamera import add_model_points, frame_folders, frames_of
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.videos import VIDEO_SUFFIXES, VideoFile, list_videos, read_video
-from drgs.data.views import Dataset
 from drgs.display.progress import Bar
 
-__all__ = ["POSES_BOUNDS", "find_posed_frames", "find_videos", "load_neu3d"]
-
-POSES_BOUNDS = "poses_bounds.npy"
+__all__ = ["NEU3D", "NEU3D_FRAMES", "load_neu3d"]
 
 _log = logging.getLogger(__name__)
 
 
-def find_videos(path: Path) -> list[Path]:
+def _folder(path: Path) -> Path:
+    """The data set of which either the folder or the file of poses was named."""
+    return path.parent if path.name == POSES_BOUNDS else path
+
+
+def _find_videos(path: Path) -> list[Path]:
     """The videos of a folder that has poses for them, by name; empty if it has none."""
     if not (path / POSES_BOUNDS).is_file():
         return []
     return [video for video in list_videos(path) if video.stem.lower().startswith("cam")]
 
 
-def find_posed_frames(path: Path) -> list[Path]:
+def _find_posed_frames(path: Path) -> list[Path]:
     """The folders of frames of cameras, in a folder that has poses for them, by name; empty if it has none."""
     return frame_folders(path) if (path / POSES_BOUNDS).is_file() else []
 
@@ -44,7 +48,6 @@ def load_neu3d(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
     """Load the videos of synchronous cameras, or folders of their frames. No image is decoded.
 
@@ -53,17 +56,17 @@ def load_neu3d(
     frame, if there is one (`add_model_points`).
 
     Args:
-        path: the folder.
-        background, times, test_cameras, lazy, points, strict: see `drgs.data.load`.
-
+        path: The folder, or its `poses_bounds.npy`.
+        background, times, test_cameras, lazy, points, strict: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file.
+        FileNotFoundError: No such file.
         ValueError: a damaged video, poses for another number of them or of another shape, a pose that is none, or with
             `strict` videos of different length.
     """
-    videos = find_videos(path)
+    path = _folder(path)
+    videos = _find_videos(path)
     rows = pose_rows(path / POSES_BOUNDS)
-    files = videos or find_posed_frames(path)
+    files = videos or _find_posed_frames(path)
     _check_rows(path / POSES_BOUNDS, len(rows), files, bool(videos))
     numbers, sources = _videos(path, videos, times, strict) if videos else frames_of(files, times)
     recordings = []
@@ -77,6 +80,13 @@ def load_neu3d(
         seen = {recording.name: recording.cameras[numbers[0]] for recording in recordings}
         add_model_points(dataset, seen, test_cameras)
     return dataset
+
+
+# Two rows: folders of frames that have a COLMAP model, too, are read with that, videos are not.
+NEU3D = Format(lambda path: bool(_find_videos(_folder(path))), load_neu3d, (f"cam*.mp4 beside {POSES_BOUNDS}",))
+NEU3D_FRAMES = Format(
+    lambda path: bool(_find_posed_frames(_folder(path))), load_neu3d, (f"cam*/ beside {POSES_BOUNDS}",)
+)
 
 
 def _check_rows(poses: Path, rows: int, files: list[Path], are_videos: bool) -> None:

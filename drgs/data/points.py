@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.data.dataset import Dataset
 from drgs.data.guesses import (
     FEWEST,
     MASK_KEEP,
@@ -18,10 +19,10 @@ from drgs.data.guesses import (
 )
 from drgs.data.guided import Matches, detect
 from drgs.data.matching import nearby_pairs
-from drgs.data.views import Dataset, View
+from drgs.data.views import View
 from drgs.display.progress import Bar
 from drgs.guards.foreign import is_file, refuse_foreign
-from drgs.guards.ply_lists import ply_source
+from drgs.guards.ply_headers import ply_source
 
 __all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_count", "triangulated_points"]
 
@@ -56,10 +57,9 @@ def initial_points(
 
     Args:
         data: a data set, or views (then there are no given points).
-        seed: of all random choices.
-        max_points: at most so many.
-        progress: called with (stage, done, total) while triangulating.
-
+        seed: Seed of all random choices.
+        max_points: Number of points at most.
+        progress: Called with (stage, done, total) while triangulating.
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
@@ -98,12 +98,11 @@ def triangulated_points(
     """Points to start Gaussians from that all of these views together show, without depth maps.
 
     Args:
-        views: at least two, with images.
-        seed: of all random choices.
-        max_points: at most so many.
-        matches: as for `added_points`.
-        progress: as for `initial_points`.
-
+        views: Views with images, at least two.
+        seed: Seed of all random choices.
+        max_points: Number of points at most.
+        matches: Matches, as `added_points` takes them.
+        progress: Callback, as `initial_points` takes it.
     Returns:
         points (P,3) float64 and colors (P,3) float32: those triangulated, and where images have none of them, guesses
         as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are, before any
@@ -117,6 +116,7 @@ def triangulated_points(
     # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
     # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
     share = empty_share(views, points, shown)
+    # Where all is empty, the share of what is not is 0.
     as_dense = found * min(1.0, share / max(1 - share, 1e-9))
     guesses = round(min(max(_ENOUGH - found, as_dense), share * max_points))
     keep = subset(found, max_points - guesses, rng)
@@ -143,6 +143,7 @@ def _at_first(views: list[View]) -> list[View]:
         return views
     first = [view for view in views if view.camera.time == times[0]]
     centers = np.array([view.camera.center for view in first])
+    # Poses that a file states in several ways differ by rounding: 1e-9 of the distance from the origin is one place.
     return first if np.ptp(centers, axis=0).max() > 1e-9 * max(1.0, float(np.abs(centers).max())) else views
 
 
@@ -155,11 +156,10 @@ def added_points(
     """Points that the last view adds to what those before it show, without depth maps.
 
     Args:
-        views: at least one; nothing but these is read.
-        seed: of all random choices.
-        matches: what was found in the first ones of these views by earlier calls; is added to.
-        progress: as for `initial_points`.
-
+        views: Views, at least one; nothing but these is read.
+        seed: Seed of all random choices.
+        matches: What was found in the first ones of these views by earlier calls; is added to.
+        progress: Callback, as `initial_points` takes it.
     Returns:
         points (P,3) float64 and colors (P,3) float32: first those triangulated with the last view, whose number is the
         third value, then guesses: along rays of the last view as far away as what is triangulated near them, or, where
@@ -180,8 +180,8 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     colors.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no PLY with x, y, z, shorter than it claims, or not finite.
+        FileNotFoundError: No such file.
+        ValueError: No PLY with x, y, z, shorter than it claims, or not finite.
     """
     if not is_file(path):
         raise FileNotFoundError(f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path")
@@ -246,7 +246,7 @@ def _check_ply_size(path: Path) -> None:
 
 
 def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Back-projected pixels, an even share a view, at most ``limit``.
+    """Back-projected pixels, an even share a view, at most `limit`.
 
     Not thinned in space: what is close to many cameras gets many points, and that is where pixels are to be explained.
     (Voxels of even size gave most points to the walls of a room and 4 dB less on the still life.)

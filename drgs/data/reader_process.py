@@ -57,7 +57,7 @@ class Child:
 
     @property
     def pid(self) -> int | None:
-        """Of the process; None where there is none."""
+        """Number of the process; None where there is none."""
         return self._process.pid if self._process is not None and self._owner == os.getpid() else None
 
     def ask(self, what: str, path: Path, *rest: Any, told: Callable[[int], None] = lambda _: None) -> Any:
@@ -68,7 +68,6 @@ class Child:
             path: Its first argument: the file that is read.
             rest: More arguments, values of JSON.
             told: Is called with the numbers that it tells of on the way.
-
         Raises:
             ValueError: The process ended over this file.
             Exception: What the function raises.
@@ -137,7 +136,7 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
     """Answer the questions of a `Child` until it is gone: the main function of its module.
 
     Args:
-        functions: By name; they get a path, the other arguments, and `tell`, which takes a number.
+        functions: Functions by name; they get a path, the other arguments, and `tell`, which takes a number.
     """
     for name in (signal.SIGINT, signal.SIGTERM):  # a fit that is told to end saves first, and may need this one
         signal.signal(name, signal.SIG_IGN)
@@ -174,7 +173,7 @@ class _Shared:
     """Memory that both processes map; it only grows.
 
     Args:
-        fd: Of the file that it is.
+        fd: Descriptor of the file.
     """
 
     def __init__(self, fd: int) -> None:

@@ -1,12 +1,12 @@
-"""Replica as Semantic-NeRF renders it: ``rgb/rgb_N.png``, ``depth/depth_N.png``, a pose a line in ``traj_w_c.txt``.
+"""Replica as Semantic-NeRF renders it: `rgb/rgb_N.png`, `depth/depth_N.png`, a pose a line in `traj_w_c.txt`.
 
 What Semantic-NeRF's own code says (Zhi et al., ICCV 2021; SSR/datasets/replica, SSR/training/trainer.py,
 SSR/models/rays.py and SSR/data_generation of its repository): frames are in the order of their numbers, frame N has the
 N-th pose; a pose is camera-to-world, 4x4, with x right, y down and z forward; the horizontal field of view is 90
 degrees, pixels are square, and the principal point (W - 1) / 2, (H - 1) / 2 counts pixel centers at integers: it is the
-middle of the image; depth is z-depth in millimeters; ``semantic_class/semantic_class_N.png`` has Replica's class
-numbers, 1 to 101 with gaps, 0 for none. Their names are in ``info_semantic.json`` of the scene's ``habitat`` folder, to
-be copied beside ``rgb``. Semantic-NeRF trains on frames 0, 5, 10, ... of 900 and tests on 2, 7, 12, ....
+middle of the image; depth is z-depth in millimeters; `semantic_class/semantic_class_N.png` has Replica's class
+numbers, 1 to 101 with gaps, 0 for none. Their names are in `info_semantic.json` of the scene's `habitat` folder, to
+be copied beside `rgb`. Semantic-NeRF trains on frames 0, 5, 10, ... of 900 and tests on 2, 7, 12, ....
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, read_text, repaired_pose
-from drgs.data.views import Dataset, View
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
+from drgs.data.views import View
 
-__all__ = ["POSES", "load_replica"]
+__all__ = ["POSES", "REPLICA", "load_replica"]
 
 POSES = "traj_w_c.txt"
 _FIELD_OF_VIEW = 90.0  # degrees across the width
@@ -36,19 +38,17 @@ def load_replica(
     test_every: int = 8,
     test_offset: int = 0,
     lazy: bool = False,
-    **_,
 ) -> Dataset:
     """Load a sequence of Replica. Views are named by their numbers, with as many digits as the last one has, so that
-    their names sort as they were taken: ``rgb_002`` for ``rgb_2.png`` of 900.
+    their names sort as they were taken: `rgb_002` for `rgb_2.png` of 900.
 
     Args:
-        path: the sequence's folder, as ``room_0/Sequence_1``.
-        background: color that images with alpha are composited on.
-        test_every, test_offset, lazy: see `drgs.data.load`. Lazily, all views get the size of the first training image.
-
+        path: The sequence's folder, as `room_0/Sequence_1`.
+        background: Color that images with alpha are composited on.
+        test_every, test_offset, lazy: See `drgs.data.load`. Lazily, all views get the size of the first training image.
     Raises:
-        FileNotFoundError: no poses, no ``rgb`` folder, or no images in it.
-        ValueError: poses that are none, or an image beyond them.
+        FileNotFoundError: No poses, no `rgb` folder, or no images in it.
+        ValueError: Poses that are none, or an image beyond them.
     """
     poses = _poses(path / POSES)
     folder = path / "rgb"
@@ -91,6 +91,9 @@ def load_replica(
         view.background = background
         view.is_checked = not lazy
     return dataset
+
+
+REPLICA = Format(lambda path: (path / POSES).is_file(), load_replica, (POSES,))
 
 
 def _poses(file: Path) -> np.ndarray:

@@ -1,21 +1,4 @@
-"""What a data set says about classes: a teacher's feature maps and label images beside the photographs.
-
-Found by their names beside the folder of the images, in this order:
-
-- Teacher: ``rgb_feature_langseg/`` (LSeg), ``sam_embeddings/`` (SAM), as Feature 3DGS reads them.
-  ``NAME_fmap_CxHxW.pt`` belongs to the image of that name without its suffix, or up to the first dot of its name.
-- Labels: ``semantic_class/``, ``semantic/``, ``labels/``. ``NAME.png`` belongs to the image NAME, and as in Replica
-  ``semantic_class_7.png`` to the image ``rgb_7.png``. One channel of 8 or 16 bits, without loss (PNG, TIFF, BMP).
-- Numbers in the labels: ``classes.json``, ``classes.txt`` or ``info_semantic.json`` (`drgs.data.class_names`). 0 and
-  the largest number, 255 or 65535, are no label unless they are named there.
-- Classes in the teacher's space: ``text_embeddings.npy``, a row a class in the order of that file.
-- Classes of things that move: ``moving_classes.json``, a list of names.
-
-Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ. Those
-of frame 7 of the synchronous camera cam03, be it a file or part of a video, are ``cam03/semantic_class_0007.png``,
-``cam03/0007.png`` or ``cam03_0007.png``, and maps alike (`drgs.data.sidecars`). Dynamic 3D Gaussians' ``seg/`` are
-labels whose only class, 1, is what moves.
-"""
+"""What a data set says about classes: a teacher's feature maps, label images, and what their numbers mean."""
 
 from __future__ import annotations
 
@@ -28,24 +11,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import read_image, read_npy
-from drgs.data.class_names import CLASS_FILES, read_class_names
-from drgs.data.sidecars import LABEL_FOLDERS, feature_maps, label_images, match_views, report_unmatched, search_folders
+from drgs.data.class_names import read_class_names
 from drgs.display.progress import Bar
 from drgs.guards.json_files import check_json, read_json
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import torch
 
     from drgs.cameras import Camera
-    from drgs.data.views import Dataset, View
     from drgs.features.segmentation import Classes
 
-__all__ = ["LABEL_FOLDERS", "TEACHER_FOLDERS", "Semantics", "attach", "plain_labels"]
+__all__ = ["SEGMENTS", "Semantics", "plain_labels"]
 
-TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
-_MOVING = "moving_classes.json"
-_SEGMENTS = "seg"  # of Dynamic 3D Gaussians: 1 is what moves
-_EMBEDDINGS = "text_embeddings.npy"
+SEGMENTS = "seg"
+"""Folder of Dynamic 3D Gaussians' labels, in which 1 is what moves."""
 _NUMBERS = 1 << 16  # what a pixel of a label image can say
 _SHOWN = 5
 _FINER = 8  # times: photographs are reduced so far (images_8) while their maps stay
@@ -117,7 +98,7 @@ class Semantics:
             FileNotFoundError, ValueError: A file that is no list of names, or names no class.
         """
         if self.moving_file is None:
-            return self.classes.names if self.labels == _SEGMENTS and self.classes else None
+            return self.classes.names if self.labels == SEGMENTS and self.classes else None
         names = read_json(self.moving_file, "a list of class names", 'write ["tongs", ...]')
         check_json(str(self.moving_file), names, [str], 'write ["tongs", ...]')
         known = self.classes.names if self.classes else ()
@@ -128,18 +109,19 @@ class Semantics:
             )
         return tuple(names)
 
-    def checked(self, views: list[View]) -> Semantics:
-        """Itself, with the headers of the maps of all views and the classes compared.
+    def checked(self, maps: Iterable[tuple[Path, Camera]]) -> Semantics:
+        """The same, with the headers of all maps and the classes compared.
 
+        Args:
+            maps: The maps and the cameras of their photographs.
         Raises:
             FileNotFoundError, ValueError: A file that is none of its kind, or as `check_map`.
         """
         if self.maps:
             from drgs.features.teacher import read_map
 
-            for view in views:
-                if view.teacher_path:
-                    self.check_map(read_map(view.teacher_path), view.teacher_path, view.camera)
+            for path, camera in maps:
+                self.check_map(read_map(path), path, camera)
             _ = self.classes
         elif self.class_file:  # labels alone: without a file, their numbers would be looked for in all of them
             _ = self._numbers
@@ -152,8 +134,8 @@ class Semantics:
 
         Args:
             values: (C, h, w).
-            path: Of the map, for the message.
-            camera: Of the photograph, which may have been reduced since the map was made.
+            path: File of the map, for the message.
+            camera: Camera of the photograph, which may have been reduced since the map was made.
         """
         if values.shape[0] != self.channels:
             like = self.embedding_file or self.maps[0]
@@ -173,8 +155,7 @@ class Semantics:
 
         Args:
             raw: (H, W) uint8 or uint16.
-            path: Of the image, for the message.
-
+            path: File of the image, for the message.
         Raises:
             ValueError: Numbers that are no class.
         """
@@ -231,6 +212,7 @@ class Semantics:
                 f"{self.embedding_file}: must be a row of floats a class, got shape {rows.shape} of {rows.dtype}; "
                 "save (classes, channels) floats"
             )
+        # float64: squares of float16 embeddings overflow from 256 on.
         lengths = np.linalg.norm(rows.astype(np.float64), axis=1)
         bad = np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0)))
         if len(bad):
@@ -242,60 +224,6 @@ class Semantics:
         from drgs.features.teacher import read_map
 
         return read_map(self.maps[0])
-
-
-def attach(dataset: Dataset, lazy: bool) -> None:
-    """Find the maps and labels of a data set's views and note them in `Dataset.semantics` and the views.
-
-    Args:
-        dataset: Loaded; without maps or labels it stays as it is.
-        lazy: Open none of the files; else headers of maps and the files of classes are read.
-
-    Raises:
-        FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
-    """
-    found: dict[str, Path] = {}
-    bases = search_folders(dataset)
-    labels = (*LABEL_FOLDERS, _SEGMENTS) if dataset.format == "train_meta" else LABEL_FOLDERS
-    for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", labels)):
-        folders = [base / name for name in names for base in bases if (base / name).is_dir()]
-        for folder in folders:
-            files = feature_maps(folder) if kind == "teacher" else label_images(folder)
-            matched = match_views(dataset.views, folder, files)
-            if matched:
-                found[kind] = folder
-                for view, path in matched:
-                    setattr(view, f"{kind.removesuffix('s')}_path", path)
-                break
-            report_unmatched(kind, folder, files, dataset.views)
-    if not found:
-        return
-    classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]
-    embeddings = [base / _EMBEDDINGS for base in bases if (base / _EMBEDDINGS).is_file()]
-    moving = [base / _MOVING for base in bases if (base / _MOVING).is_file()]
-    semantics = Semantics(
-        teacher=found["teacher"].name if "teacher" in found else "",
-        labels=found["labels"].name if "labels" in found else "",
-        maps=tuple(view.teacher_path for view in dataset.views if view.teacher_path),
-        label_images=tuple(view.label_path for view in dataset.views if view.label_path),
-        class_file=classes[0] if classes else None,
-        embedding_file=embeddings[0] if embeddings else None,
-        moving_file=moving[0] if moving else None,
-    )
-    if "teacher" in found:
-        train = dataset.split()[0]
-        without = [view.name for view in train if view.teacher_path is None]
-        if without:
-            _log.warning(
-                "%s: %d of the %d training views have no map (%s); of these, only colors can be fitted",
-                found["teacher"],
-                len(without),
-                len(train),
-                ", ".join(without[:_SHOWN]) + (", ..." if len(without) > _SHOWN else ""),
-            )
-    for view in dataset.views:
-        view.semantics = semantics
-    dataset.semantics = semantics if lazy else semantics.checked(dataset.views)
 
 
 def plain_labels(path: Path) -> np.ndarray:

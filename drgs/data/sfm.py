@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import os
+import re
 import shutil
 import time
+import unicodedata
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size, list_images
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, list_images, read_image
+from drgs.data.heif import heif_as_jpeg, is_heif
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
-from drgs.data.readable import check_names, readable_photos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -43,6 +46,11 @@ _WINDOW = 10
 # Matches that a pose needs where an object alone is looked at, which has few: half of COLMAP's own numbers.
 _MASKED_INLIERS_FIRST = 50
 _MASKED_INLIERS = 15
+_QUALITY = 98  # of JPEG, for what has been compressed before
+_LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
+_SHOWN = 5  # names that a message repeats
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -50,13 +58,13 @@ class SfmSummary:
     """What structure from motion found.
 
     Attributes:
-        registered, total: photos with a pose, and all.
-        points: number of 3D points.
+        registered, total: Photos with a pose, and all.
+        points: Number of 3D points.
         reprojection_error: mean, in pixels.
-        models: separate models found; the largest was kept.
-        explanation: sentences about the photos without a pose: which models they are in, and what would help.
-        seconds: time by stage: features, matching, mapping.
-        missing: names of the photos without a pose.
+        models: Separate models found; the largest was kept.
+        explanation: Sentences about the photos without a pose: which models they are in, and what would help.
+        seconds: Time by stage: features, matching, mapping.
+        missing: Names of the photos without a pose.
     """
 
     registered: int
@@ -80,31 +88,30 @@ def run_sfm(
     masks: str | os.PathLike | None = None,
     doing: Callable[[str], None] | None = None,
 ) -> SfmSummary:
-    """Find camera poses and points from photos; afterwards ``drgs.data.load(out_dir)`` works.
+    """Find camera poses and points from photos; afterwards `drgs.data.load(out_dir)` works.
 
-    Writes ``out_dir/{database.db, sparse/0, images}``, and ``masks`` if there are any, where a fit finds them;
-    ``images`` and ``masks`` are links to the folders given where links work, copies elsewhere. An earlier result of
+    Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them;
+    `images` and `masks` are links to the folders given where links work, copies elsewhere. An earlier result of
     this function is replaced, and only once the new one is complete; nothing else ever is.
 
     Args:
-        image_dir: folder of photos.
-        out_dir: made if absent.
-        progress: called with (stage, done, total); stages are masks, features, matching and mapping. Of mapping, which
+        image_dir: Folder of photos.
+        out_dir: Folder of the data set; made if absent.
+        progress: Called with (stage, done, total); stages are masks, features, matching and mapping. Of mapping, which
             may begin anew, `done` is the number of photos with a pose so far; it is called from another thread, too.
         camera_model: COLMAP's name of the lens. Photos of one size share one camera.
-        max_image_size: pixels on the longer side that features are found at; 0 for the photos' own.
-        matching: ``exhaustive``, ``sequential`` (photos in the order of a walk or video) or
-            ``auto`` (exhaustive up to 60 photos, 150 with masks).
-        seed: of all random sampling.
-        masks: what features are looked for in, where an object was turned or moved between photos: a folder with a mask
-            of every photo, ``NAME.EXT.png`` or ``NAME.png``, white where the object is, of the photo's shape; or
-            ``"alpha"``, the photos' own alpha channel. Weights below a half count as black.
-        doing: called with what is being done within mapping, in words; from another thread, too.
-
+        max_image_size: Pixels on the longer side that features are found at; 0 for the photos' own.
+        matching: `exhaustive`, `sequential` (photos in the order of a walk or video) or
+            `auto` (exhaustive up to 60 photos, 150 with masks).
+        seed: Seed of all random sampling.
+        masks: What features are looked for in, where an object was turned or moved between photos: a folder with a mask
+            of every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or
+            `"alpha"`, the photos' own alpha channel. Weights below a half count as black.
+        doing: Called with what is being done within mapping, in words; from another thread, too.
     Raises:
-        FileNotFoundError: no such folder, or no mask of a photo.
-        ValueError: fewer than 2 photos, an unknown option, photos that do not connect, or an
-            ``out_dir`` that holds a COLMAP project or photos that were not made here; a mask of another shape, one that
+        FileNotFoundError: No such folder, or no mask of a photo.
+        ValueError: Fewer than 2 photos, an unknown option, photos that do not connect, or an
+            `out_dir` that holds a COLMAP project or photos that were not made here; a mask of another shape, one that
             keeps nothing, or a photo without alpha.
     """
     image_dir, out_dir = Path(image_dir), Path(out_dir)
@@ -113,7 +120,7 @@ def run_sfm(
     if not image_dir.is_dir():
         raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]
-    check_names(image_dir, names, masked=masks is not None)
+    _check_names(image_dir, names, masked=masks is not None)
     if len(names) < 2:
         raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
     if camera_model not in CAMERA_MODELS:
@@ -146,8 +153,8 @@ def run_sfm(
 
 
 def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
-    """What COLMAP looks for features in: ``photos`` without their surroundings, and ``masks`` of their sizes, black or
-    white, ``NAME.EXT.png``.
+    """What COLMAP looks for features in: `photos` without their surroundings, and `masks` of their sizes, black or
+    white, `NAME.EXT.png`.
     """
     import cv2
 
@@ -157,6 +164,7 @@ def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial:
         report("masks", done, len(names))
         kept = feature_mask(image_dir / name, mask)
         pixels = masked_photo(image_dir / name, kept)
+        # OpenCV writes blue first.
         pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
         for file, image in ((partial / "masks" / f"{name}.png", kept), (partial / "photos" / name, pixels)):
             suffix = file.suffix.lower()
@@ -192,15 +200,15 @@ def _reconstruct(
     seed: int,
     is_masked: bool,
 ) -> SfmSummary:
-    """Run the three stages; leaves ``database.db`` and ``sparse/0`` in ``partial``."""
+    """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
+    from drgs.data.colmap_bindings import pycolmap
     from drgs.data.matching import extract, match, quiet, sequential_pairs, state_focal_lengths
-    from drgs.data.native import pycolmap
 
     database = partial / "database.db"
     shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
     with quiet():
-        readable = readable_photos(image_dir, names, partial / "readable", report)
+        readable = _readable_photos(image_dir, names, partial / "readable", report)
         extract(
             database,
             partial / "photos" if is_masked else readable,
@@ -283,3 +291,71 @@ def _install(partial: Path, output: Claim, linked: dict[str, Path], makes_masks:
     for file in partial.glob("database.db*"):
         output.put(file, file.name)
     output.put(partial / "sparse", "sparse")
+
+
+def _check_names(folder: Path, names: list[str], masked: bool = False) -> None:
+    """Refuse names that a COLMAP model cannot hold: with line breaks or other control characters, or bytes that are not
+    UTF-8; with masks, whose names are those and `.png`, also too long ones. Say which photographs are hidden, and left
+    out.
+
+    Raises:
+        ValueError: There is one.
+    """
+    for name in names:
+        if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
+            raise ValueError(
+                f"{folder}: the name of a photo must be one line of UTF-8 without control characters, got "
+                f"{name[:80]!r}; rename this photo"
+            )
+        if masked and len(name.encode()) > _LONGEST:
+            raise ValueError(
+                f"{folder}: with masks, the name of a photo must have at most {_LONGEST} bytes, got "
+                f"{len(name.encode())}: {name[:40]}...; rename this photo and its mask"
+            )
+    # Those of ._ are no photographs, but what macOS notes about them on other systems.
+    hidden = [p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and re.match(r"\.(?!_)", p.name)]
+    if hidden:
+        shown = ", ".join(sorted(hidden)[:_SHOWN]) + (", ..." if len(hidden) > _SHOWN else "")
+        _log.warning("%s: %d hidden photos are left out (%s); rename them to use them", folder, len(hidden), shown)
+
+
+def _readable_photos(folder: Path, names: list[str], target: Path, progress: Callable[[str, int, int], None]) -> Path:
+    """A folder where COLMAP can read all photographs under their names.
+
+    Args:
+        folder, names: The photographs.
+        target: Folder that is made if some of them are HEIC, AVIF or WebP: these become JPEG there, whatever their
+            names say, with their EXIF (which of WebP is lost), and the others links.
+        progress: Called with ("decoding", done, total) where there are such.
+    Returns:
+        `target`, or `folder` if COLMAP reads all of it.
+    Raises:
+        ValueError: One cannot be decoded, or pillow-heif is missing.
+    """
+    import cv2
+
+    foreign = [name for name in names if is_heif(folder / name) or _is_webp(folder / name)]
+    if not foreign:
+        return folder
+    target.mkdir()
+    for name in set(names) - set(foreign):
+        try:
+            (target / name).symlink_to((folder / name).resolve())
+        except OSError:
+            shutil.copyfile(folder / name, target / name)
+    for done, name in enumerate(foreign):
+        progress("decoding", done, len(foreign))
+        if is_heif(folder / name):
+            (target / name).write_bytes(heif_as_jpeg(folder / name, _QUALITY))
+        else:
+            pixels = np.ascontiguousarray(read_image(folder / name)[..., 2::-1])  # without alpha, in OpenCV's order
+            _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            (target / name).write_bytes(encoded.tobytes())
+    progress("decoding", len(foreign), len(foreign))
+    return target
+
+
+def _is_webp(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(12)
+    return head[:4] == b"RIFF" and head[8:] == b"WEBP"

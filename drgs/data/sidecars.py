@@ -1,4 +1,21 @@
-"""Files beside the photographs of a data set, found by their names: a teacher's maps and label images."""
+"""Files beside the photographs of a data set: a teacher's maps, label images, and what their numbers mean.
+
+Found by their names beside the folder of the images, in this order:
+
+- Teacher: `rgb_feature_langseg/` (LSeg), `sam_embeddings/` (SAM), as Feature 3DGS reads them.
+  `NAME_fmap_CxHxW.pt` belongs to the image of that name without its suffix, or up to the first dot of its name.
+- Labels: `semantic_class/`, `semantic/`, `labels/`. `NAME.png` belongs to the image NAME, and as in Replica
+  `semantic_class_7.png` to the image `rgb_7.png`. One channel of 8 or 16 bits, without loss (PNG, TIFF, BMP).
+- Numbers in the labels: `classes.json`, `classes.txt` or `info_semantic.json` (`drgs.data.class_names`). 0 and
+  the largest number, 255 or 65535, are no label unless they are named there.
+- Classes in the teacher's space: `text_embeddings.npy`, a row a class in the order of that file.
+- Classes of things that move: `moving_classes.json`, a list of names.
+
+Images in subfolders have their maps and labels in subfolders alike, or all in one folder if their names differ. Those
+of frame 7 of the synchronous camera cam03, be it a file or part of a video, are `cam03/semantic_class_0007.png`,
+`cam03/0007.png` or `cam03_0007.png`, and maps alike. Dynamic 3D Gaussians' `seg/` are
+labels whose only class, 1, is what moves.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +24,22 @@ import re
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
+from drgs.data.class_names import CLASS_FILES
+from drgs.data.semantics import SEGMENTS, Semantics
+
 if TYPE_CHECKING:
-    from drgs.data.views import Dataset, View
+    from drgs.data.dataset import Dataset
+    from drgs.data.views import View
 
-__all__ = ["LABEL_FOLDERS", "feature_maps", "label_images", "match_views", "report_unmatched", "search_folders"]
+__all__ = ["LABEL_FOLDERS", "TEACHER_FOLDERS", "attach"]
 
+TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
 LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
+_EMBEDDINGS = "text_embeddings.npy"
+_MOVING = "moving_classes.json"
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _IMAGE_FOLDERS = ("images", "rgb")
+_SHOWN = 5  # names that a message repeats
 _NEAR = 3  # folders above an image among which one may be named so
 _NUMBERED = re.compile(r"rgb_(\d+)")
 _FRAME = re.compile(r"(?P<prefix>.*?)(?P<number>\d{1,20})")
@@ -22,7 +47,64 @@ _FRAME = re.compile(r"(?P<prefix>.*?)(?P<number>\d{1,20})")
 _log = logging.getLogger(__name__)
 
 
-def search_folders(dataset: Dataset) -> list[Path]:
+def attach(dataset: Dataset, lazy: bool) -> None:
+    """Find the maps and labels of a data set's views and note them in `Dataset.semantics` and the views.
+
+    Args:
+        dataset: Loaded; without maps or labels it stays as it is.
+        lazy: Open none of the files; else headers of maps and the files of classes are read.
+    Raises:
+        FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
+    """
+    found: dict[str, Path] = {}
+    bases = _search_folders(dataset)
+    labels = (*LABEL_FOLDERS, SEGMENTS) if dataset.format == "train_meta" else LABEL_FOLDERS
+    for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", labels)):
+        folders = [base / name for name in names for base in bases if (base / name).is_dir()]
+        for folder in folders:
+            files = _feature_maps(folder) if kind == "teacher" else _label_images(folder)
+            matched = _match_views(dataset.views, folder, files)
+            if matched:
+                found[kind] = folder
+                for view, path in matched:
+                    setattr(view, f"{kind.removesuffix('s')}_path", path)
+                break
+            _report_unmatched(kind, folder, files, dataset.views)
+    if not found:
+        return
+    classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]
+    embeddings = [base / _EMBEDDINGS for base in bases if (base / _EMBEDDINGS).is_file()]
+    moving = [base / _MOVING for base in bases if (base / _MOVING).is_file()]
+    semantics = Semantics(
+        teacher=found["teacher"].name if "teacher" in found else "",
+        labels=found["labels"].name if "labels" in found else "",
+        maps=tuple(view.teacher_path for view in dataset.views if view.teacher_path),
+        label_images=tuple(view.label_path for view in dataset.views if view.label_path),
+        class_file=classes[0] if classes else None,
+        embedding_file=embeddings[0] if embeddings else None,
+        moving_file=moving[0] if moving else None,
+    )
+    if "teacher" in found:
+        train = dataset.split()[0]
+        without = [view.name for view in train if view.teacher_path is None]
+        if without:
+            _log.warning(
+                "%s: %d of the %d training views have no map (%s); of these, only colors can be fitted",
+                found["teacher"],
+                len(without),
+                len(train),
+                ", ".join(without[:_SHOWN]) + (", ..." if len(without) > _SHOWN else ""),
+            )
+    for view in dataset.views:
+        view.semantics = semantics
+    dataset.semantics = (
+        semantics
+        if lazy
+        else semantics.checked((view.teacher_path, view.camera) for view in dataset.views if view.teacher_path)
+    )
+
+
+def _search_folders(dataset: Dataset) -> list[Path]:
     """Where the folders may be: in the data set, and beside its folder of images."""
     path = dataset.path
     folders = [path if path.is_dir() else path.parent]
@@ -33,7 +115,7 @@ def search_folders(dataset: Dataset) -> list[Path]:
     return list(dict.fromkeys(folders))
 
 
-def feature_maps(folder: Path) -> dict[str, Path]:
+def _feature_maps(folder: Path) -> dict[str, Path]:
     """Stem of the image, with its subfolder -> map."""
     from drgs.features.teacher import map_name
 
@@ -44,7 +126,7 @@ def feature_maps(folder: Path) -> dict[str, Path]:
     }
 
 
-def label_images(folder: Path) -> dict[str, Path]:
+def _label_images(folder: Path) -> dict[str, Path]:
     """Stem, with its subfolder -> label image."""
     return {
         str(PurePosixPath(path.relative_to(folder)).with_suffix("")): path
@@ -53,7 +135,7 @@ def label_images(folder: Path) -> dict[str, Path]:
     }
 
 
-def match_views(views: list[View], folder: Path, files: dict[str, Path]) -> list[tuple[View, Path]]:
+def _match_views(views: list[View], folder: Path, files: dict[str, Path]) -> list[tuple[View, Path]]:
     """The views that have a file, and which; ValueError if two photographs have the same."""
     cameras = {view.camera_name for view in views} - {""}
     frames = _by_camera(files, cameras, folder.name) if cameras else {}
@@ -94,8 +176,8 @@ def _of_photograph(view: View, folder: Path, files: dict[str, Path]) -> Path | N
 def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[tuple[str, int], Path]:
     """(camera, number of the frame) -> file, of those in the camera's folder or with its name in front.
 
-    Before the number there may be the folder's name, as ``semantic_class_0007``, ``frame_`` or ``rgb_``; others, as
-    ``vis_sem_class_0007``, are no labels.
+    Before the number there may be the folder's name, as `semantic_class_0007`, `frame_` or `rgb_`; others, as
+    `vis_sem_class_0007`, are no labels.
 
     Raises:
         ValueError: Two files of one frame.
@@ -119,7 +201,7 @@ def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[t
     return found
 
 
-def report_unmatched(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:
+def _report_unmatched(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:
     """Say that a folder has no file for any view; maps of other images are refused."""
     image = next((view.name if view.camera_name else view.stem for view in views if view.has_image), "NAME")
     if kind == "teacher" and files:

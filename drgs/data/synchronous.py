@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size
+from drgs.data.dataset import Dataset
+from drgs.data.resizing import fit_to_image, resized_to
 from drgs.data.videos import VideoFile, VideoFrame
-from drgs.data.view_checks import fit_to_image, go_on_without, resized_to
-from drgs.data.views import Dataset, View
+from drgs.data.view_checks import go_on_without
+from drgs.data.views import View
 from drgs.guards.foreign import is_file
 
 if TYPE_CHECKING:
@@ -31,8 +33,8 @@ class Recording:
     """What one of several synchronous cameras has taken.
 
     Attributes:
-        name: Of the camera.
-        cameras: As calibrated, of every frame by its number; those of a moving camera differ.
+        name: Name of the camera.
+        cameras: Calibrated camera of every frame, by its number; those of a moving camera differ.
         source: A video, or the image of each of these frames by its number; some may not exist.
         where: What states the calibration, for messages.
         split: What the data set's own files say that it is for; else empty.
@@ -69,12 +71,11 @@ def synchronous(
     the video does so in the data set, though frames that are spread over it need not be equally far apart.
 
     Args:
-        dataset: Without views.
-        recordings: One a camera, by name.
-        numbers: Of the frames, ascending.
+        dataset: Data set that has no views yet.
+        recordings: One recording a camera, sorted by name.
+        numbers: Numbers of the frames, ascending.
         where: What lists the frames, for messages.
-        background, lazy, strict: As for `drgs.data.load`.
-
+        background, lazy, strict: Options of `drgs.data.load`.
     Raises:
         FileNotFoundError: Too few of the images are there.
         ValueError: Images of another shape than their camera's, or of several sizes in one camera.

@@ -1,8 +1,8 @@
-"""Dynamic 3D Gaussians' data sets (Luiten et al., 3DV 2024): ``train_meta.json`` and images in ``ims``.
+"""Dynamic 3D Gaussians' data sets (Luiten et al., 3DV 2024): `train_meta.json` and images in `ims`.
 
-Lists by time and camera: ``fn`` (an image below ``ims``), ``k`` (3x3), ``w2c`` (4x4, world to camera, OpenCV's axes)
-and ``cam_id``; ``w`` and ``h`` of all. Where there is a ``test_meta.json``, its cameras are for testing;
-``init_pt_cld.npz`` has points (x, y, z, r, g, b, whether they move).
+Lists by time and camera: `fn` (an image below `ims`), `k` (3x3), `w2c` (4x4, world to camera, OpenCV's axes)
+and `cam_id`; `w` and `h` of all. Where there is a `test_meta.json`, its cameras are for testing;
+`init_pt_cld.npz` has points (x, y, z, r, g, b, whether they move).
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.capture import Focus
 from drgs.data.checks import file_inside, read_npz, repaired_pose
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
-from drgs.data.views import Dataset
 from drgs.guards.camera_checks import check_distance
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["META", "load_train_meta"]
+__all__ = ["TRAIN_META", "load_train_meta"]
 
-META = "train_meta.json"
+_META = "train_meta.json"
 _TEST = "test_meta.json"
 _POINTS = "init_pt_cld.npz"
 _IMAGES = "ims"
@@ -39,28 +40,28 @@ def load_train_meta(
     lazy: bool = False,
     points: bool = True,
     strict: bool = False,
-    **_,
 ) -> Dataset:
-    """Load a data set of synchronous cameras. A camera is named by its ``cam_id``; frame k is the k-th of the lists.
+    """Load a data set of synchronous cameras. A camera is named by its `cam_id`; frame k is the k-th of the lists.
 
     Args:
-        path: the folder, or the JSON file.
-        background, times, lazy, points, strict: see `drgs.data.load`.
-
+        path: The folder, or the JSON file.
+        background, times, lazy, points, strict: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file, or too few of the images.
-        ValueError: broken JSON, lists of different lengths, a pose that is not one, or camera-to-world matrices.
+        FileNotFoundError: No such file, or too few of the images.
+        ValueError: Broken JSON, lists of different lengths, a pose that is not one, or camera-to-world matrices.
     """
-    file = path if path.is_file() else path / META
+    file = path if path.is_file() else path / _META
     folder = file.parent
     taken, count = _cameras(file)
     stated = {}
-    if (folder / _TEST).is_file() and file.name == META:
+    if (folder / _TEST).is_file() and file.name == _META:
         stated, tested = _cameras(folder / _TEST)
         if tested != count:
-            raise ValueError(f"{folder / _TEST}: must have the {count} times of {META}, has {tested}; cut one")
+            raise ValueError(f"{folder / _TEST}: must have the {count} times of {_META}, has {tested}; cut one")
         if twice := sorted(set(taken) & set(stated)):
-            raise ValueError(f"{folder / _TEST}: must have other cameras than {META}, {twice[0]} is in both; remove it")
+            raise ValueError(
+                f"{folder / _TEST}: must have other cameras than {_META}, {twice[0]} is in both; remove it"
+            )
     xyz = colors = None
     if (folder / _POINTS).is_file() and points:
         xyz, colors = _points(folder / _POINTS)
@@ -75,6 +76,11 @@ def load_train_meta(
     source = "" if xyz is None else f"{_POINTS}, {len(xyz)} points"
     dataset = Dataset(path, "train_meta", [], xyz, colors, source)
     return synchronous(dataset, recordings, numbers, where=file, background=background, lazy=lazy, strict=strict)
+
+
+TRAIN_META = Format(
+    lambda path: path.name == _META if path.is_file() else (path / _META).is_file(), load_train_meta, (_META,)
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +146,7 @@ def _points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     rows = rows[np.isfinite(rows[:, :6]).all(axis=1)]
     if not len(rows):
         raise ValueError(f"{file}: data must have a row of finite numbers, has none; remove the file")
+    # Colors of converted point clouds may leave [0, 1] by rounding.
     return rows[:, :3].astype(np.float64), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)
 
 

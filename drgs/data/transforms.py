@@ -1,5 +1,5 @@
-"""Nerfstudio, instant-ngp and Blender data sets: ``transforms.json`` or
-``transforms_{train,val,test}.json``.
+"""Nerfstudio, instant-ngp and Blender data sets: `transforms.json` or
+`transforms_{train,val,test}.json`.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.data.checks import IMAGE_SUFFIXES, check_last_row, file_inside, image_size, inverse_pose, repaired_pose
+from drgs.data.dataset import Dataset
+from drgs.data.formats import Format
 from drgs.data.points import read_point_ply
+from drgs.data.resizing import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME
-from drgs.data.view_checks import fit_to_image, go_on_without, make_unique
-from drgs.data.views import Dataset, View
+from drgs.data.view_checks import go_on_without, make_unique
+from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 from drgs.guards.foreign import is_file
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["find_transforms", "load_transforms"]
+__all__ = ["TRANSFORMS", "load_transforms"]
 
 _SPLITS = ("train", "val", "test")
 _LENSES = {
@@ -35,7 +38,7 @@ _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
 
 
-def find_transforms(path: Path) -> list[Path]:
+def _files(path: Path) -> list[Path]:
     """The transforms files of a data set: one, or one a split; empty if there are none."""
     if path.is_file():
         return [path]
@@ -53,25 +56,23 @@ def load_transforms(
     points: bool = True,
     strict: bool = False,
     test_cameras: tuple[str, ...] | None = None,
-    **_,
 ) -> Dataset:
-    """Load a ``transforms.json`` data set (OpenGL camera axes).
+    """Load a `transforms.json` data set (OpenGL camera axes).
 
     Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
-    camera_model and k1, k2, k3, k4, p1, p2. Frames may state their ``time``, and name ``mask_path`` and
-    ``depth_file_path`` (z-depth; unit from ``depth_unit_scale_factor``, else millimeters for images and scene units for
-    ``.npy``).
+    camera_model and k1, k2, k3, k4, p1, p2. Frames may state their `time`, and name `mask_path` and
+    `depth_file_path` (z-depth; unit from `depth_unit_scale_factor`, else millimeters for images and scene units for
+    `.npy`).
 
     Args:
-        path: the folder, or one JSON file.
-        background: color that images with alpha are composited on.
-        test_every, test_offset, lazy, points, strict, test_cameras: see `drgs.data.load`.
-
+        path: The folder, or one JSON file.
+        background: Color that images with alpha are composited on.
+        test_every, test_offset, lazy, points, strict, test_cameras: See `drgs.data.load`.
     Raises:
-        FileNotFoundError: no such file, too few of the images that it names, or a mask or depth map is missing.
-        ValueError: broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
+        FileNotFoundError: No such file, too few of the images that it names, or a mask or depth map is missing.
+        ValueError: Broken JSON, a frame without what it needs, a pose that is not one, mixed sizes.
     """
-    files = find_transforms(path)
+    files = _files(path)
     if not files:
         raise FileNotFoundError(
             f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
@@ -109,6 +110,14 @@ def load_transforms(
     dataset.colors = colors
     dataset.point_source = source
     return dataset
+
+
+TRANSFORMS = Format(
+    lambda path: path.is_dir() and bool(_files(path)),
+    load_transforms,
+    ("transforms.json", "transforms_{train,val,test}.json"),
+    suffix=".json",
+)
 
 
 def _name_cameras(dataset: Dataset, times: list[Any]) -> None:

@@ -26,11 +26,10 @@ _log = logging.getLogger(__name__)
 
 
 def lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the
-    photo did not see.
+    """OpenCV remap tables of an undistortion (columns, rows) and the pixels (H,W) bool that the photo did not see.
 
     Raises:
-        ValueError: the photo saw next to nothing of its own undistorted image.
+        ValueError: The photo saw next to nothing of its own undistorted image.
     """
     *maps, lost = _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
     if lost > _LOST_MAX:
@@ -49,9 +48,11 @@ def undistorted_map(values: torch.Tensor, camera: Camera) -> torch.Tensor:
     h, w = values.shape[1:]
     columns, rows, _ = lens_maps(camera.resized(w, h))
     places = np.stack([(columns + 0.5) * (2 / w) - 1, (rows + 0.5) * (2 / h) - 1], axis=-1)
+    # grid_sample wants places of the type of what it samples, here float32: a map has at most thousands of cells.
     grid = torch.from_numpy(places.astype(np.float32))[None]
     moved = torch.empty(values.shape, dtype=values.dtype)
     for start in range(0, len(values), _CHANNELS):
+        # In float32: between cells of float16 a weighted sum would keep three digits.
         part = values[start : start + _CHANNELS].float()[None]
         moved[start : start + _CHANNELS] = torch.nn.functional.grid_sample(
             part, grid, mode="bilinear", padding_mode="border", align_corners=False
@@ -63,7 +64,7 @@ def undistorted_map(values: torch.Tensor, camera: Camera) -> torch.Tensor:
 def _cached_lens_maps(
     K: bytes, width: int, height: int, model: str, distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, float]:
-    """As `_lens_maps`, and the share of pixels that were not seen."""
+    """The tables of `lens_maps`, and the share of pixels that were not seen."""
     matrix = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
     lens = Camera(K=matrix, w2c=np.eye(4), width=width, height=height, model=model, distortion=distortion)
     rays = lens.undistorted().pixel_directions().reshape(-1, 3)

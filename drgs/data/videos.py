@@ -25,7 +25,7 @@ class VideoFrame:
 
     Attributes:
         path: The video.
-        index: Of the frame as it is shown, from 0.
+        index: Number of the frame as it is shown, from 0.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class VideoFile:
 
     Attributes:
         path: The file.
-        width, height: In pixels.
+        width, height: Size in pixels.
         stamps: Milliseconds at which each frame is shown, ascending; empty where the file does not say.
         count: Frames that are shown.
         version: Size and time of change of the file.

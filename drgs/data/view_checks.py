@@ -10,25 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size
-
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.data.views import Dataset, View
+    from drgs.data.dataset import Dataset
+    from drgs.data.views import View
 
-__all__ = [
-    "ASPECT_TOLERANCE",
-    "check_cameras",
-    "check_parallax",
-    "check_times",
-    "fit_to_image",
-    "go_on_without",
-    "make_unique",
-    "nearest_resized",
-    "resized_to",
-]
+__all__ = ["check_cameras", "check_parallax", "check_times", "go_on_without", "make_unique"]
 
-ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
 # of cameras that film what moves (docs/dynamic.md, Data)
 _FEW_PLACES = 4
 _ENOUGH_PLACES = 6
@@ -47,7 +34,6 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
         missing: The images that are not there; nothing is done if there are none.
         left: How many are there.
         strict: Refuse whatever is left.
-
     Raises:
         FileNotFoundError: `strict`, or fewer than 3 are left.
     """
@@ -72,7 +58,7 @@ def check_parallax(views: list[View]) -> None:
     Views of one pose at several times are one place: a camera that stands still before something that moves.
 
     Raises:
-        ValueError: two views or more, all of one pose and of one time (or of none).
+        ValueError: Two views or more, all of one pose and of one time (or of none).
     """
     poses = np.stack([view.camera.c2w for view in views])
     spread = np.abs(poses - poses[0]).max(axis=(1, 2))
@@ -103,7 +89,7 @@ def check_cameras(views: list[View]) -> None:
     pictures by heart.
 
     Args:
-        views: For training, all that there will be. Those of one place alone are `check_parallax`'s.
+        views: All training views that there will be. Those of one place alone are `check_parallax`'s.
     """
     times = {view.camera.time for view in views} - {None}
     centers = np.stack([view.camera.center for view in views])
@@ -132,7 +118,7 @@ def check_times(dataset: Dataset) -> None:
     Times may be in any unit and order, and views may share one.
 
     Raises:
-        ValueError: training views of two times or more, and a view of none.
+        ValueError: Training views of two times or more, and a view of none.
     """
     if not dataset.is_dynamic:
         return
@@ -143,9 +129,9 @@ def check_times(dataset: Dataset) -> None:
             f"{dataset.path}: every view of a scene that moves must have a time, {len(without)} have none (as view "
             f"{without[0]!r}); state all, or remove all for a scene that stands still"
         )
-    first = min(view.camera.time for view in train)
-    last = max(view.camera.time for view in train)
-    beyond = [view.name for view in test if not first <= view.camera.time <= last]
+    times = [view.camera.time for view in train if view.camera.time is not None]
+    first, last = min(times), max(times)
+    beyond = [view.name for view in test if view.camera.time is not None and not first <= view.camera.time <= last]
     if beyond:
         _log.warning(
             "%d of the %d test views are before or after all training views (%g to %g), as %r: nothing says how things "
@@ -168,57 +154,3 @@ def make_unique(views: list[View]) -> None:
             number += 1
             view.name = f"{name}_{number}"
         seen.add(view.name)
-
-
-def fit_to_image(camera: Camera, path: Path, where: str, lazy: bool = False) -> Camera:
-    """The camera at the size of its image file, from the file's header.
-
-    Data sets are often downscaled after calibration, so K is scaled when the shapes agree to 1 %. With `lazy` the file
-    must exist, but is not opened, and the camera stays as it is.
-
-    Raises:
-        FileNotFoundError: no such image.
-        ValueError: not an image, or another shape.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{where}: the image {path} must exist, found none; restore it or drop the view")
-    if lazy:
-        return camera
-    return resized_to(camera, image_size(path), path, where)
-
-
-def resized_to(camera: Camera, size: tuple[int, int], path: Path, where: str) -> Camera:
-    """The camera at the size (width, height) that an image or video has.
-
-    Raises:
-        ValueError: another shape, by more than 1 %.
-    """
-    width, height = size
-    if (width, height) == (camera.width, camera.height):
-        return camera
-    if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
-        raise ValueError(
-            f"{where}: the image {path} must have the shape of its camera "
-            f"({camera.width}x{camera.height}), "
-            f"got {width}x{height}; give this view its own intrinsics"
-        )
-    return camera.resized(width, height)
-
-
-def nearest_resized(data: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
-    """A mask, label image or depth map (H,W) at the size (width, height) of its image, without mixing pixels.
-
-    Args:
-        path: The file that it is of, for the message.
-
-    Raises:
-        ValueError: another shape than the image's, by more than 1 %.
-    """
-    import cv2
-
-    height, width = data.shape
-    if abs(width * size[1] / (height * size[0]) - 1) > ASPECT_TOLERANCE:
-        raise ValueError(
-            f"{path}: must have the shape of its image ({size[0]}x{size[1]}), got {width}x{height}; export it again"
-        )
-    return data if (width, height) == size else cv2.resize(data, size, interpolation=cv2.INTER_NEAREST_EXACT)

@@ -1,4 +1,4 @@
-"""Views and data sets: cameras with images, masks, depth and feature maps and labels that are read when asked for."""
+"""Views: cameras with images, masks, depth and feature maps and labels, which are read when they are asked for."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import read_image, read_npy, unit_range
 from drgs.data.masks import read_mask
+from drgs.data.resizing import fit_to_image, nearest_resized, resize_area
 from drgs.data.semantics import Semantics, plain_labels
-from drgs.data.splits import SplitRule
 from drgs.data.undistortion import lens_maps, undistorted_map
 from drgs.data.videos import VideoFrame
-from drgs.data.view_checks import fit_to_image, nearest_resized
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Dataset", "View"]
+__all__ = ["View"]
 
 
 @dataclass
@@ -29,19 +28,19 @@ class View:
     """One photograph: its camera and where its files are. Nothing is decoded before a method asks.
 
     Attributes:
-        camera: the camera as calibrated, of the size of the image file, lens included.
-        name: unique in the data set; the image's path below the image folder without its suffix.
+        camera: The camera as calibrated, of the size of the image file, lens included.
+        name: Unique in the data set; the image's path below the image folder without its suffix.
         image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0
             is unknown.
-        depth_scale: scene units in one unit of the depth file.
-        background: color in [0,1] that images with an alpha channel are composited on.
-        split: ``train``, ``val`` or ``test`` where the data set itself says so, else empty.
-        label_path: image of the class of each pixel, or None.
-        teacher_path: feature map of a teacher, or None.
-        semantics: what their numbers mean, as in the data set; None without.
-        camera_name: of the camera that took it, where a data set has several synchronous cameras, as ``cam03``; else
-            empty.
-        frame: the frame of a video, where the photograph is one; `image_path` is None then.
+        depth_scale: Scene units in one unit of the depth file.
+        background: Color in [0,1] that images with an alpha channel are composited on.
+        split: `train`, `val` or `test` where the data set itself says so, else empty.
+        label_path: Image of the class of each pixel, or None.
+        teacher_path: Feature map of a teacher, or None.
+        semantics: What their numbers mean, as in the data set; None without.
+        camera_name: Name of the camera that took it, as `cam03`, where a data set has several synchronous cameras;
+            else empty.
+        frame: The frame of a video, where the photograph is one; `image_path` is None then.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
@@ -67,14 +66,14 @@ class View:
 
     @property
     def stem(self) -> str:
-        """What its maps and labels are called like: the image's name without its suffix, or the number of the frame."""
+        """Stem of the names of its maps and labels: the image's name without its suffix, or the number of the frame."""
         return self.name.rpartition("/")[2] if self.image_path is None else self.image_path.stem
 
     def checked(self) -> View:
         """The view with its camera at the size of its image file, whose header is read now if it has not been.
 
         Raises:
-            FileNotFoundError, ValueError: as `fit_to_image`.
+            FileNotFoundError, ValueError: As `fit_to_image`.
         """
         if self.is_checked or self.image_path is None:
             return self
@@ -82,16 +81,14 @@ class View:
         return dataclasses.replace(self, camera=camera, is_checked=True)
 
     def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
-        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted,
-        area-resized.
+        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted, area-resized.
 
-        The result belongs to ``camera.undistorted().resized(width, height)``.
+        The result belongs to `camera.undistorted().resized(width, height)`.
 
         Args:
-            width, height: pixels; the camera's own size if left out.
-
+            width, height: Pixels; the camera's own size if left out.
         Raises:
-            FileNotFoundError, ValueError: the file is missing, no image, or not of the camera's
+            FileNotFoundError, ValueError: The file is missing, no image, or not of the camera's
                 size.
         """
         import cv2
@@ -115,30 +112,26 @@ class View:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
-        return _resize_area(data, *self._size(width, height))
+        return resize_area(data, *self._size(width, height))
 
     def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.
 
-        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask
-        file.
+        Pixels of an undistorted image that the photo did not see are 0, also where there is no mask file.
         """
-        if self.mask_path is None and not (self.camera.is_distorted and lens_maps(self.camera)[2] is not None):
+        unseen = self._unseen()
+        if self.mask_path is None and unseen is None:
             return None
         if self.mask_path is None:
             data = np.ones((self.camera.height, self.camera.width), dtype=np.float32)
         else:
             data = self._nearest(read_mask(self.mask_path), self.mask_path)
-        if self.camera.is_distorted:
-            unseen = lens_maps(self.camera)[2]
-            if unseen is not None:
-                data = np.where(unseen, np.float32(0), data)
-        return _resize_area(data, *self._size(width, height))
+        if unseen is not None:
+            data = np.where(unseen, np.float32(0), data)
+        return resize_area(data, *self._size(width, height))
 
     def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is
-        no depth map.
-        """
+        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map."""
         import cv2
 
         if self.depth_path is None:
@@ -148,20 +141,21 @@ class View:
             raw = raw[..., 0]
         if raw.ndim != 2:
             raise ValueError(f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; convert it")
+        # Depths are stored as integers, or as float64 that no picture has the digits of.
         data = raw.astype(np.float32) * np.float32(self.depth_scale)
         data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
         data = self._nearest(data, self.depth_path)
-        if self.camera.is_distorted and lens_maps(self.camera)[2] is not None:
-            data = np.where(lens_maps(self.camera)[2], np.float32(0), data)
+        if (unseen := self._unseen()) is not None:
+            data = np.where(unseen, np.float32(0), data)
         # Averaging depths across an edge, or with unknown zeros, would invent surfaces.
         return cv2.resize(data, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
     def labels(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """(H,W) int64 classes: 0 where there is no label, k for ``semantics.classes.names[k - 1]``; undistorted,
+        """(H,W) int64 classes: 0 where there is no label, k for `semantics.classes.names[k - 1]`; undistorted,
         nearest pixel; None if there is no label image.
 
         Raises:
-            FileNotFoundError, ValueError: no label image, another shape than the photo's, or numbers of no class.
+            FileNotFoundError, ValueError: No label image, another shape than the photo's, or numbers of no class.
         """
         import cv2
 
@@ -174,8 +168,8 @@ class View:
             labels = self.semantics.numbered(raw, self.label_path)
         # OpenCV has no int64; float32 holds all numbers of 16 bits.
         labels = self._nearest(labels.astype(np.float32), self.label_path)
-        if self.camera.is_distorted and lens_maps(self.camera)[2] is not None:
-            labels = np.where(lens_maps(self.camera)[2], np.float32(0), labels)
+        if (unseen := self._unseen()) is not None:
+            labels = np.where(unseen, np.float32(0), labels)
         return cv2.resize(labels, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT).astype(np.int64)
 
     def teacher(self) -> torch.Tensor | None:
@@ -186,7 +180,7 @@ class View:
         a process looks through it for NaN.
 
         Raises:
-            FileNotFoundError, ValueError: no such map, of other channels than the data set's, or larger than the photo.
+            FileNotFoundError, ValueError: No such map, of other channels than the data set's, or larger than the photo.
         """
         from drgs.features.teacher import used_map
 
@@ -196,6 +190,10 @@ class View:
         if self.semantics is not None:
             self.semantics.check_map(values, self.teacher_path, self.camera)
         return undistorted_map(values, self.camera) if self.camera.is_distorted else values
+
+    def _unseen(self) -> np.ndarray | None:
+        """(H,W) bool: pixels of the undistorted image that the photo did not see; None if it saw all."""
+        return lens_maps(self.camera)[2] if self.camera.is_distorted else None
 
     def _size(self, width: int | None, height: int | None) -> tuple[int, int]:
         return width or self.camera.width, height or self.camera.height
@@ -217,106 +215,3 @@ class View:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return data
-
-
-@dataclass
-class Dataset:
-    """Views of one scene and, where the data set has them, its points.
-
-    Attributes:
-        path: what was loaded.
-        format: ``colmap``, ``transforms``, ``llff``, ``replica``, ``neu3d``, ``cameras`` or ``train_meta``.
-        views: in the order of the data set.
-        points: (P,3) float64 world points, or None.
-        colors: (P,3) float32 in [0,1], or None.
-        point_source: where the points come from, one line, empty without points.
-        test_every: every how many views one is held out.
-        test_offset: index, by name, of the first view that is held out.
-        absent: views that the data set lists, but whose image is not there; they have no camera, and count in `split`
-            alone, which therefore stays the same whatever is missing.
-        semantics: a teacher's maps, labels and classes, or None where there are none.
-        test_cameras: names of the cameras that are held out at all times, which wins over the other rules; None or
-            empty: the other rules hold.
-        frames: numbers of the frames that were used, the same of each video or camera, one for each of `times`; empty
-            where there are no synchronous cameras.
-    """
-
-    path: Path
-    format: str
-    views: list[View]
-    points: np.ndarray | None = None
-    colors: np.ndarray | None = None
-    point_source: str = ""
-    test_every: int = 8
-    absent: list[View] = dataclasses.field(default_factory=list)
-    test_offset: int = 0
-    semantics: Semantics | None = None
-    test_cameras: tuple[str, ...] | None = None
-    frames: tuple[int, ...] = ()
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """The distinct times of the views, ascending; empty if none has one."""
-        return _times(self.views)
-
-    @property
-    def is_dynamic(self) -> bool:
-        """Whether the training views were taken at two times or more."""
-        return len(_times(self.split()[0])) >= 2
-
-    @property
-    def camera_names(self) -> tuple[str, ...]:
-        """The names of synchronous cameras, sorted; empty where views are photographs of their own."""
-        return tuple(sorted({view.camera_name for view in (*self.views, *self.absent)} - {""}))
-
-    def split(
-        self,
-        test_every: int | None = None,
-        test_offset: int | None = None,
-        test_cameras: tuple[str, ...] | None = None,
-    ) -> tuple[list[View], list[View]]:
-        """(train, test) views, both sorted by name, by the rule that `split_rule` names.
-
-        Cameras that are held out by name win over a split that the data set's own files state (`View.split`), and this
-        wins over both numbers.
-
-        Args:
-            test_every: 8 holds out every 8th view, 0 none; the data set's own number if left out.
-            test_offset: 2 holds out the 3rd view first; the data set's own number if left out, 0 if `test_every` is
-                given alone.
-            test_cameras: names of the cameras that are held out at all times; the data set's own if left out.
-        Raises:
-            ValueError: If a number is out of range, the offset lies beyond the last view, or there is no such camera.
-        """
-        train, test = self._rule(test_every, test_offset, test_cameras).parts([*self.views, *self.absent])
-        there = {id(view) for view in self.views}
-        return [view for view in train if id(view) in there], [view for view in test if id(view) in there]
-
-    def split_rule(
-        self,
-        test_every: int | None = None,
-        test_offset: int | None = None,
-        test_cameras: tuple[str, ...] | None = None,
-    ) -> str:
-        """The rule of `split` in words, to be recorded with results."""
-        return self._rule(test_every, test_offset, test_cameras).words()
-
-    def _rule(self, test_every: int | None, test_offset: int | None, test_cameras: tuple[str, ...] | None) -> SplitRule:
-        if test_offset is None:
-            test_offset = self.test_offset if test_every is None else 0
-        every = self.test_every if test_every is None else test_every
-        cameras = self.test_cameras if test_cameras is None else test_cameras
-        return SplitRule.of([*self.views, *self.absent], len(self.views), every, test_offset, cameras or ())
-
-
-def _times(views: list[View]) -> tuple[float, ...]:
-    return tuple(sorted({view.camera.time for view in views if view.camera and view.camera.time is not None}))
-
-
-def _resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
-    import cv2
-
-    if data.shape[1::-1] == (width, height):
-        return np.ascontiguousarray(data)
-    shrinks = width <= data.shape[1] and height <= data.shape[0]
-    return cv2.resize(data, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

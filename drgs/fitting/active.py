@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,7 +54,7 @@ class ActiveViews:
     Attributes:
         active: How views are chosen.
         views: The training split, in its order; what has not been picked has not been opened.
-        timetable: When one is picked, and among which.
+        timetable: Steps at which views are picked, and among which.
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
         measured: One record for each number of views at which the held-out views were measured on the way.
@@ -78,6 +77,7 @@ class ActiveViews:
         Raises:
             ValueError: As `Timetable.of`, and if there are no views, or no such policy.
         """
+        from drgs.gain import criterion_named
         from drgs.select import policy_named
 
         active = config.selection
@@ -90,6 +90,7 @@ class ActiveViews:
         self._config = config
         self._workers = workers
         policy_named(active.policy)  # else the first pick would be where that is found out
+        criterion_named(active.scoring.criterion, "--criterion")
         self.timetable = Timetable.of(self.views, config, moves)
         first = len(self.timetable.start)
         last = len(self.timetable.start) + self.timetable.add - 1
@@ -147,7 +148,7 @@ class ActiveViews:
 
         Args:
             frame: Its photograph.
-            scene: As it is now, seen at the time of the view.
+            scene: Scene at this step, seen at the time of the view.
         Returns:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
@@ -238,7 +239,7 @@ class ActiveViews:
 
         Args:
             step: Steps done.
-            result: Its.
+            result: Metrics that it returned.
         """
         labels = (result.get("segmentation") or {}).get("run") or {}
         record = {"views": len(self.chosen), "step": step, "mean": result["mean"], "median": result["median"]}
@@ -249,10 +250,10 @@ class ActiveViews:
         """Choose one more view, then read it.
 
         Args:
-            scene: As it is now, seen by each view at its time.
+            scene: Scene at this step, seen by each view at its time.
             frames: The photographs seen so far; of these, too, only the cameras matter, and the masks.
             step: Steps done.
-            decoder: Of the features as it is now; they count in its metric.
+            decoder: Decoder of the features at this step; they count in its metric.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """
@@ -279,42 +280,21 @@ class ActiveViews:
                 progress=bar.update,
                 workers=self._workers,
             )
-        best = selection.picks[0]
-        index = left[best.index]
-        count = len(left)
-        unseen: Sequence[float | None] = selection.unseen or [None] * count
-        scored = zip(left, selection.scores, selection.parts or [{}] * count, unseen, strict=True)
+        index = left[selection.picks[0].index]
+        views = [{"index": i, "name": self.views[i].name, **self._where(i)} for i in left]
         record = {
             "number": len(self.picks) + 1,
             "step": step,
-            "index": index,
-            "name": best.name,
-            **self._where(index),
-            "score": best.score,
-            "parts": best.parts,
-            "margin": best.margin,
+            **selection.picks_json(views)[0],
             "seconds": selection.seconds,
             "policy": active.policy,
             "criterion": scoring.criterion if active.policy == "fisher" else None,
             "prior": scoring.prior_of(active.policy).to_json(),
-            "blocks": selection.blocks,
-            "semantics": selection.semantics,
-            "network": selection.network,
-            "combine": selection.combine,
+            **selection.blocks_json(),
             "gaussians": len(scene.at(frames[0].camera.time)),
             "left_out": selection.left_out,
             "notes": selection.notes,
-            "candidates": [
-                {
-                    "index": i,
-                    "name": self.views[i].name,
-                    **self._where(i),
-                    "score": score,
-                    "parts": parts,
-                    "unseen": share,
-                }
-                for i, score, parts, share in scored
-            ],
+            "candidates": selection.candidates_json(views, no_parts={}),
         }
         self.chosen.append(index)
         self.picks.append(record)

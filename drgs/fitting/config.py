@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.guards.arguments import check_fields
 from drgs.guards.records import Record, ways_of
-from drgs.information.choices import POLICY_NAMES
+from drgs.information.choices import POLICIES, check_named
 from drgs.information.prior import Prior
 from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings
@@ -59,6 +59,7 @@ FeatureSize = Literal["image", "teacher"]
 Dynamics = Literal["auto", "ignore"]
 FieldPreset = Literal["neu3d", "dnerf"]
 
+_FAST = RenderSettings.preset("fast")
 _COUNT = (1, 10**9)
 _SHARE = (0.0, 1.0)
 _RATE = (0.0, 1e6)
@@ -132,7 +133,6 @@ class DensityConfig(Record):
         grow_until: Fraction of the steps at which the budget of Gaussians is reached, growing at a constant rate.
         noise: Strength of the noise by which Gaussians explore; 0 is none, 5e5 is that of MCMC.
         jitter: Displacement of copies, in their own standard deviations.
-
     Reference:
         [1] Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
     """
@@ -234,7 +234,6 @@ class FeatureConfig(Record):
         couple_features: Let features move the geometry, too; else only colors do.
         feature_resolution: Features are rendered at the size of the image and then reduced, or at that of the teacher's
             map: faster.
-
     Reference:
         [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
     """
@@ -282,7 +281,6 @@ class MotionConfig(Record):
         smooth_weight: Weight of the field's smoothness along time.
         plane_weight: Weight of the smoothness of the field's planes of space (x and y, x and z, y and z).
         l1_time_weight: Weight of the L1 distance of the field's planes of time from 1, at which they change nothing.
-
     Reference:
         [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
     """
@@ -356,7 +354,7 @@ class SelectionConfig(Record):
         info_pixels: Information is computed on views of at most this many pixels; default as in the fit.
         pick_points: Points that a picked view adds: triangulated, and where nothing is yet; auto: none with
             --init-points all.
-        restart: After a pick begin again at points of all views so far: until these are 1,000 (auto), always, or never.
+        restart: Begin again after a pick at points of all views so far: until these are 1,000 (auto), always, never.
         measure: Numbers of training views at which the held-out views are measured, too, just before the next pick.
     """
 
@@ -374,16 +372,12 @@ class SelectionConfig(Record):
     where: ClassVar[str] = "active"
 
     def __post_init__(self) -> None:
-        if ":" not in str(self.policy) and self.policy not in POLICY_NAMES:
-            known = ", ".join(POLICY_NAMES)
-            raise ValueError(f"active: policy must be one of {known}, or package.module:function, got {self.policy!r}")
+        check_named("active", POLICIES, self.policy)
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         check_fields("active", self, dict.fromkeys(("initial", "add", "every", "info_pixels", "measure"), _COUNT))
-        usual = Scoring()
-        for name in ("settings", "semantics"):
-            if getattr(self.scoring, name) != getattr(usual, name):
-                raise ValueError(f"active: scoring must leave its {name} to the fit, got others; drop them")
+        if self.scoring.settings != Scoring.settings or self.scoring.semantics is not None:
+            raise ValueError("active: scoring must leave settings and semantics to the fit, got others; drop them")
 
     def scoring_of(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
         """As `drgs.select` takes it, for views that are rendered with these settings."""
@@ -417,7 +411,7 @@ def selection_of_flat(fields: Mapping[str, Any]) -> SelectionConfig:
     Raises:
         ValueError: If a field is unknown or out of range.
     """
-    known = {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
+    known: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
     relative = known.pop("relative_prior", False)
     prior = known.pop("prior", None)
     return SelectionConfig.of(**known, prior=Prior.given(prior, relative))
@@ -451,7 +445,7 @@ class FitConfig(Record):
         ValueError: If a field has another type or is out of its range.
     """
 
-    settings: RenderSettings = dataclasses.field(default_factory=lambda: RenderSettings.preset("fast"))
+    settings: RenderSettings = _FAST
     max_steps: int = 3000
     seed: int = 0
     sh_degree: Degree = 3
@@ -512,7 +506,8 @@ def _with_flat_fields(kind: type[FitConfig]) -> None:
 
 def _read_flat(self: Record, name: str) -> Any:
     """A field of a part, read of the whole."""
-    way = ways_of(type(self)).get(name, ())
+    kind: Any = type(self)
+    way = ways_of(kind).get(name, ())
     value: Any = self
     if len(way) < 2:
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

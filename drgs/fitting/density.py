@@ -52,9 +52,9 @@ def relocate(rows: GaussianRows, min_opacity: float, jitter: float, generator: t
 
     Args:
         rows: Changed in place; moments of all that moved, and of opacity and scale of all that were divided, are 0.
-        min_opacity: Below it a Gaussian is dead.
+        min_opacity: Opacity below which a Gaussian is dead.
         jitter: Standard deviation of a copy's displacement, in units of the Gaussian's own.
-        generator: Of all random choices.
+        generator: Generator of all random choices.
     """
     opacity = rows.tensors["logit_opacities"].detach().sigmoid()  # for a decision, which has no gradient
     is_dead = opacity <= min_opacity
@@ -84,9 +84,9 @@ def explore(rows: GaussianRows, rate: float, extent: float, strength: float, gen
     Args:
         rows: Changed in place.
         rate: Relative learning rate of the means at this step (1.6e-4 to 1.6e-6 in 3DGS).
-        extent: Of the scene; the noise of [1] depends on the unit of length, here it does not.
+        extent: Extent of the scene; the noise of [1] depends on the unit of length, here it does not.
         strength: Factor; 5e5 in [1].
-        generator: Of the noise.
+        generator: Generator of the noise.
     """
     t = rows.tensors
     # A gate that is open below an opacity of about 0.005: visible Gaussians stay where the gradient puts them.

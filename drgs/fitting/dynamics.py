@@ -60,7 +60,7 @@ class Motion:
     """What a fit has besides its parts if things move: stages, the field, and who moves.
 
     Args:
-        config: Of the fit.
+        config: Configuration of the fit.
         times: All that views of the data set have, sorted; at least two.
     Attributes:
         field: None in the static stage.
@@ -100,8 +100,8 @@ class Motion:
 
         Args:
             rows: Get gates.
-            parts: Of the static stage.
-            extent: Of the scene.
+            parts: Parts of the static stage.
+            extent: Extent of the scene, in world units.
         Returns:
             With the field's networks, terms and rates, and a scene that moves.
         """
@@ -260,8 +260,8 @@ def moving_scene(
 
     Args:
         gaussians: Its canonical Gaussians.
-        tensors, header: Of the checkpoint.
-        networks: As `saved_networks` gives them.
+        tensors, header: Contents of the checkpoint.
+        networks: Result of `saved_networks`.
         where: It, for messages.
     Raises:
         ValueError: If the field is missing, or its tensors have other shapes than its sizes ask for.

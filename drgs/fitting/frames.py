@@ -63,8 +63,8 @@ def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> 
     """The data set of a fit: its frames, split and background are those that the fit is told.
 
     Args:
-        path: Of the data set.
-        config: Of the fit.
+        path: The data set.
+        config: Configuration of the fit.
         options: Others of `drgs.data.load`.
     Raises:
         FileNotFoundError, ValueError: As `drgs.data.load`.
@@ -85,8 +85,8 @@ def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[
 
     Args:
         views: Whatever their sizes; those whose image has not been looked at yet are checked now.
-        max_pixels: Of one image; smaller ones keep their size.
-        mask: As in `FitConfig`.
+        max_pixels: Pixels of one image at most; smaller ones keep their size.
+        mask: Use of masks, as `DataConfig` has it.
     """
     with Bar("photographs", len(views)) as bar:
         return _frames(views, max_pixels, mask, bar)

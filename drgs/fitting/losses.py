@@ -43,7 +43,7 @@ class LossTerm(Protocol):
         Args:
             output: What `drgs.render` shows of `gaussians`.
             frame: The photograph.
-            gaussians: As they are at this step, and at the time of the view; gradients reach what is fitted.
+            gaussians: Gaussians at this step and at the time of the view; gradients reach what is fitted.
         Returns:
             A scalar with the term's weight in it, or None where the term has nothing to say about this view.
         """

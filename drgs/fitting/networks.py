@@ -23,10 +23,10 @@ class Network:
     Parts of a module with rates of their own are networks of their own: `Network("field.grid", field.grid, 1.6e-3)`.
 
     Attributes:
-        name: Of its entries in a checkpoint: `NAME.parameter.*` (parameters and buffers) and `NAME.adam.*`.
+        name: Name of its entries in a checkpoint: `NAME.parameter.*` (parameters and buffers) and `NAME.adam.*`.
         module: What losses, or the scene, call.
         rate: Its learning rate.
-        factors: Of the learning rate of some parameters, by name, e.g. of those that have a unit of length in them.
+        factors: Factors of the learning rate of some parameters, by name, e.g. of those that have a unit of length.
         fused: One pass of the optimizer over the memory of a parameter, for large ones; rounds in other places.
         optimizer: Adam, with torch's defaults.
     """
@@ -68,7 +68,7 @@ class Network:
         """Continue from `state`; other keys are ignored.
 
         Args:
-            tensors: Of a checkpoint.
+            tensors: Tensors of a checkpoint.
             where: It, for the message.
         Raises:
             ValueError: If a parameter is missing, or has another shape.

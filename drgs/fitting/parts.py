@@ -23,7 +23,7 @@ class Parts:
     """What a fit is made of.
 
     Attributes:
-        terms: Of the loss, in the order in which they are added up.
+        terms: Terms of the loss, in the order in which they are added up.
         rates: Learning rates by the name of the tensor in `GaussianRows`.
         networks: What is fitted beside the Gaussians, and called by terms or by the scene.
         scene: What is rendered of the rows: their Gaussians, or a scene that has others at the time of a view.
@@ -44,9 +44,9 @@ def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> P
     """The parts of a fit with a config.
 
     Args:
-        config: Of the fit.
-        extent: Of the scene, its unit of length.
-        channels: Of the maps of a teacher, to which features and a decoder are fitted; None: no features.
+        config: Configuration of the fit.
+        extent: Extent of the scene, its unit of length.
+        channels: Channels of the maps of a teacher, to which features and a decoder are fitted; None: no features.
     """
     rates: dict[str, Rate] = {
         "means": lambda part: means_rate(config, part) * extent,

@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.files import CONFIG_SCHEMA, load_ply, load_state
+from drgs.files import CONFIG_SCHEMA, Run, load_ply, load_state
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
@@ -72,7 +73,7 @@ class FitRecord:
         train, test: Names of the views of the two splits; of an active run, `train` are those it began with.
         config: How it was fitted.
         semantics: What its features were fitted to; None where it has none.
-        times: Of the views, sorted, where it was fitted to what moves; else none.
+        times: Times of the views, sorted, where it was fitted to what moves; else none.
     """
 
     data: Path
@@ -99,11 +100,10 @@ class LoadedRun:
     """What a run holds.
 
     Attributes:
-        gaussians: As the last checkpoint has them, or the PLY where there is none that can be read; at rest, where they
-            move.
+        gaussians: Gaussians of the last checkpoint, or of the PLY where none can be read; at rest, where they move.
         record: How they were fitted.
-        step: Of the checkpoint; None where only the PLY could be read.
-        seconds, bad_steps: Of the fit up to there, what its steps took and how many were skipped; None as `step`.
+        step: Step of the checkpoint; None where only the PLY could be read.
+        seconds, bad_steps: Seconds that the steps up to there took, and how many of these were skipped; None as `step`.
         networks: What was fitted beside them, by name: what `torch.nn.Module.load_state_dict` takes.
         decoder: What makes a teacher's features of the Gaussians'; None where it has none, or only the PLY could be
             read.
@@ -128,16 +128,22 @@ class LoadedRun:
         return self.gaussians if self.moving is None else self.moving
 
 
-def load_run(run: Run) -> LoadedRun:
+def load_run(run: Run | str | os.PathLike) -> LoadedRun:
     """What a run holds, from its last checkpoint; point_cloud.ply holds less, and is for other programs.
+
+        scene = drgs.load_run("runs/scene").scene
+        image = drgs.render(scene, camera).rgb
 
     Where the checkpoint is missing or damaged, the PLY is taken. Where both are there but differ, because somebody has
     edited the PLY, the checkpoint is taken; `drgs.load_ply` reads the PLY. Either way the log has one line about it.
 
+    Args:
+        run: Run folder.
     Raises:
         FileNotFoundError: If it is no run folder, or has neither a checkpoint nor a PLY.
         ValueError: If config.json or the classes' embeddings are damaged, or everything else.
     """
+    run = run if isinstance(run, Run) else Run(run)
     record = fit_record(run)
     known = record.semantics
     decoder = None
@@ -330,8 +336,8 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     """Refuse a checkpoint that no fit has written.
 
     Args:
-        path: For the message.
-        tensors, header: As `drgs.files.load_state` returns them.
+        path: File that messages name.
+        tensors, header: Result of `drgs.files.load_state`.
     Raises:
         ValueError: If the header lacks a field, or a value is of another type or out of range, or a tensor is missing
             or has another shape than the number of Gaussians asks for, or a network has no tensor.
@@ -341,6 +347,12 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     kind |= {"networks": [str]} if "networks" in header else {}
     kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
     check_json(str(path), header, kind, advice)
+    active = (header.get("active") or {}).get("config")  # of versions that wrote it there
+    check_json(str(path), {"active": active}, {"active": (None, dict)}, advice)
+    try:
+        recorded_config(header["config"], active)
+    except (ValueError, NotImplementedError) as error:
+        raise ValueError(f"{path}: {error}; {advice}") from None
     least = {"step": 0, "bad_steps": 0, "start_count": 1, "seconds": 0}
     for name, low in least.items():
         if header.get(name, low) < low:

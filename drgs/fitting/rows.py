@@ -42,7 +42,7 @@ class GaussianRows:
         Args:
             points: (N, 3) world.
             colors: (N, 3) in [0, 1].
-            opacity: Of all of them.
+            opacity: Opacity of all of them.
             scale: Times the root of the mean squared distance to the three nearest points.
             features: Their number D a Gaussian, 0 at the start.
         """

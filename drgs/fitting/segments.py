@@ -31,7 +31,7 @@ class Segmentation:
 
     Attributes:
         reference: `labels` of the data set, or `teacher`.
-        folder: Where that lies in the data set.
+        folder: Folder of these in the data set.
     """
 
     def __init__(self, gaussians: Gaussians, decoder: Decoder, classes: Classes, reference: str, folder: str) -> None:
@@ -127,8 +127,8 @@ def segmentation_of(
     """What to measure of frames: against the data set's labels if any of them has some, else against the teacher's.
 
     Args:
-        gaussians: With features; those of a scene that moves are at rest.
-        decoder, classes, record: Of the run.
+        gaussians: Gaussians with features; those of a scene that moves are at rest.
+        decoder, classes, record: Decoder, classes and teacher of the run.
         frames: That will be measured.
     Returns:
         None where a run has no features; in words why it cannot be measured.
@@ -168,8 +168,8 @@ def teacher_labels(values: torch.Tensor, classes: Classes, width: int, height: i
 
     Args:
         values: (C, h, w).
-        classes: With embeddings.
-        width, height: Of the view.
+        classes: Classes with embeddings.
+        width, height: Size of the view in pixels.
     Returns:
         (H, W) int64, 1..K.
     """
@@ -183,8 +183,8 @@ def feature_colors(gaussians: Gaussians, decoder: Decoder | None) -> FeatureColo
     """Colors of the features of all views alike: of the Gaussians themselves, those that can be seen above all.
 
     Args:
-        gaussians: With features.
-        decoder: Of them; None where they are shown as they are.
+        gaussians: Gaussians with features.
+        decoder: Decoder of the features; None where they are shown as they are.
     """
     assert gaussians.features is not None
     with torch.no_grad():  # for pictures

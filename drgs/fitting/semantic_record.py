@@ -67,8 +67,8 @@ class SemanticRecord:
         """What a fit of a data set with a config would record; None where it fits no features.
 
         Args:
-            dataset: As loaded.
-            config: Of the fit.
+            dataset: Data set that was loaded.
+            config: Configuration of the fit.
             views: Those that may be read at the start: no other's map is looked at, as long as one of them has a map,
                 and never that of a held-out view.
         """
@@ -164,8 +164,8 @@ class SemanticRecord:
         """The fitted decoder.
 
         Args:
-            networks: As `drgs.fitting.networks.saved_networks` finds them in a checkpoint.
-            gaussians: Of the same checkpoint.
+            networks: Networks that `drgs.fitting.networks.saved_networks` finds in a checkpoint.
+            gaussians: Gaussians of the same checkpoint.
             where: It, for the message.
         Raises:
             ValueError: If there is none, or it does not go with the Gaussians' features or the teacher's channels.
@@ -188,8 +188,8 @@ def check_same_teacher(now: SemanticRecord | None, was: SemanticRecord | None, w
     """Refuse to go on with another teacher, or with other classes, than a fit began with.
 
     Args:
-        now: Of the data set and the config; None where no features are fitted.
-        was: Of the checkpoint.
+        now: Record of the data set and the config; None where no features are fitted.
+        was: Record of the checkpoint.
         where: It, for the message.
     Raises:
         ValueError: On the first field that differs.

@@ -40,9 +40,9 @@ class FeatureDistance:
     """gamma times the mean L1 distance between decoded features and the teacher's map, over channels and cells.
 
     Attributes:
-        decoder: From the Gaussians' features to the teacher's.
+        decoder: Map from the Gaussians' features to the teacher's.
         weight: gamma.
-        settings: As the colors are rendered with.
+        settings: Settings that the colors are rendered with.
         size: `image`: of the features in `output`, reduced to the size of the map bilinearly, corners on corners, as in
             [1]; it mixes the 2 x 2 pixels around each cell's place, hence before the decoder, which is linear and mixes
             channels: the same numbers from fewer products. `teacher`: a ray through the middle of each cell.

@@ -31,9 +31,9 @@ def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion 
     """The stages of a fit to views; None if nothing can move in them, or is to: then nothing of it is loaded.
 
     Args:
-        config: Of the fit.
-        train: Of these at least two times make a fit dynamic.
-        test: Whose times the field covers, too.
+        config: Configuration of the fit.
+        train: Training views; two times among them make a fit dynamic.
+        test: Held-out views, whose times the field covers, too.
     Raises:
         ValueError: If some views have a time and others do not.
     """

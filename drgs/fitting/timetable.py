@@ -45,7 +45,8 @@ class Timetable:
     Attributes:
         schedule: `views`, `times` or `pairs`.
         start: Indices of the views that are known from the first step on.
-        pools: Of `times`: the indices of the views at each later time, one pick each. Else one pool, of all others.
+        pools: Candidates: of `times` the indices of the views at each later time, one pick each; else one pool of all
+            others.
         add: Picks.
         every: Steps between two of them.
         first: Steps done before the first.
@@ -167,8 +168,8 @@ def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int
     """One camera, then always the one whose center is farthest from all chosen ones; ties to the lower index.
 
     Args:
-        cameras: At least `count`.
-        count: At least 1.
+        cameras: Cameras to choose from, at least `count`.
+        count: Number of views, at least 1.
         first: Index of the one to begin with.
     """
     centers = np.stack([camera.center for camera in cameras])

@@ -39,9 +39,9 @@ class StepResult:
     """What one step was.
 
     Attributes:
-        loss: Of its view, before the step, as all of these.
-        terms: Of the loss by name, those that this view has.
-        psnr: Of this view in dB; None where it is not finite.
+        loss: Loss of its view, before the step, as all of these.
+        terms: Terms of the loss by name, those that this view has.
+        psnr: PSNR of this view in dB; None where it is not finite.
         view: Its name.
         events: What is to be logged.
     """
@@ -60,7 +60,7 @@ class Trainer:
         config: The `FitConfig`.
         frames: Training photographs.
         rows: The Gaussians and their optimizer.
-        extent: Of the scene, its unit of length.
+        extent: Extent of the scene, its unit of length.
         parts: Terms of the loss, learning rates, networks, and what is rendered.
         motion: The stages of a fit to what moves; None of what stands still.
         step_index: Steps done.
@@ -81,7 +81,7 @@ class Trainer:
 
         Args:
             parts: Default those of `config`.
-            motion: Which stage it is in, and what comes with the next.
+            motion: Stage that a fit of what moves is in, and what comes with the next.
         Raises:
             ValueError: If there is no photograph or no Gaussian, a tensor has no rate, or two networks have one name.
         """
@@ -229,11 +229,11 @@ class Trainer:
         """Continue from a checkpoint.
 
         Args:
-            config, frames: As they were; when checkpoints are written may change.
-            tensors, header: Of the checkpoint.
+            config, frames: The same as before, but for `saving`.
+            tensors, header: Contents of the checkpoint.
             where: It, for messages.
-            parts: As they were at the first step; networks are overwritten by those of the checkpoint.
-            motion: As it was at the first step.
+            parts: Parts of the first step; networks are overwritten by those of the checkpoint.
+            motion: Motion of the first step.
         Raises:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """

@@ -131,9 +131,9 @@ def check_handedness(where: str, rotation: np.ndarray, axes: str, column: str) -
     the other.
 
     Args:
-        rotation: what is closer to a reflection is refused.
-        axes: of a camera where the pose comes from, for the message.
-        column: and which of them usually points the other way.
+        rotation: (3, 3) matrix; one that is closer to a reflection is refused.
+        axes: Axes of a camera where the pose comes from, for the message.
+        column: Number of the column that usually points the other way, for the message.
     """
     check_distance(where, rotation)
     if np.linalg.det(rotation) < 0:

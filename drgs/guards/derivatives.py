@@ -89,7 +89,7 @@ def check_unbatched(where: str, x: torch.Tensor) -> None:
 
 
 def refuse_batched(where: str) -> NoReturn:
-    """Of what is called with one."""
+    """Raise NotImplementedError: a function was called with a batch of `torch.func.vmap`."""
     raise NotImplementedError(
         f"{where}: must be computed one at a time, got a batch of torch.func.vmap, which jacrev, jacfwd and hessian "
         "use, too; loop over it, pass a list of cameras, or K tangents at once to drgs.render_jvp"

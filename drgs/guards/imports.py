@@ -1,4 +1,4 @@
-"""Functions that a user names on the command line: `package.module:function`."""
+"""Imports by name: functions of `package.module:function`, and modules of a room at first access."""
 
 from __future__ import annotations
 
@@ -7,7 +7,26 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["imported_function"]
+__all__ = ["imported_function", "modules_of"]
+
+
+def modules_of(package: str) -> Callable[[str], Any]:
+    """The `__getattr__` of a room whose modules are imported at first access, as `drgs.features.query`.
+
+    Args:
+        package: Full name of the room, its `__name__`.
+    """
+
+    def at_first_access(name: str) -> Any:
+        if not name.startswith("_"):
+            try:
+                return importlib.import_module(f"{package}.{name}")
+            except ModuleNotFoundError as error:
+                if error.name != f"{package}.{name}":  # the module is there, and lacks something that is not installed
+                    raise
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return at_first_access
 
 
 def imported_function(option: str, text: str, or_else: str = "") -> Callable[..., Any]:
@@ -16,7 +35,7 @@ def imported_function(option: str, text: str, or_else: str = "") -> Callable[...
     Only for what the caller of drgs typed: importing runs the module. Never for a name that a file holds.
 
     Args:
-        option: Where it was given, e.g. `--policy`.
+        option: Option that it was given with, e.g. `--policy`.
         text: The name.
         or_else: What else the option takes, for the message.
     Raises:

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 Masks = Sequence[torch.Tensor | None] | None
-"""For each of several cameras (H, W) in [0, 1], what its image is multiplied by before it is compared, or None: 1."""
+"""Masks of several cameras: (H, W) in [0, 1] each, by which an image is multiplied before it is compared, or None."""
 
 _SCENE = "drgs.load_ply(path) or drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh) makes one"
 _CAMERA = "drgs.Camera(K=K, w2c=w2c, width=width, height=height) makes one"

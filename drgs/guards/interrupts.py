@@ -35,7 +35,7 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM or SIGHUP; ends a program as Ctrl-C does.
 
     Attributes:
-        signum: Which.
+        signum: Number of the signal.
     """
 
     def __init__(self, signum: int, text: str = ""):
@@ -72,7 +72,7 @@ class _Handlers:
         raise self.error()
 
     def watch(self, pipe: int, leave: Callable[[int], None]) -> None:
-        """In a second thread: hears of a signal when it comes, and leaves if the main thread does not answer."""
+        """Hear of a signal when it comes, in a second thread, and leave if the main thread does not answer."""
         while (found := os.read(pipe, 64)) and 0 not in found:
             numbers = [number for number in found if number in _SIGNALS]
             if not numbers:
@@ -198,7 +198,7 @@ def leave() -> None:
 
 
 def exit_code(error: KeyboardInterrupt) -> int:
-    """As shells have it: 128 + the signal's number."""
+    """Exit status of an interrupted program, as shells have it: 128 + the signal's number."""
     return 128 + (error.signum if isinstance(error, Terminated) else signal.SIGINT)
 
 

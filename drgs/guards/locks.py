@@ -134,9 +134,10 @@ def _started(pid: object) -> str | None:
 
 @contextlib.contextmanager
 def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """Of this machine's processes: without it, two that find the same stale lock might each remove the other's new one.
+    """Let one process of this machine in: else two that find the same stale lock might each remove the other's new one.
 
-    Only they may remove one, so that this is enough; other machines are kept out by the exclusive creation of the file.
+    Only processes of this machine may remove a lock, so that this is enough; other machines are kept out by the
+    exclusive creation of the file.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:

@@ -37,7 +37,7 @@ def frame_bytes(pixels: int, settings: RenderSettings, features: int = 0, gradie
     """Bytes that rendering an image takes at least, whatever it shows.
 
     Args:
-        pixels: Of the image.
+        pixels: Number of pixels of the image.
         settings: How it is rendered.
         features: Channels besides the colors.
         gradients: Whether it will be differentiated.
@@ -54,7 +54,7 @@ def require(where: str, needed: int, what: str, advice: str, cuda: bool = False)
         needed: Bytes, a lower bound.
         what: That takes them.
         advice: How it takes less.
-        cuda: Of the device, not of the machine.
+        cuda: Ask for memory of the device, in place of the machine's.
     """
     if needed < _SMALL:
         return

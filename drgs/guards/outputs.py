@@ -9,6 +9,7 @@ else's, or was edited, and stays. The same is asked again when a file is put in 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import logging
 import os
@@ -18,7 +19,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from drgs.guards import locks, unfinished
-from drgs.guards.authors import author_of, fingerprint, is_log, is_there
 from drgs.guards.json_files import parse_json
 from drgs.guards.writing import append_line, named
 
@@ -32,9 +32,12 @@ __all__ = [
 ]
 
 JOURNAL = ".drgs.jsonl"
+_MAX_JSON = 64 << 20  # bytes; a longer file is none that a command wrote as its report
+_LARGE = 1 << 20  # bytes that take long enough to hash that the result is kept
 
 _log = logging.getLogger(__name__)
 _claims: dict[Path, Claim] = {}
+_hashes: dict[tuple, str] = {}  # of checkpoints, which are moved and linked
 
 
 class Claim:
@@ -83,24 +86,24 @@ class Claim:
         """Whether a file, a link or everything in a folder is as drgs wrote it.
 
         Args:
-            path: In the folder.
-            by: By these commands; default by any.
+            path: Path of a file in the folder.
+            by: Commands that may have made it; default any.
         """
         if path.is_dir() and not path.is_symlink():
             return all(self.is_made(child, by) for child in path.iterdir())
         if not path.is_symlink() and not path.is_file():
             return False
         made = self._made.get(self._name_of(path))
-        command = made.get(fingerprint(path)) if made else None
+        command = made.get(_fingerprint(path)) if made else None
         if command is None and path.suffix == ".json":
-            command = author_of(path)
+            command = _author_of(path)
             command = command if command == self.command else None
-        if command is None and path.suffix == ".jsonl" and is_log(path):
+        if command is None and path.suffix == ".jsonl" and _is_log(path):
             command = self.command
         return command is not None and (by is None or command in by)
 
     def _name_of(self, path: Path) -> str:
-        """Of a path in the folder, however it leads there: from the working directory, or through a link."""
+        """Name in the folder of a path that leads there, be it from the working directory or through a link."""
         return (path.parent.resolve() / path.name).relative_to(self.path).as_posix()
 
     def record(self, name: str, content: str | os.PathLike, command: str | None = None) -> None:
@@ -111,7 +114,7 @@ class Claim:
             content: A file or link with the same content.
             command: Default the one that holds the folder.
         """
-        row = {"file": name, "sha256": fingerprint(Path(content)), "command": command or self.command}
+        row = {"file": name, "sha256": _fingerprint(Path(content)), "command": command or self.command}
         known = self._made.setdefault(name, {})
         if known.get(row["sha256"]) == row["command"]:
             return
@@ -211,7 +214,7 @@ class Claim:
                 rows.append(row)
                 self._made.setdefault(file, {})[digest] = command
         if len(rows) > 2 * len(self._made) + 100:
-            kept = [row for row in rows if is_there(self.path / row["file"], row["sha256"])]
+            kept = [row for row in rows if _is_there(self.path / row["file"], row["sha256"])]
             with replacing(path, claimed=False) as name:
                 Path(name).write_text("".join(json.dumps(row) + "\n" for row in kept))
 
@@ -225,7 +228,7 @@ def claim(
 
     Args:
         folder: What -o says.
-        command: For people, and for the record of what it made.
+        command: Name of the command, for people and for the record of what it made.
         names: Files that will be written; more may be checked later (`Claim.check`).
         inputs: Files and folders that are read; those that do not exist are left out.
     Raises:
@@ -258,7 +261,7 @@ def check_file(
     Args:
         path: The file.
         command: Name of the command.
-        inputs: As for `claim`.
+        inputs: Files and folders that are read, as `claim` takes them.
         is_made: Whether a file is one that the command wrote; default: a JSON file that says so.
     Raises:
         ValueError: If it cannot be written, is an input, or is there and was not made by this command.
@@ -268,7 +271,7 @@ def check_file(
         raise ValueError(f"{path}: must be a file, is a folder; name a file in it")
     if os.path.lexists(path):
         _refuse_inputs(path, [Path(os.path.realpath(x)) for x in inputs if os.path.exists(x)])
-        if path.is_symlink() or not (is_made(path) if is_made else author_of(path) == command):
+        if path.is_symlink() or not (is_made(path) if is_made else _author_of(path) == command):
             raise ValueError(
                 f"{path}: must not be replaced, `drgs {command}` did not make it; move it away or choose another output"
             )
@@ -305,7 +308,7 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
     Args:
         path: The file.
         suffix: That the hidden name must end with, for a library that goes by it.
-        claimed: In a claimed folder, refuse to replace what drgs did not make, and record what it made.
+        claimed: Refuse, in a claimed folder, to replace what drgs did not make, and record what it made.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -376,3 +379,44 @@ def _refuse_inputs(target: Path, inputs: list[Path]) -> None:
 def _claim_of(folder: Path) -> Claim | None:
     """The innermost claim that a folder is in."""
     return next((_claims[x] for x in (folder, *folder.parents) if x in _claims), None)
+
+
+def _fingerprint(path: Path) -> str:
+    """The SHA-256 hash of a file's content; of a link, where it points to."""
+    if path.is_symlink():
+        return f"link to {os.readlink(path)}"
+    status = path.stat()
+    key = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+    if key in _hashes:
+        return _hashes[key]
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if status.st_size > _LARGE:  # small ones are quick, and might be replaced within a tick of the clock
+        _hashes[key] = digest
+    return digest
+
+
+def _is_there(path: Path, digest: str) -> bool:
+    """Whether a path is a file or link with this fingerprint."""
+    return os.path.lexists(path) and not (path.is_dir() and not path.is_symlink()) and _fingerprint(path) == digest
+
+
+def _author_of(path: Path) -> str | None:
+    """The command that a JSON file of ours says it is of."""
+    try:
+        if path.stat().st_size > _MAX_JSON:
+            return None
+        value = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return value.get("command") if isinstance(value, dict) and isinstance(value.get("schema"), int) else None
+
+
+def _is_log(path: Path) -> bool:
+    """Whether the first line is an event of `drgs.files.Run.log`."""
+    try:
+        with path.open("rb") as file:
+            value = json.loads(file.readline(_MAX_JSON))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(value, dict) and isinstance(value.get("schema"), int) and "event" in value

@@ -1,14 +1,18 @@
-"""Headers of PLY files: parsed, and compared with the size of the file before anybody allocates what they claim."""
+"""PLY files before anybody reads them: what a header claims is compared with the size of the file, and lists, whose
+lengths no header has, are read from memory, where they can claim nothing.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import re
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-__all__ = ["EXTRA", "PlyElement", "extra_kind", "read_ply_header"]
+__all__ = ["EXTRA", "PlyElement", "extra_kind", "ply_source", "read_ply_header"]
 
 EXTRA = ("uncertainty_", "label")
 """Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
@@ -109,3 +113,13 @@ def extra_kind(name: str, values: np.ndarray, count: int) -> str:
         i = int(np.flatnonzero(~np.isfinite(values))[0])
         raise ValueError(f"save_ply: {name} must be finite, got {values[i]} at index {i}; leave it out or repair it")
     return "<f4"
+
+
+def ply_source(path: Path) -> BinaryIO | str:
+    """What plyfile is to read: the path, which it maps; or the whole file, where it has lists.
+
+    plyfile asks the file for as many bytes as a list claims, and a file makes room for them before it reads.
+    """
+    with path.open("rb") as file:
+        has_lists = re.search(rb"property\s+list", file.read(_MAX_HEADER))
+    return io.BytesIO(path.read_bytes()) if has_lists else str(path)

@@ -51,7 +51,8 @@ class Record:
 
     def to_json(self) -> dict:
         """The nested object of a file: `from_json` reads it."""
-        return {name: _plain(getattr(self, name)) for name in hints_of(type(self))}
+        kind: Any = type(self)
+        return {name: _plain(getattr(self, name)) for name in hints_of(kind)}
 
     @classmethod
     def from_json(cls, value: Any) -> Self:
@@ -63,7 +64,7 @@ class Record:
         return _with(cls, None, stated(cls, value))
 
 
-def _with(kind: type, base: Any, fields: Mapping[str, Any]) -> Any:
+def _with(kind: Any, base: Any, fields: Mapping[str, Any]) -> Any:
     """A record of a kind like `base` (None: the defaults), with fields of it and of its parts."""
     ways = ways_of(kind)
     own: dict[str, Any] = {}
@@ -80,7 +81,6 @@ def _with(kind: type, base: Any, fields: Mapping[str, Any]) -> Any:
     defaults = {field.name: field for field in dataclasses.fields(kind)}
     for name, changed in inner.items():
         part = part_of(hints_of(kind)[name])
-        assert part is not None
         factory: Any = defaults[name].default_factory
         usual = None if factory is dataclasses.MISSING else factory()
         before = own[name] if name in own else usual if base is None else getattr(base, name)
@@ -94,10 +94,10 @@ def _with(kind: type, base: Any, fields: Mapping[str, Any]) -> Any:
     return kind(**{**kept, **own})
 
 
-def _renamed(message: str, part: type, kind: type) -> str:
+def _renamed(message: str, part: Any, kind: Any) -> str:
     """A message of a part as the record that holds it says it."""
-    was = f"{part.where}: "  # type: ignore[attr-defined]
-    return f"{kind.where}: {message.removeprefix(was)}" if message.startswith(was) else message  # type: ignore[attr-defined]
+    was = f"{part.where}: "
+    return f"{kind.where}: {message.removeprefix(was)}" if message.startswith(was) else message
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -110,7 +110,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def hints_of(kind: type) -> Mapping[str, Any]:
     """Field -> its type, in their order; of records without those that are `TRANSIENT`."""
     space = vars(sys.modules[kind.__module__])
-    found = {}
+    found: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         if not field.metadata.get("transient"):
             alone = types.SimpleNamespace(__annotations__={field.name: field.type})
@@ -131,7 +131,7 @@ def ways_of(kind: type) -> Mapping[str, tuple[str, ...]]:
     return types.MappingProxyType(found)
 
 
-def part_of(hint: Any) -> type[Record] | None:
+def part_of(hint: Any) -> Any:
     """The record that a field of a type holds, be it optional; None of other types."""
     kinds = typing.get_args(hint) or (hint,)
     return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Record)), None)
@@ -152,7 +152,7 @@ def texts_of(kind: type) -> Mapping[str, str]:
     return types.MappingProxyType(found)
 
 
-def stated(kind: type[Record], value: Any) -> dict[str, Any]:
+def stated(kind: Any, value: Any) -> dict[str, Any]:
     """What a nested object says, as fields by their names; those of parts stand beside the others.
 
     A part that may be None and is there has itself an entry, with its defaults.
@@ -185,29 +185,27 @@ def stated(kind: type[Record], value: Any) -> dict[str, Any]:
     return found
 
 
-def _hint(kind: type, way: tuple[str, ...]) -> Any:
+def _hint(kind: Any, way: tuple[str, ...]) -> Any:
     """The type of the field at the end of a way."""
     for name in way[:-1]:
-        part = part_of(hints_of(kind)[name])
-        assert part is not None
-        kind = part
+        kind = part_of(hints_of(kind)[name])
     return hints_of(kind)[way[-1]]
 
 
 def _converted(where: str, name: str, value: Any, hint: Any) -> Any:
     """A value of a file as its field holds it: an object becomes the dataclass that is meant, a list a tuple."""
     kinds = typing.get_args(hint) or (hint,)
-    whole = next((kind for kind in kinds if dataclasses.is_dataclass(kind)), None)
+    whole: Any = next((kind for kind in kinds if dataclasses.is_dataclass(kind)), None)
     if whole is None:
         return tuple(value) if isinstance(value, list) else value
     if not isinstance(value, dict):
         if value is None and type(None) in kinds:
             return None
-        must_be(where, name, value, dict, f"the fields of a {whole.__name__}")  # type: ignore[union-attr]
-    known = hints_of(whole)  # type: ignore[arg-type]
+        must_be(where, name, value, dict, f"the fields of a {whole.__name__}")
+    known = hints_of(whole)
     if unknown := [key for key in value if key not in known]:
         raise ValueError(f"{where}: {name} must hold known fields, got {unknown[0]!r}; {nearest(unknown[0], known)}")
-    return whole(**{key: tuple(x) if isinstance(x, list) else x for key, x in value.items()})  # type: ignore[operator]
+    return whole(**{key: tuple(x) if isinstance(x, list) else x for key, x in value.items()})
 
 
 def _plain(value: Any) -> Any:

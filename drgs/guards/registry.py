@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.metadata
 from collections.abc import Iterator, Mapping, MutableMapping
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from drgs.guards.imports import imported_function
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 __all__ = ["Registry"]
 
@@ -30,13 +32,15 @@ class Registry(MutableMapping[str, T], Generic[T]):
 
     Args:
         kind: What a row is, for messages: "policy".
-        group: Of the entry points: "drgs.policies".
+        group: Group of the entry points: "drgs.policies".
         rows: Those of this package.
+        row: Type that a row must have; None where any will do, as functions that are checked by what they return.
     """
 
-    def __init__(self, kind: str, group: str, rows: Mapping[str, T | str]) -> None:
+    def __init__(self, kind: str, group: str, rows: Mapping[str, T | str], row: type[T] | None = None) -> None:
         self.kind = kind
         self.group = group
+        self.row = row
         self._rows: dict[str, Any] = dict(rows)
 
     def __getitem__(self, name: str) -> T:
@@ -48,15 +52,23 @@ class Registry(MutableMapping[str, T], Generic[T]):
             return row
         point = _entry_points(self.group)[name]
         try:
-            row = self._rows[name] = point.load()
+            row = point.load()
         except Exception as error:  # whatever the other package raises, the line names it
             raise ValueError(
                 f"{self.kind} {name!r} of {_package(point)}: must be importable, got {type(error).__name__}: {error}"
             ) from error
+        self._rows[name] = self._checked(f"{self.kind} {name!r} of {_package(point)}", row)
         return row
 
     def __setitem__(self, name: str, value: T) -> None:
-        self._rows[name] = value
+        self._rows[name] = self._checked(f"{self.kind} {name!r}", value)
+
+    def _checked(self, where: str, row: T) -> T:
+        """The row; ValueError where it has another type than rows of this table have."""
+        if self.row is None or isinstance(row, self.row):
+            return row
+        wanted = f"{self.row.__module__}.{self.row.__name__}"
+        raise ValueError(f"{where}: must be a {wanted}, got {type(row).__name__}; make one of it")
 
     def __delitem__(self, name: str) -> None:
         del self._rows[name]
@@ -92,13 +104,15 @@ class Registry(MutableMapping[str, T], Generic[T]):
 
 
 @functools.cache
-def _entry_points(group: str) -> dict[str, importlib.metadata.EntryPoint]:
+def _entry_points(group: str) -> dict[str, EntryPoint]:
     """Rows of installed packages by name; of two of a name the first that is found."""
-    found: dict[str, importlib.metadata.EntryPoint] = {}
+    import importlib.metadata  # a quarter of what `import drgs.settings` takes, which asks no table
+
+    found: dict[str, EntryPoint] = {}
     for point in importlib.metadata.entry_points(group=group):
         found.setdefault(point.name, point)
     return found
 
 
-def _package(point: importlib.metadata.EntryPoint) -> str:
+def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.value

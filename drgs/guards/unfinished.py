@@ -24,7 +24,7 @@ def hidden_file(folder: str, name: str, suffix: str = "") -> Iterator[str]:
     """The name of an empty private file; after the block it is renamed, or removed.
 
     Args:
-        folder: Where it is, without links.
+        folder: Path of the folder that it is in, without links.
         name: What it will be called.
         suffix: That its name must end with, for a library that goes by it.
     """
@@ -47,7 +47,7 @@ def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iter
 
     Args:
         kind: Part of its name.
-        parent: Where it is; default the system's place for such.
+        parent: Folder that it is made in; default the system's place for such.
     """
     parent = None if parent is None else os.path.realpath(parent)
     name = tempfile.mkdtemp(prefix=f".drgs.{kind}.", suffix=".tmp", dir=parent)

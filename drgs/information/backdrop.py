@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
 
 __all__ = [
+    "BACKDROP",
     "CELLS",
     "Sphere",
     "backdrop_cells",
@@ -40,6 +41,7 @@ __all__ = [
     "painted_opacity",
 ]
 
+BACKDROP = "backdrop"  # the group of its information
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
 _PIXELS = 1200  # of a view as its depth is looked at
@@ -55,7 +57,7 @@ class Sphere:
 
     Attributes:
         center: x, y, z.
-        radius: > 0.
+        radius: Distance of what is painted from the center, > 0.
     """
 
     center: tuple[float, float, float]
@@ -74,8 +76,11 @@ def backdrop_sphere(
     the bits that a single call would find; `drgs.select.Cache` keeps what views tell apart from it.
 
     Args:
-        scene, cameras: What is seen, by whom.
+        scene: The scene that is seen.
+        cameras: The cameras that see it.
         answers: Asks the scene's views, in place of one after another here (`Pool.answers`).
+    Raises:
+        ValueError: If there is no camera.
     """
     if not cameras:
         raise ValueError("fisher.backdrop_sphere: there must be at least one camera, got none")
@@ -95,7 +100,7 @@ def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) ->
     """(P,) depths of what is solid in a small picture of a view."""
     from drgs.integrator import render
 
-    with torch.no_grad():
+    with torch.no_grad():  # a distance is a number
         # Without its lens, which tiles do not know: what is wanted is how far away things are, about.
         plain = colors_only(scene, camera.time)
         small = at_most(camera.undistorted(), _PIXELS)
@@ -110,14 +115,14 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
     if sphere:
         start = (camera.center - np.array(sphere.center)) / sphere.radius
         along = np.einsum("pk,k->p", rays, start)  # no `@`, as in `Camera.pixel_directions`
-        # Of a camera that is outside, a ray that misses: where it is nearest.
+        # Not below 0: a ray of a camera outside that misses has no crossing, and takes the place where it is nearest.
         rays = start + rays * (np.sqrt(np.maximum(along**2 + 1 - start @ start, 0.0)) - along)[:, None]
     axis = np.abs(rays).argmax(1)
     rows = np.arange(len(rays))
     along = rays[rows, axis]
     across = np.stack([rays[rows, (axis + k) % 3] for k in (1, 2)], axis=-1) / np.abs(along)[:, None]
     even = np.arctan(across) * 4 / np.pi  # in [-1, 1]
-    places = ((even + 1) / 2 * _SIDE).astype(int).clip(0, _SIDE - 1)
+    places = ((even + 1) / 2 * _SIDE).astype(int).clip(0, _SIDE - 1)  # the edge of a face, 1, would be cell 16
     face = 2 * axis + (along < 0)
     found = (face * _SIDE + places[:, 0]) * _SIDE + places[:, 1]
     return torch.from_numpy(found.reshape(camera.height, camera.width))
@@ -127,12 +132,16 @@ def opacity_of(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.
     """(H, W) float32 opacity alpha of a view."""
     from drgs.integrator import render
 
-    with torch.no_grad():
+    with torch.no_grad():  # information is a number
         return render(colors_only(scene, camera.time), camera, settings, outputs=()).alpha.cpu()
 
 
 def _open(opacity: torch.Tensor) -> torch.Tensor:
-    """(H, W) float64: (1 - alpha)^2."""
+    """(H, W) float64: (1 - alpha)^2.
+
+    In float64, where 1 - alpha of a float32 alpha is exact. A sum of weights may exceed 1 by rounding: clamped, so that
+    no pixel is more open the more it is covered.
+    """
     return (1 - opacity.double().cpu()).clamp(min=0).square()
 
 

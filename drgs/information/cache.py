@@ -36,7 +36,7 @@ class Cache:
 
     Attributes:
         max_bytes: What is kept has no more; above it, what was used least recently goes.
-        bytes: Of all tensors that are kept now.
+        bytes: Bytes of all tensors that are kept now.
         hits, misses: Answers found and computed so far. With the block `backdrop` a view has two: what it tells, and
             how far away its surfaces are.
         evictions: Answers that went, or did not come in, for lack of room. Those of another scene are not counted.
@@ -45,7 +45,7 @@ class Cache:
     def __init__(self, max_bytes: int = 1 << 30) -> None:
         """
         Args:
-            max_bytes: At least 0; 1 GiB by default, 150 views of 30,000 Gaussians of SH degree 3.
+            max_bytes: A whole number, at least 0; 1 GiB by default, 150 views of 30,000 Gaussians of SH degree 3.
         Raises:
             ValueError: If it is no such number.
         """
@@ -92,7 +92,7 @@ class Cache:
 
         Args:
             scene: That it was computed of; if another one was asked about since, nothing is stored.
-            key: Of all else that it depends on: what is computed, its options, settings and camera.
+            key: All else that it depends on: what is computed, its options, settings and camera.
             answer: The information.
         """
         with self._lock:

@@ -48,6 +48,7 @@ def dense(
     Raises:
         ValueError: If a shape is wrong, or H + lambda is singular after leaving out what no row moves.
     """
+    # float64 is what the chain is about: its inequalities hold to rounding, which float32 would break.
     Jc, J = candidate.to(torch.float64), train.to(torch.float64)
     if Jc.ndim != 2 or J.ndim != 2 or Jc.shape[1] != J.shape[1]:
         raise ValueError(

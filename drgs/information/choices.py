@@ -1,12 +1,20 @@
-"""What views can be judged and chosen by, by name; imports nothing, for the options of the command line read it."""
+"""What views can be judged and chosen by, by name; loads nothing heavy, for the options of the command line read it.
+
+What stands behind a name is imported when it is first asked for. Rows that other packages add are found by entry points
+(`drgs.guards.registry`), and have no part in what is the default.
+"""
 
 from __future__ import annotations
 
 import typing
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+from drgs.guards.registry import Registry
+from drgs.information.criteria import criterion_named
 
 __all__ = [
+    "BLOCKS",
     "BLOCK_NAMES",
     "COMBINES",
     "ESTIMATES",
@@ -21,21 +29,51 @@ __all__ = [
     "Method",
     "NetworkScore",
     "NetworkEstimate",
+    "POLICIES",
     "POLICY_NAMES",
     "Policy",
     "check_combined",
+    "check_named",
     "checked_blocks",
 ]
 
 Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
-"""The names in `drgs.gain.CRITERIA`, where the functions are; views are chosen by the first unless told otherwise."""
+"""The names of `drgs.information.criteria` that are this package's; views are chosen by the first by default."""
 
 CRITERION_NAMES: tuple[Criterion, ...] = typing.get_args(Criterion)
 
 Policy = Literal["fisher", "fisherrf", "coverage", "moments", "farthest", "uniform", "random"]
-"""The names in `drgs.select.POLICIES`, where the functions are."""
+"""The names of `POLICIES` that are this package's."""
 
 POLICY_NAMES: tuple[Policy, ...] = typing.get_args(Policy)
+
+POLICIES: Registry[Callable[[Any], Any]] = Registry(
+    "policy",
+    "drgs.policies",
+    {
+        "fisher": "drgs.policies.informed:fisher",
+        "fisherrf": "drgs.policies.informed:fisherrf",
+        "coverage": "drgs.policies.informed:coverage",
+        "moments": "drgs.policies.informed:moments",
+        "farthest": "drgs.policies.spread:farthest",
+        "uniform": "drgs.policies.spread:uniform",
+        "random": "drgs.policies.spread:random",
+    },
+)
+"""Name -> policy, a function `drgs.select.Pool` -> `drgs.select.Selection`."""
+
+
+def check_named(where: str, registry: Registry, name: object) -> None:
+    """Raise ValueError if a name is no row's and does not look like `package.module:function`.
+
+    It imports nothing, so that names from files can be checked by it, too.
+    """
+    if not isinstance(name, str) or (name not in registry and ":" not in name):
+        raise ValueError(
+            f"{where}: {registry.kind} must be one of {', '.join(registry)}, or package.module:function, got {name!r}; "
+            "choose one"
+        )
+
 
 Method = Literal["exact", "columns", "probes", "fisherrf"]
 """How `drgs.fisher.diagonal` computes; the first is the default everywhere."""
@@ -47,7 +85,19 @@ Block = Literal["geometry", "semantic", "deformation", "backdrop"]
 network that moves them, and about what stands behind them, where they leave a pixel open."""
 
 BLOCK_NAMES: tuple[Block, ...] = typing.get_args(Block)
-"""In the order in which results name them."""
+"""In the order in which results name them. Where no blocks are named, these count, as far as the scene has them."""
+
+BLOCKS: Registry[Any] = Registry(
+    "block",
+    "drgs.blocks",
+    {
+        "geometry": "drgs.information.blocks:GEOMETRY_BLOCK",
+        "semantic": "drgs.information.blocks:SEMANTIC_BLOCK",
+        "deformation": "drgs.information.blocks:DEFORMATION_BLOCK",
+        "backdrop": "drgs.information.blocks:BACKDROP_BLOCK",
+    },
+)
+"""Name -> `drgs.information.blocks.ImageBlock`."""
 
 
 def checked_blocks(where: str, names: Sequence[str], method: str) -> tuple[Block, ...]:
@@ -56,16 +106,16 @@ def checked_blocks(where: str, names: Sequence[str], method: str) -> tuple[Block
     Raises:
         ValueError: If one is unknown, or the method does not know it, or none is named.
     """
-    known = ", ".join(BLOCK_NAMES)
+    known = ", ".join(BLOCKS)
     if not isinstance(names, tuple | list) or not names:
         raise ValueError(f"{where}: blocks must be a tuple of one or more of {known}, got {names!r}; correct it")
     for name in names:
-        if name not in BLOCK_NAMES:
+        if name not in BLOCKS:
             raise ValueError(f"{where}: blocks must be among {known}, got {name!r}; correct it")
-    other = [name for name in BLOCK_NAMES[1:] if name in names]
+    other = [name for name in BLOCKS if name in names and name != BLOCK_NAMES[0]]
     if method == "fisherrf" and other:
         raise ValueError(f"{where}: blocks must be geometry with method fisherrf, got {other[0]}; use method exact")
-    return tuple(name for name in BLOCK_NAMES if name in names)
+    return tuple(name for name in BLOCKS if name in names)  # type: ignore[misc]  # one of another package is no `Block`
 
 
 Estimate = Literal["principal", "collapsed", "exact"]
@@ -92,10 +142,11 @@ COMBINES: tuple[Combine, ...] = typing.get_args(Combine)
 
 def check_combined(where: str, blocks: Sequence[str] | None, criterion: str, network: str, combine: str | None) -> None:
     """Raise ValueError if these blocks (None: all there are) cannot be scored so, or not together."""
-    others = [name for name in ("deformation", "backdrop") if name in (blocks or ())]
-    if others and criterion == "block_logdet":
+    others = [name for name in blocks or () if name not in ("geometry", "semantic")]
+    # A function of one's own, which is not imported here, is of a diagonal.
+    if others and ":" not in criterion and criterion_named(criterion, where).of_blocks:
         raise ValueError(
-            f"{where}: blocks must be geometry or semantic with criterion block_logdet, got {others[0]}; only "
+            f"{where}: blocks must be geometry or semantic with criterion {criterion}, got {others[0]}; only "
             "Gaussians have blocks of their own, use eig"
         )
     beside = blocks is None or ("deformation" in blocks and len(blocks) > 1)

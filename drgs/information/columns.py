@@ -34,7 +34,7 @@ def jacobian_columns(
     """Columns of the Jacobian by forward mode: how the image changes with single parameters.
 
     Args:
-        gaussians, camera, settings: As for `render`.
+        gaussians, camera, settings: The same as for `render`.
         index: Group -> integers. (M, 1 + axes) rows (gaussian, component...), (M,) for logit_opacities; `features` rows
             are (gaussian, channel); `camera` (M,) of 0..5, the world-frame twist, rotation first. Of a
             `drgs.ellipsoids.DeformableScene` the groups are its own tensors, by the names of its `parameters()`, and
@@ -86,15 +86,16 @@ def by_columns(
     """The diagonal of J^T J from every column of J.
 
     Args:
-        gaussians: As the camera sees them.
+        gaussians: The Gaussians as the camera sees them.
         wanted: Groups: the Gaussians', or with `scene` the scene's own.
         weights: Inverse noise variances of R, G and B.
-        semantics: Of the features, if these tell about the geometry.
-        scene: That the Gaussians come from.
+        semantics: The metric of the features, if these tell about the geometry.
+        scene: The scene that the Gaussians come from.
         mask: (H, W) what the image is multiplied by; None: 1.
     """
     result = {}
     scale = torch.tensor(weights, dtype=torch.float64)
+    # A mask is a number, whatever graph it is in; sums of squares of all pixels are float64, as everywhere here.
     factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
     for name, group in wanted.items():
         shape = group.tangent(gaussians)

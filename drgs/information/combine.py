@@ -1,10 +1,9 @@
-"""How scores of several blocks become one, and what is asked of a view for each.
+"""How scores of several blocks become one, and all that a view is asked for them.
 
-A block is a part of an image with the parameters that it tells about (`choices.Block`). Their diagonals are ratios,
-without a unit, and add up: what colors and features say about the same parameters even before it is divided by what is
-known. A trace has a unit, and no divisor: beside it every block is scored alone, by information of its own, whose
-groups are named `block.group` then, and its scores are compared with those of the other candidates before they are
-added up (z-scores).
+Diagonals of blocks (`drgs.information.blocks`) are ratios in a score, without a unit, and add up: what colors and
+features say about the same parameters even before it is divided by what is known. A trace has a unit, and no divisor:
+beside it every block is scored alone, by information of its own, whose groups are named `block.group` then, and its
+scores are compared with those of the other candidates before they are added up (z-scores).
 """
 
 from __future__ import annotations
@@ -12,22 +11,19 @@ from __future__ import annotations
 import dataclasses
 import math
 import statistics
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 
 from drgs.gain import Gain, Information, scorer
-from drgs.information.backdrop import opacity_of, painted_opacity
-from drgs.information.network_groups import NETWORK_GROUPS
+from drgs.information.blocks import BlockQuestion, SceneBlocks, SeenView
+from drgs.information.criteria import criterion_named
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
-    from drgs.information.backdrop import Sphere
-    from drgs.information.choices import Block
     from drgs.information.scoring import Scoring
-    from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
 __all__ = ["Asked", "Combination", "Questions", "asked_of"]
@@ -37,60 +33,19 @@ _SAME = 1e-6  # relative standard deviation below which a block's scores are the
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """One function of `drgs.fisher` that a view is asked by.
+    """One question to a view, and how its answer is named.
 
     Attributes:
-        function: Its name; where it returns one tensor, that is a group of the same name.
-        without: Groups of what it returns that do not count.
-        options: Of the function, besides scene, camera and settings.
-        block: What names of groups begin with; "" where all are scored together.
-        groups: Of those of a network, the ones that count; None: all.
-        known: Whether views that are known are asked, too: a trace has no use for what they say.
+        question: What is asked.
+        block: The block that names of groups begin with; "" where all blocks are scored together.
     """
 
-    function: str
-    without: tuple[str, ...] = ()
-    options: tuple[tuple[str, Hashable], ...] = ()
+    question: BlockQuestion
     block: str = ""
-    groups: tuple[str, ...] | None = None
-    known: bool = True
 
-    def __call__(
-        self,
-        scene: Scene,
-        camera: Camera,
-        settings: RenderSettings,
-        mask: torch.Tensor | None = None,
-        opacity: list[torch.Tensor] | None = None,
-    ) -> Information:
-        """What one view says.
-
-        `opacity` gets the view's, where it is found on the way, and is where it is looked for.
-        """
-        from drgs import fisher  # loads Dr.Jit, which policies that ask nothing need not have
-
-        options: dict[str, Any] = dict(self.options)
-        # `diagonal` also knows the parameters that a scene computes its Gaussians from, but no closed form for them.
-        own = self.function == "diagonal" and (options.get("groups") is None or options["method"] in _OF_SCENES)
-        if self.function == "diagonal" and options.get("method") == "exact":
-            options["seen_opacity"] = opacity
-        elif self.function == "backdrop" and opacity:
-            options["seen_opacity"] = opacity[:1]
-        with torch.no_grad():  # information is a number
-            seen = scene if own or self.function == "network" else scene.at(camera.time)
-            if mask is not None:
-                options["masks"] = [mask]
-            found = getattr(fisher, self.function)(seen, camera, settings, **options)
-        if isinstance(found, torch.Tensor):
-            found = {self.function: found}
-        wanted = {name: x for name, x in found.items() if name not in self.without}
-        if self.groups is not None:
-            wanted = {name: x for name, x in wanted.items() if name in self.groups}
-        return {f"{self.block}.{name}" if self.block else name: x for name, x in wanted.items()}
-
-
-_OF_SCENES = ("columns", "probes")
-_OPACITY = "opacity"  # the name under which a view's opacity travels as an Information
+    def named(self, information: Information) -> dict[str, torch.Tensor]:
+        """Information by the names that scores know it by."""
+        return {f"{self.block}.{name}" if self.block else name: x for name, x in information.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,48 +53,35 @@ class Questions:
     """All that a view is asked, as data, which other processes can be sent.
 
     Attributes:
-        settings: Of the renderer.
-        asked: In the order of asking.
-        empty_outside: Whether it is known that nothing is outside of masks, so that the view has shown it.
-        is_painted: Whether what is told about the backdrop is about the cells of its sphere; else it is the view's
-            opacity, by which this is known wherever the sphere is (`painted`).
+        settings: Settings of the renderer.
+        asked: The questions in the order of asking: what one finds out on its way, those after it make use of.
     """
 
     settings: RenderSettings
     asked: tuple[Asked, ...]
-    empty_outside: bool = False
-    is_painted: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        """What one view says, in float32, as it is kept."""
+        """What one view says, in float32, as it is kept: half the memory, of sums that are of float32 images."""
         found: dict[str, torch.Tensor] = {}
-        opacity: list[torch.Tensor] = []
-        for one in self.asked:
-            if one.function != "backdrop":
-                found |= one(scene, camera, self.settings, mask, opacity)
-            elif self.is_painted:
-                found |= one(scene, camera, self.settings, None if self.empty_outside else mask, opacity)
-            else:
-                found[_OPACITY] = opacity[0] if opacity else opacity_of(scene, camera, self.settings)
+        view = SeenView(scene, camera, self.settings, mask)
+        with torch.no_grad():  # information is a number
+            for one in self.asked:
+                found |= one.named(one.question.information(view))
         return {name: x.to(torch.float32) for name, x in found.items()}
 
     def lasting(self) -> Questions:
-        """Questions whose answers depend on a view alone, not on the others of its pool, around which the sphere is."""
-        asked = tuple(dataclasses.replace(one, options=()) if one.function == "backdrop" else one for one in self.asked)
-        return Questions(self.settings, asked, is_painted=False)
+        """Questions whose answers depend on a view alone, not on the others of its pool."""
+        return Questions(self.settings, tuple(Asked(one.question.lasting(), one.block) for one in self.asked))
 
-    def painted(self, answer: Information, camera: Camera, mask: torch.Tensor | None) -> Information:
+    def finished(self, answer: Information, camera: Camera, mask: torch.Tensor | None) -> Information:
         """What a view says to these questions, of its answer to the `lasting` ones: the same bits."""
         found = dict(answer)
-        if (opacity := found.pop(_OPACITY, None)) is None:
-            return found
-        one = next(one for one in self.asked if one.function == "backdrop")
-        options: dict[str, Any] = dict(one.options)
-        sphere = options["sphere"]
-        mask = None if self.empty_outside else mask
-        told = painted_opacity(opacity, camera, (1.0, 1.0, 1.0), mask, sphere)
-        found[f"{one.block}.backdrop" if one.block else "backdrop"] = told.to(torch.float32)
-        return found
+        for one in self.asked:
+            # Where all blocks are scored together, a question gets the whole answer, and returns it.
+            own = _own(found, one.block) if one.block else found
+            rest = {name: x for name, x in found.items() if name not in one.named(own)}
+            found = rest | one.named(one.question.finished(own, camera, mask))
+        return {name: x.to(torch.float32) for name, x in found.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,9 +89,9 @@ class Combination:
     """How one score is made of what a view says.
 
     Attributes:
-        scoring: Its criterion, lambda and weights.
+        scoring: The scoring that has criterion, lambda and weights.
         apart: The blocks that are scored alone, each with groups of its name; empty: all groups are scored together.
-        traced: Of these, the block that is a trace, scored without what is known; "" for none.
+        traced: The block that is a trace, scored without what is known; "" for none.
     """
 
     scoring: Scoring
@@ -159,14 +101,15 @@ class Combination:
     @property
     def pooled(self) -> bool:
         """Whether scores ask for the information of all views together, known ones and candidates."""
-        return self.scoring.criterion == "v_opt" and (bool(self.apart) or not self.traced)
+        needed = criterion_named(self.scoring.criterion, "select").needs_pool
+        return needed and (bool(self.apart) or not self.traced)
 
     def scorer(self, H: Information, pool: Information | None = None) -> Callable[[Information], Gain]:
         """Gains of candidates against H, that of the known views.
 
         Args:
             H: Group -> tensor.
-            pool: Of all views together, where scores are `pooled`.
+            pool: The information of all views together, where scores are `pooled`.
         Raises:
             ValueError: If the prior or weights name a group that there is not.
         """
@@ -229,8 +172,11 @@ class Combination:
 
     @property
     def falls(self) -> bool:
-        """Whether a candidate's score can only fall when more is known, as greedy choice may make use of."""
-        return not self.apart
+        """Whether a candidate's score can only fall when more is known, as greedy choice may make use of.
+
+        A trace stays as it is; z-scores rise as those of other candidates fall.
+        """
+        return not self.apart and (bool(self.traced) or criterion_named(self.scoring.criterion, "select").scores_fall)
 
 
 class _Trace:
@@ -254,76 +200,24 @@ def _own(information: Information, block: str) -> dict[str, torch.Tensor]:
     return {name.removeprefix(prefix): x for name, x in information.items() if name.startswith(prefix)}
 
 
-def asked_of(
-    scoring: Scoring, blocks: tuple[Block, ...], metric: SemanticMetric | None, sphere: Sphere | None = None
-) -> tuple[list[Asked], Combination]:
+def asked_of(of: SceneBlocks) -> tuple[list[Asked], Combination]:
     """What views are asked, and how they are scored by it.
 
     Args:
-        scoring: As `drgs.select` takes it.
-        blocks: `scoring.blocks_of` the scene, at least one.
-        metric: Of the block `semantic`.
-        sphere: Of the block `backdrop`.
+        of: The blocks of the scene that count, at least one.
     Raises:
-        ValueError: If `scoring` names groups that no block tells about, or blocks that cannot be combined.
+        ValueError: If the scoring names groups that no block tells about, or blocks that cannot be combined.
     """
-    combined = scoring.combined_of(blocks)
-    network = [name for name in scoring.groups or () if name in NETWORK_GROUPS]
-    if "backdrop" in (scoring.groups or ()) and "backdrop" not in blocks:
-        raise ValueError(
-            f"select: groups must be of blocks {', '.join(blocks)}, got backdrop; add its block or drop it"
-        )
-    theirs = None if scoring.groups is None else tuple(x for x in scoring.groups if x not in (*network, "backdrop"))
-    traced = "deformation" if "deformation" in blocks and scoring.network != "ratio" else ""
-    apart = blocks if combined == "zscore" else ()
-    parts: list[Sequence[str]] = [[block] for block in apart] or [blocks]
-    made = [_of_gaussians(scoring, part, metric, theirs, bool(apart)) for part in parts]
-    if "deformation" in blocks and (scoring.groups is None or network):
-        rows = _rows(tuple(x for x in blocks if x in ("geometry", "semantic")), metric)
-        estimate = "diagonal" if scoring.network == "ratio" else scoring.network
-        options = {"estimate": estimate, "probes": scoring.probes, **rows}
-        name = "deformation" if apart else ""
-        made.append(Asked("network", (), tuple(sorted(options.items())), name, tuple(network) or None, not traced))
-    if "backdrop" in blocks and (scoring.groups is None or "backdrop" in scoring.groups):
-        made.append(Asked("backdrop", options=(("sphere", sphere),), block="backdrop" if apart else ""))
-    asked = [one for one in made if one is not None]
+    scoring = of.scoring
+    of.check_groups()
+    apart = of.names if scoring.combined_of(of.names) == "zscore" else ()
+    parts: list[Sequence[str]] = [[block] for block in apart] or [of.names]
+    asked = [Asked(question, name if apart else "") for part in parts for name, question in of.questions(part)]
     if not asked:
         raise ValueError(
-            f"select: groups must have one that blocks {', '.join(blocks)} tell about, got "
+            f"select: groups must have one that blocks {', '.join(of.names)} tell about, got "
             f"{', '.join(scoring.groups or ()) or 'none'}; add the other block, or another group"
         )
-    if apart:
-        apart = tuple(block for block in apart if any(one.block == block for one in asked))
-    return asked, Combination(scoring, apart, traced)
-
-
-def _of_gaussians(
-    scoring: Scoring,
-    blocks: Sequence[str],
-    metric: SemanticMetric | None,
-    groups: tuple[str, ...] | None,
-    apart: bool,
-) -> Asked | None:
-    """What these blocks ask about Gaussians, together; None if that is nothing."""
-    blocks = tuple(x for x in blocks if x in ("geometry", "semantic"))
-    without: tuple[str, ...] = () if "semantic" in blocks else ("features",)
-    if "semantic" in blocks and "geometry" not in blocks:
-        without = ("sh",)
-    if not blocks or (groups is not None and set(groups) <= set(without)):
-        return None
-    name = blocks[0] if apart else ""
-    rows = _rows(blocks, metric)
-    if scoring.criterion == "block_logdet":
-        return Asked("blocks", (), tuple(sorted(rows.items())), name)
-    options: dict[str, Hashable] = {"method": scoring.method, "groups": groups, **rows}
-    if scoring.method == "probes":
-        options["probes"] = scoring.probes
-    return Asked("diagonal", without, tuple(sorted(options.items())), name)
-
-
-def _rows(blocks: tuple[str, ...], metric: SemanticMetric | None) -> dict[str, Hashable]:
-    """Options that say which rows of the image count; none where colors are all there is."""
-    rows: dict[str, Hashable] = {"semantics": metric} if "semantic" in blocks else {}
-    if blocks and "geometry" not in blocks:
-        rows["channel_weights"] = (0.0, 0.0, 0.0)
-    return rows
+    traced = [name for name, question in of.questions(of.names) if not question.asks_known]
+    told = tuple(block for block in apart if any(one.block == block for one in asked))
+    return asked, Combination(scoring, told, *traced[:1])

@@ -35,7 +35,7 @@ def log_determinants(
 def _some(
     first: int, keep: torch.Tensor, told: list[torch.Tensor], added: torch.Tensor, rounding: float
 ) -> tuple[torch.Tensor, int]:
-    """The same of the Gaussians from `first` on."""
+    """The same for the Gaussians from `first` on."""
     H = functools.reduce(torch.add, [x.to(torch.float64) for x in told])
     diagonal = H.diagonal(dim1=1, dim2=2) * (1 + rounding) + added
     scale = torch.where(keep, diagonal.rsqrt(), 0.0)

@@ -22,8 +22,10 @@ import torch
 from drgs.cameras import Camera
 from drgs.gain import Gain, Information, Prior, check
 from drgs.guards.memory import available
+from drgs.information.blocks import add
 from drgs.information.cache import Cache, size_of
 from drgs.information.combine import Combination
+from drgs.information.criteria import criterion_named
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.pool import Pool, Question, Selection, ViewQuestion
 
@@ -60,8 +62,8 @@ class AskedView:
     """A view whose information is wanted.
 
     Attributes:
-        what: It is, for messages.
-        camera, mask: Its.
+        what: What it is called in messages.
+        camera, mask: The camera and the mask of the view.
         is_known: Whether it is one of the known ones.
     """
 
@@ -75,17 +77,17 @@ class ViewInformation:
     """Information of single views as greedy needs it: out of the pool's cache if it is there, checked, in float32.
 
     Attributes:
-        computed: Views that were not in the cache.
-        bytes: Of what a cache keeps of all views so far.
+        computed: Number of views that were not in the cache.
+        bytes: Bytes that a cache needs to keep all views so far.
         told: Group of a network -> whether any view so far says something about it.
     """
 
     def __init__(self, pool: Pool, source: InformationSource, known: InformationSource | None = None):
         """
         Args:
-            pool: Whose cache is asked, and whose `progress` is called after each view.
+            pool: The pool whose cache is asked, and whose `progress` is called after each view.
             source: What information is computed by.
-            known: The same of views that are known, where less is needed of them.
+            known: What information of known views is computed by, where less is needed of them.
         """
         self.pool = pool
         self.source = source
@@ -95,12 +97,14 @@ class ViewInformation:
         self.told: dict[str, bool] = {}
 
     def each(self, views: Sequence[AskedView]) -> Iterator[Information]:
-        """Of these views, one after another: nothing of one is held while the next one is computed."""
+        """The information of these views, one after another: nothing of one is held while the next one is computed."""
+        signed = criterion_named(self.pool.scoring.criterion, "select").of_blocks
 
         def accept(i: int, answer: Information) -> Information:
+            # Rounded once, here, whoever computed it: a cache and workers give the same bits as neither.
             found = {name: x.to(torch.float32) for name, x in answer.items()}
             self.computed += 1
-            check(f"select: {views[i].what}", found, self.pool.scoring.criterion)
+            check(f"select: {views[i].what}", found, signed)
             return found
 
         answers = self.pool.told([self._source(view).to(view) for view in views], accept)
@@ -132,8 +136,8 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
     """The best candidate, then the best once that one is known, `pool.k` times.
 
     Args:
-        pool: Whose `scoring` says how much what `information` returns counts.
-        information: Of single views.
+        pool: The pool whose `scoring` says how much what `information` returns counts.
+        information: The information of single views.
         combination: How a score is made of it; default by that scoring, all groups together.
     """
     combination = combination or Combination(pool.scoring)
@@ -303,5 +307,4 @@ def _add(H: dict[str, torch.Tensor], part: Information) -> None:
     if H.keys() != part.keys() or any(H[name].shape != x.shape for name, x in part.items()):
         shapes = ({name: tuple(x.shape) for name, x in y.items()} for y in (H, part))
         raise ValueError("select: information must be of the same parameters in every view, got {}, {}".format(*shapes))
-    for name, x in part.items():
-        H[name] += x
+    add(H, part)

@@ -46,7 +46,7 @@ def extras(
     Args:
         logit: (N,) raw opacities.
         projected: `Projected` of the view.
-        moved: Where the response asks for them, per geometric parameter but the opacity the tangent of the record.
+        moved: Tangents of the record, where the response asks for them: one per geometric parameter but the opacity.
         color: (channel, axis) nested lists of dc/dmu, or None where the color does not depend on the mean.
     """
     F = lib.Float
@@ -63,7 +63,7 @@ class Row(NamedTuple):
 
     Attributes:
         slopes: d a / d geometry; None without geometry.
-        g: Per channel, dC / da, 0 where the ray has no such hit; None without geometry.
+        g: Slopes dC / da, one per channel, 0 where the ray has no such hit; None without geometry.
         w: Weight of the hit, 0 likewise.
         turned: (color, axis) w dc/dmu, or None where the color does not depend on the mean.
         color: RGB of the Gaussian on this ray, then its other channels; None where the sink does not need them.
@@ -82,11 +82,11 @@ class Rows:
     """Replay of a primal pass that hands the Jacobian's rows of every hit to a sink.
 
     Args:
-        buffer: From `extras`; None leaves the geometry out, only w is known then.
+        buffer: The buffer of `extras`; None leaves the geometry out, only w is known then.
         sink: What becomes of them: `Diagonal`, `Blocks` or `Variance`.
-        finals: Per shared ray, the final state of the Primal pass.
+        finals: The final state of the Primal pass, one per shared ray.
         color: The color depends on the mean, through the direction.
-        masks: Per shared ray, what its rows are multiplied by; None: nothing.
+        masks: What the rows of each shared ray are multiplied by; None: nothing.
         table: Says what there is of each hit, in whatever order they come; `finals` are not needed then.
     """
 
@@ -113,7 +113,11 @@ class Rows:
         self.colors = buffer is not None or (sink is not None and sink.needs_color)
 
     def rest(self, k: int) -> list[Float]:
-        """The whole sum of each channel of shared ray k; none without geometry."""
+        """The whole sum of each channel of shared ray k; none without geometry.
+
+        In float64: what lies behind a hit is left of it by subtraction, and in float32 nothing were left of what many
+        hits in front of it have covered.
+        """
         final, D = self.finals[k], self.m.lib.Float64
         if self.buffer is None:
             return []
@@ -196,7 +200,7 @@ class Diagonal:
     """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, then by band and channel.
 
     Args:
-        weights: Of the channels: colors first, where they are composited.
+        weights: Weights of the channels: colors first, where they are composited.
         entries: Those that are wanted.
         bands: SH coefficients whose sums (w Y_k)^2 over the rays where a channel is not clamped are wanted as well:
             where SH are evaluated along each ray, they are no multiple of sum w^2.
@@ -307,7 +311,7 @@ class Variance:
 
     Args:
         buffer: 16 floats a Gaussian: the weights of the geometry, then of w^2 in each color, then of w^2 itself.
-        weights: Of the channels: colors first.
+        weights: Weights of the channels: colors first.
         light: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
         plain: Whether there are weights of w^2 itself.
     """

@@ -18,7 +18,7 @@ The random signs are the same in each view. Then equal views say the same, a can
 ratio of at most 1 as it should, and a cache may keep what was estimated. 1 / H is too large on average by a factor of
 about K / (K - 2) where one view of K probes is all that is known of a parameter: take 8 or more.
 
-References:
+Reference:
     [1] Bekas, Kokiopoulou, Saad: An estimator for the diagonal of a matrix, 2007; Hutchinson 1990 for the trace.
     [2] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771, section 3.3.
 """
@@ -84,13 +84,13 @@ def network(
         cameras: One or several; each has a time.
         settings: Default `RenderSettings.preset("exact")`.
         estimate: `diagonal`, `trace` or `paper`, see the module's text.
-        mode: Of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one traversal.
-            `diagonal` has reverse mode only, `paper` needs both.
+        mode: Mode of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one
+            traversal. `diagonal` has reverse mode only, `paper` needs both.
         probes: K, of each view; the error falls as 1 / sqrt(K).
-        seed: Of the random signs, the same in all views.
+        seed: Seed of the random signs, the same in all views.
         channel_weights: Inverse noise variances of R, G and B.
         semantics: The metric in which decoded features tell, too; its `estimate` says how many channels they take.
-        masks: As for `drgs.fisher.diagonal`.
+        masks: The same as for `drgs.fisher.diagonal`.
     Returns:
         Group (`grid`, `mlp`; those that there are) -> float64 on the CPU: (P,) of its P parameters in the order of
         `scene.parameters()`, of `trace` and `paper` a number ().
@@ -131,8 +131,8 @@ def network_variance_map(
     mean of (J v)^2 over v = z sqrt(weights), z random signs: forward mode.
 
     Args:
-        scene, camera, settings, probes, seed, channel_weights, semantics: As for `network`; a pixel of n rows has a
-            relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
+        scene, camera, settings, probes, seed, channel_weights, semantics: The same as for `network`; a pixel of n rows
+            has a relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
         weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
     """
     where = "fisher.network_variance_map"
@@ -158,7 +158,7 @@ def network_variance_map(
             for name, root in roots.items():
                 tangents |= _unflat(groups[name], _signs(generator, count, len(root)) * root)
             total += view.push(tangents).square().sum((0, 2))
-    return (total / probes).float().reshape(camera.height, camera.width)
+    return (total / probes).float().reshape(camera.height, camera.width)  # a map, as `fisher.variance_map` gives it
 
 
 Groups = Mapping[str, Mapping[str, torch.Tensor]]  # group -> name -> parameter
@@ -169,7 +169,7 @@ class _View:
     """The rows of a view's image, each divided by its noise, as a function of phi.
 
     Attributes:
-        call: Of the view.
+        call: The call of the view.
         scales: (C,) what the call's channels are multiplied by, colors, then semantic channels; with a mask
             (pixels, C).
     """
@@ -188,7 +188,7 @@ class _View:
         semantics: SemanticMetric | None,
         mask: torch.Tensor | None = None,
     ) -> _View | None:
-        """Of a scene at the time of a camera; None if there is nothing to see."""
+        """A scene at the time of a camera; None if there is nothing to see."""
         with torch.no_grad():  # derivatives are taken from Dr.Jit's side
             seen = gaussians_at(where, scene, camera)
         check_view(where, seen, camera, settings)
@@ -207,8 +207,9 @@ class _View:
             seen = reduced.reduced(seen)
             scales = torch.cat([scales, torch.full((directions.shape[1],), semantics.weight**0.5)])
         settings = settings or RenderSettings.preset("exact")
-        if mask is not None:
+        if mask is not None:  # a number, whatever graph it is in
             scales = mask.detach().double().cpu().reshape(-1, 1) * scales
+        # Detached: Dr.Jit differentiates through `deformed`, of which these are only the values now.
         return cls(Call(seen.detach(), camera, settings, frozenset(), scene=deformed), scales)
 
     @property
@@ -222,7 +223,7 @@ class _View:
 
     def pulled(self, pull: Pullback, groups: Groups, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """Group -> (P,) slopes along (pixels, C) rows."""
-        scaled = (rows * self.scales).float()
+        scaled = (rows * self.scales).float()  # as cotangents of images are
         slopes = pull(scaled[:, :3], scaled[:, 3:] if self.rows > 3 else None)
         return {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
 

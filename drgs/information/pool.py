@@ -6,7 +6,7 @@ import dataclasses
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 
@@ -26,8 +26,8 @@ class Pick:
 
     Attributes:
         index: Place in the list of candidates.
-        name: Of its camera.
-        score: When it was picked.
+        name: Name of its camera.
+        score: Its score when it was picked.
         parts: Group -> its share of the score; empty for policies without groups.
         margin: This score minus the next best one's at that time; None when nothing else was left or the policy ranks
             nothing. With several threads sums differ in their last digits, so that ties and near-ties may fall
@@ -43,19 +43,19 @@ class Pick:
 
 @dataclasses.dataclass
 class Selection:
-    """What a policy chose, in which order, and the scores that it chose by; `dataclasses.asdict` of it is plain JSON.
+    """What a policy chose, in which order, and the scores that it chose by; `to_json` is how files hold it.
 
     Attributes:
-        picks: In the order of picking.
-        scores: Of every candidate, before the first pick.
-        parts: Of every candidate, before the first pick: group -> what it adds to the score.
-        unseen: Of every candidate: what of its score, in the same unit, is of parameters that no training view has
+        picks: Picks in the order of picking.
+        scores: Scores of all candidates, before the first pick.
+        parts: Parts of all candidates' scores, before the first pick: group -> what it adds.
+        unseen: Share of each candidate's score, in the same unit, that is of parameters that no training view has
             information about (lambda alone decides how much they count).
         left_out: Group -> parameters not counted because lambda = 0 and no training view has information about them.
         evaluations: How often a candidate was scored.
         computed: Views whose information was computed, not taken from the cache.
         notes: What a reader of the result should know, one sentence each.
-        blocks: Of which blocks of the image the information is; empty for policies without.
+        blocks: The blocks of the image that the information is of; empty for policies without.
         semantics: What is coupled, if anything is: the metric's estimate, gamma and width.
         network: How the block `deformation` scored, and from how many probes, if it did.
         combine: `sum` of the groups' parts, or of blocks' z-scores over the candidates that were left: then scores
@@ -77,6 +77,43 @@ class Selection:
     combine: Combine = "sum"
     seconds: float = 0.0
 
+    def blocks_json(self) -> dict[str, Any]:
+        """What of images the scores are of, as files hold it."""
+        return {name: getattr(self, name) for name in ("blocks", "semantics", "network", "combine")}
+
+    def picks_json(self, views: Sequence[Mapping], after: Sequence[Mapping] | None = None) -> list[dict[str, Any]]:
+        """Each pick as files hold it: what is said of its view, score, parts, margin, what is said after these.
+
+        Args:
+            views: What is said of each candidate, in their order: index, name and what else says which view it is.
+            after: What is said of each at the end of its record.
+        """
+        return [
+            {
+                **views[pick.index],
+                "score": pick.score,
+                "parts": pick.parts,
+                "margin": pick.margin,
+                **(after[pick.index] if after else {}),
+            }
+            for pick in self.picks
+        ]
+
+    def candidates_json(
+        self, views: Sequence[Mapping], after: Sequence[Mapping] | None = None, no_parts: Mapping | None = None
+    ) -> list[dict[str, Any]]:
+        """Each candidate as files hold it: what is said of its view, score, parts, unseen, what is said after these.
+
+        Args:
+            views, after: The same as for `picks_json`.
+            no_parts: What stands for `parts` where the policy has no groups.
+        """
+        count = len(self.scores)
+        parts: Sequence[Mapping | None] = self.parts or [no_parts] * count
+        unseen: Sequence[float | None] = self.unseen or [None] * count
+        rows = zip(views, self.scores, parts, unseen, after or [{}] * count, strict=True)
+        return [{**view, "score": score, "parts": own, "unseen": x, **rest} for view, score, own, x, rest in rows]
+
 
 Question = Callable[[Scene, Camera, torch.Tensor | None], Information]
 """What is asked of a view: scene, camera and mask -> tensors by name. Other processes can be sent it."""
@@ -88,7 +125,7 @@ class ViewQuestion:
 
     Attributes:
         question: What is asked.
-        camera, mask: Of the view.
+        camera, mask: The camera and the mask of the view.
         kept_by: What the answer depends on besides scene, camera and mask; None: on the question.
     """
 
@@ -118,19 +155,19 @@ class Pool:
     """Everything that a policy may look at: the scene, the views that are known and those to choose from.
 
     Attributes:
-        scene: As it is now; the Gaussians that a camera sees are `scene.at(camera.time)`.
+        scene: The scene as it is now; the Gaussians that a camera sees are `scene.at(camera.time)`.
         candidates: Cameras to choose from, at least `k`; a policy names them by their place in this list.
         train: Cameras whose views are known; may be empty.
-        masks: Of these, where they have some; see `drgs.fisher.diagonal`.
+        masks: Masks of these, where they have some; see `drgs.fisher.diagonal`.
         empty_outside: Whether it is known that nothing is outside of the masks, as of an object's.
         k: How many to pick.
         scoring: How views are scored, where the policy scores them by information.
-        rng: Where policies that draw take their numbers from.
-        cache: Where information of single views is looked up and kept; None: nowhere.
+        rng: Generator that policies that draw take their numbers from.
+        cache: Cache where information of single views is looked up and kept; None: nowhere.
         lazy: Whether greedy policies leave out scores that cannot win; see `drgs.information.greedy`.
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
-        workers: Where information is computed; None: here.
+        workers: Processes that compute information; None: this one.
     """
 
     scene: Scene
@@ -159,7 +196,7 @@ class Pool:
         """What views say, one after another: out of the cache, else computed by the workers, if any, else here.
 
         Args:
-            views: In their order.
+            views: Questions to the views, in their order.
             accept: Called with the place of a view and what was computed of it; returns what is made of that, and kept.
         """
         cache = self.cache

@@ -38,9 +38,9 @@ def by_probes(
     """Mean of (J^T v)^2 over Rademacher images v of RGB and decoded features; what only features tell about is exact.
 
     Args:
-        semantics: Of the features; v has a sign for each direction that the decoder sees, and L v is what the features
-            get of it, for E (J^T L v)^2 = diag(J^T M J). None: v is of RGB only.
-        scene: Where the Gaussians come from: all groups are of this scene then.
+        semantics: The metric of the features; v has a sign for each direction that the decoder sees, and L v is what
+            the features get of it, for E (J^T L v)^2 = diag(J^T M J). None: v is of RGB only.
+        scene: The scene that the Gaussians come from: all groups are of it then.
         mask: (H, W) what the image is multiplied by; None: 1.
     """
     if not (isinstance(probes, int) and probes >= 1):
@@ -48,12 +48,14 @@ def by_probes(
     other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
     groups = {name: group for name, group in groups.items() if name not in other}
     total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
-    # Without a graph of torch, as in `Replay`.
+    # Detached: information is a number, and its derivatives are taken by Dr.Jit. Features that nobody asks about would
+    # be composited for nothing.
     seen = gaussians.detach() if semantics else gaussians.detach().replace(features=None)
     call = Call(seen, camera, settings, frozenset(), scene=scene)
     generator = torch.Generator().manual_seed(seed)
     pull = Pullback(call, [group.input for group in groups.values()])
     root = torch.tensor(weights).sqrt()
+    # float32, as cotangents of images are; squares of the slopes are summed in float64.
     factor = torch.ones(1, 1) if mask is None else mask.detach().float().cpu().reshape(-1, 1)
     for _ in range(probes if groups else 0):
         sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1
@@ -74,8 +76,8 @@ class Pullback:
     def __init__(self, call: Call, names: Sequence[str]) -> None:
         """
         Args:
-            call: Of the view; its scene, if it has one, is where the Gaussians come from.
-            names: Of the call's inputs, those that slopes are wanted of.
+            call: The call of the view; its scene, if it has one, is where the Gaussians come from.
+            names: The call's inputs that slopes are wanted of.
         """
         self.call = call
         self.names = list(names)

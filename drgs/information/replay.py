@@ -41,7 +41,7 @@ class Walk(NamedTuple):
 
     Attributes:
         first: It is the traversal whose colors weigh.
-        weights: Of its channels: three colors, then semantic channels.
+        weights: Weights of its channels: three colors, then semantic channels.
         channels: What it composited.
         part, finals: The rays, and their final states.
         table: What is known of their hits, where final states are not needed.
@@ -207,6 +207,7 @@ class Replay:
         total = torch.zeros(self.count, width, dtype=torch.float64)
         for walk in self._walks(weights):
             sink = sink_of(walk, walk.part.reduction)
+            # A buffer is float32, which one traversal fills; what several add up to is float64.
             dr.eval(self._replay(walk, sink), sink.buffer)
             found = _torch(sink.buffer).reshape(self.count, -1)
             total[:, : found.shape[1]] += found
@@ -237,7 +238,7 @@ class Replay:
         return result
 
     def blocks(self, weights: Sequence[float]) -> torch.Tensor:
-        """`blocks` of one view."""
+        """`fisher.blocks` of one view."""
         lib, size = self.lib, Blocks.SIZE
         made = lambda walk, mode: Blocks(lib, self.count, walk.weights, mode)  # noqa: E731
         total = self._summed(made, Blocks.WIDTH, weights)
@@ -248,7 +249,7 @@ class Replay:
         return full
 
     def variance(self, information: Information, weights: Sequence[float]) -> torch.Tensor:
-        """`variance_map`."""
+        """`fisher.variance_map` of one view, by weights of the groups (`information`) and of the channels."""
         lib = self.lib
         table = torch.zeros(self.count, 16, dtype=torch.float64)
         for name, values in information.items():
@@ -268,6 +269,7 @@ class Replay:
             for state, at, inside in zip(self._replay(walk, sink), walk.part.flat, walk.part.inside, strict=True):
                 dr.scatter_add(image, state["variance"], at, inside)
             dr.eval(image)
+        # Sums of weights that lambda = 0 makes huge may be inf, which a picture's scale could not hold.
         return image.torch().cpu().clamp_max(_FLOAT_MAX).reshape(self.call.shape)
 
     def _weights(self, weights: torch.Tensor) -> Float:

@@ -11,18 +11,20 @@ from drgs.guards.arguments import kind_of, must_be
 from drgs.guards.records import TRANSIENT, Record
 from drgs.information.choices import (
     BLOCK_NAMES,
+    BLOCKS,
     COMBINES,
     CRITERION_NAMES,
     METHODS,
     NETWORK_SCORES,
     Block,
     Combine,
-    Criterion,
     Method,
     NetworkScore,
     check_combined,
+    check_named,
     checked_blocks,
 )
+from drgs.information.criteria import CRITERIA, criterion_named
 from drgs.information.prior import Prior
 from drgs.settings import RenderSettings
 
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Scoring"]
 
-_KNOWN = 1e-2  # lambda of v_opt: the variance of a photograph's noise, 0.03^2, over that of a color, 0.3^2
+_EXACT = RenderSettings.preset("exact")  # made once: every record of options has a `Scoring`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +61,8 @@ class Scoring(Record):
     `fisher` and `fisherrf`. Groups of a scene's network need method `columns` or `probes`.
 
     Attributes:
-        criterion: Score of policy fisher; v_opt chose the best views from six on, level below (docs/active-static.md).
+        criterion: Score of policy fisher, or package.module:function of one's own; v_opt chose the best views from six
+            on, level below (docs/active-static.md).
         settings: What `drgs.render` computes of a view.
         method: How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does.
         prior: How firmly every parameter counts as known beforehand (lambda): 1e-2 with v_opt, 1 in drgs fisher, else
@@ -78,10 +81,8 @@ class Scoring(Record):
             the wrong kind.
     """
 
-    criterion: Criterion = CRITERION_NAMES[0]
-    settings: RenderSettings = dataclasses.field(
-        default_factory=lambda: RenderSettings.preset("exact"), metadata=TRANSIENT
-    )
+    criterion: str = CRITERION_NAMES[0]
+    settings: RenderSettings = dataclasses.field(default=_EXACT, metadata=TRANSIENT)
     method: Method = METHODS[0]
     prior: Prior | None = None
     weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -94,11 +95,8 @@ class Scoring(Record):
     where: ClassVar[str] = "select"
 
     def __post_init__(self) -> None:
-        choices: dict[str, tuple[str, ...]] = {
-            "criterion": CRITERION_NAMES,
-            "method": METHODS,
-            "network": NETWORK_SCORES,
-        }
+        check_named("select", CRITERIA, self.criterion)
+        choices: dict[str, tuple[str, ...]] = {"method": METHODS, "network": NETWORK_SCORES}
         for name, known in (choices | ({} if self.combine is None else {"combine": COMBINES})).items():
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"select: {name} must be one of {', '.join(known)}, got {value!r}; choose one")
@@ -127,24 +125,17 @@ class Scoring(Record):
         """The blocks that are scored of a scene.
 
         Args:
-            gaussians: As they are at some time of it.
-            where: For messages.
-            scene: Itself; None: it is these Gaussians, which do not move.
+            gaussians: The Gaussians at some time of it.
+            where: What an error begins with.
+            scene: The scene; None: it is these Gaussians, which do not move.
         Raises:
             ValueError: If one is wanted that the scene does not have.
         """
-        from drgs.information.network_groups import network_groups
-
-        missing = {
-            "semantic": "for Gaussians without features; fit them to a data set with teacher maps"
-            if gaussians.features is None
-            else "",
-            "deformation": "" if scene and network_groups(scene) else "for a scene that no network moves",
-        }
+        missing = {block: BLOCKS[block].lack(gaussians, scene) for block in self.blocks or BLOCK_NAMES}
         if self.blocks is None:
             if self.method == "fisherrf":
                 return ("geometry",)
-            if self.criterion == "block_logdet":  # which only Gaussians have
+            if criterion_named(self.criterion, "select").of_blocks:  # which only Gaussians have
                 return ("geometry", *(("semantic",) if not missing["semantic"] else ()))
             return tuple(block for block in BLOCK_NAMES if not missing.get(block))
         for block in self.blocks:
@@ -158,7 +149,7 @@ class Scoring(Record):
         """lambda of a policy by this scoring."""
         if self.prior is not None:
             return self.prior
-        return Prior(_KNOWN) if policy == "fisher" and self.criterion == "v_opt" else Prior()
+        return Prior(criterion_named(self.criterion, "select").prior) if policy == "fisher" else Prior()
 
     def combined_of(self, blocks: tuple[Block, ...]) -> Combine:
         """How the scores of these blocks become one."""

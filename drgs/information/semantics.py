@@ -57,7 +57,7 @@ class SemanticMetric:
         weight: gamma, the inverse noise variance of a decoded channel, where that of a color is 1.
         estimate: `exact`, `principal` or `collapsed` (the module's text).
         samples: K, channels of `principal` and `collapsed`; `exact` is taken where it needs no more.
-        seed: Of its signs: the same for all views that are compared.
+        seed: Seed of its signs: the same for all views that are compared.
     Raises:
         ValueError: If a value is out of range, or the matrix is no metric.
     """
@@ -70,6 +70,7 @@ class SemanticMetric:
 
     def __post_init__(self) -> None:
         must_be("SemanticMetric", "matrix", self.matrix, torch.Tensor, "e.g. decoder.metric()")
+        # A copy that no graph and no later step of the optimizer reaches: the metric is frozen.
         M = self.matrix.detach().to("cpu", torch.float64, copy=True)
         if M.ndim != 2 or M.shape[0] != M.shape[1] or not len(M):
             raise ValueError(
@@ -77,7 +78,7 @@ class SemanticMetric:
             )
         if not torch.isfinite(M).all():
             raise ValueError("SemanticMetric: matrix must be finite, got NaN or Inf; check the decoder")
-        if float((M - M.T).abs().max()) > 1e-6 * float(M.abs().max()):
+        if float((M - M.T).abs().max()) > 1e-6 * float(M.abs().max()):  # more than W^T W in float32 leaves
             raise ValueError("SemanticMetric: matrix must be symmetric, got one that is not; use W.T @ W")
         object.__setattr__(self, "matrix", 0.5 * (M + M.T))
         if not (isinstance(self.weight, int | float) and 0 < self.weight < float("inf")):
@@ -93,7 +94,7 @@ class SemanticMetric:
 
     @classmethod
     def of(cls, decoder: _Decodes | None, width: int, **fields: Any) -> SemanticMetric:
-        """Of a decoder as it is now; without one of the features themselves, `width` channels that count alike."""
+        """The metric of a decoder as it is now; without one, that of `width` channels that count alike."""
         return cls(torch.eye(width, dtype=torch.float64) if decoder is None else decoder.metric(), **fields)
 
     @property
@@ -111,7 +112,7 @@ class SemanticMetric:
         """(D, rank) L with L L^T = M, without the directions that the decoder does not see."""
         values, vectors = torch.linalg.eigh(self.matrix)
         top = float(values[-1])
-        if float(values[0]) < -1e-6 * max(top, 0.0) or top < 0:
+        if float(values[0]) < -1e-6 * max(top, 0.0) or top < 0:  # below what rounding of float32 makes of 0
             raise ValueError(
                 f"SemanticMetric: matrix must be positive semidefinite, got an eigenvalue of {float(values[0]):.3g}; "
                 "use W.T @ W"
@@ -129,6 +130,7 @@ class SemanticMetric:
         draw = lambda *shape: torch.randint(0, 2, shape, generator=generator).double() * 2 - 1  # noqa: E731
         if self.estimate == "collapsed":
             return L @ draw(rank, K) / K**0.5
+        # Detached: directions are frozen, too. float64, for eigenvectors of sums of thousands of squares.
         some = features[:: max(1, len(features) // _SAMPLE)].detach().double().cpu() @ L
         Q = torch.linalg.eigh(some.T @ some)[1].flip(1)  # eigenvalues descend
         return L @ torch.cat([Q[:, : K - 1], Q[:, K - 1 :] @ draw(rank - K + 1, 1)], 1)

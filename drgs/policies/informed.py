@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.gain import Information
-from drgs.information.backdrop import backdrop_sphere
+from drgs.information.blocks import CoverageQuestion, DiagonalQuestion, SceneBlocks
 from drgs.information.combine import Asked, Combination, Questions, asked_of
 from drgs.information.greedy import InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pool, Selection
-from drgs.information.semantics import SemanticMetric
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -31,23 +30,16 @@ _FEW_PROBES = 8  # of a network's information, below which 1 / H is far too larg
 
 def fisher(pool: Pool) -> Selection:
     """Largest gain of Fisher information, of the blocks of the image that the scoring names."""
-    scoring, metric = pool.scoring, None
+    scoring = pool.scoring
     if pool.information is not None:  # it knows by itself what it is about
         return _greedy(pool, ())
-    with torch.no_grad():
-        seen = pool.scene.at(pool.candidates[0].time)
-    blocks = scoring.blocks_of(seen, scene=pool.scene)
-    if "semantic" in blocks:
-        assert seen.features is not None  # else there is no such block
-        metric = scoring.semantics or SemanticMetric.of(None, seen.features.shape[1])
-    sphere = None
-    if "backdrop" in blocks:
-        sphere = backdrop_sphere(pool.scene, [*pool.train, *pool.candidates], pool.answers)
-    asked, combination = asked_of(scoring, blocks, metric, sphere)
+    views = [*pool.train, *pool.candidates]
+    blocks = SceneBlocks.of(pool.scene, scoring, views, answers=pool.answers, empty_outside=pool.empty_outside)
+    asked, combination = asked_of(blocks)
     selection = _greedy(pool, asked, combination)
-    selection.blocks = list(blocks)
-    selection.semantics = metric.to_json() if metric else None
-    if "deformation" in blocks:
+    selection.blocks = list(blocks.names)
+    selection.semantics = blocks.metric.to_json() if blocks.metric else None
+    if "deformation" in blocks.names:
         selection.network = {"score": scoring.network, "probes": scoring.probes}
         if scoring.network == "ratio" and scoring.probes < _FEW_PROBES:
             selection.notes.append(
@@ -65,7 +57,7 @@ def fisherrf(pool: Pool) -> Selection:
     prior = pool.scoring.prior_of("fisherrf")
     weights = _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
-    asked = Asked("diagonal", ("features",), (("method", "fisherrf"),))
+    asked = Asked(DiagonalQuestion("fisherrf", without=("features",)))
     plain = dataclasses.replace(pool, masks=None)  # of which FisherRF knows nothing
     return _greedy(_scored(plain, criterion="eig", prior=prior, weights=weights), [asked])
 
@@ -73,14 +65,14 @@ def fisherrf(pool: Pool) -> Selection:
 def coverage(pool: Pool) -> Selection:
     """Largest sum Wc / (W + lambda), W = sum over pixels of w^2."""
     prior = dataclasses.replace(pool.scoring.prior_of("coverage"), groups={})
-    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), [Asked("coverage")])
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), [Asked(CoverageQuestion())])
 
 
 def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None = None) -> Selection:
     """`greedy` by what `drgs.fisher` says of each view, or by the pool's own information.
 
     Args:
-        pool: Whose scoring says how much it counts.
+        pool: The pool whose scoring says how much it counts.
         asked: What is asked of a view.
         combination: How that becomes a score; default by the pool's scoring, all groups together.
     """
@@ -88,15 +80,16 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
     combination = combination or Combination(pool.scoring)
 
     def by(asked: Sequence[Asked]) -> InformationSource:
-        questions = Questions(settings, tuple(asked), pool.empty_outside)
+        questions = Questions(settings, tuple(asked))
         if pool.cache is None:
             return InformationSource(questions)
-        return InformationSource(questions.lasting(), finish=questions.painted)
+        return InformationSource(questions.lasting(), finish=questions.finished)
 
     if own := pool.information:
         source = InformationSource(lambda scene, camera, mask: own(camera), (own, settings), by_name=True)
         return greedy(pool, ViewInformation(pool, source), combination)
-    known = None if all(one.known for one in asked) else by([one for one in asked if one.known])
+    told = [one for one in asked if one.question.asks_known]
+    known = None if len(told) == len(asked) else by(told)
     return greedy(pool, ViewInformation(pool, by(asked), known), combination)
 
 
@@ -106,6 +99,7 @@ def _scored(pool: Pool, **fields: Any) -> Pool:
 
 
 def _without_rotations(groups: Mapping[str, float]) -> dict[str, float]:
+    """What is said of groups that FisherRF's rasterizer knows."""
     return {name: x for name, x in groups.items() if name != "rotations"}
 
 
@@ -135,6 +129,6 @@ class _Moments:
     settings: RenderSettings
 
     def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        from drgs.information.moments import moments_map  # loads Dr.Jit, which other policies need not have
+        from drgs.information.maps import moments_map  # loads Dr.Jit, which other policies need not have
 
         return {"moments": moments_map(scene.at(camera.time), camera, self.settings).double().mean()}

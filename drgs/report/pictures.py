@@ -12,16 +12,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs import fisher
 from drgs.display import pictures
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.gain import Prior, variances
+from drgs.gain import variances
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks, add, together
+from drgs.information.scoring import Scoring
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
+    from drgs.information.choices import Block
     from drgs.report.account import Account
     from drgs.settings import RenderSettings
 
@@ -32,7 +34,7 @@ _WIDEST = 1200  # pixels; more than a page is wide
 _PREVIEWS = 12
 _MAP_WIDTH = 480  # pixels, about
 _LARGEST = 1 << 28  # bytes of a PNG in a run folder that is opened
-_PRIOR = Prior(1.0)  # as for the maps of `drgs fisher`
+_MAPPED: tuple[Block, ...] = ("geometry", "backdrop")
 _KNOWN = 24  # views whose information is added up; of more, these stand for all
 _MOMENTS = 12
 
@@ -112,27 +114,25 @@ def maps(
 ) -> dict[str, tuple[Picture, Picture]]:
     """View -> how uncertain each pixel is by what the fitted views say, and what no Gaussian covers.
 
-    The first is `drgs.fisher.variance_map` of the colors, with the color behind everything among the parameters
-    (lambda = 1); of more than 24 known views, 24 evenly chosen ones stand for all.
+    The first is the predictive variance by the blocks geometry and backdrop, with lambda = 1; of more than 24 known
+    views, 24 evenly chosen ones stand for all.
     """
     if not known or not shown:
         return {}
     counted = spread(known, _KNOWN)
     result = dict[str, tuple[Picture, Picture]]()
-    sphere = fisher.backdrop_sphere(scene, [*known, *shown.values()])
+    scoring = Scoring(settings=settings, blocks=_MAPPED)
+    blocks = SceneBlocks.of(scene, scoring, [*known, *shown.values()], "report")
     with Bar("maps of information", len(counted) + len(shown)) as bar:
         total: dict[str, torch.Tensor] = {}
         for camera in counted:
-            plain = colors_only(scene, camera.time)
-            behind = fisher.backdrop(plain, camera, settings, sphere=sphere)
-            said = {**fisher.diagonal(plain, camera, settings), "backdrop": behind}
-            for name, x in said.items():
-                total[name] = total.get(name, 0) + x * (len(known) / len(counted))
+            said = together(blocks.information(camera))
+            add(total, {name: x * (len(known) / len(counted)) for name, x in said.items()})
             bar.advance()
-        weights = variances(total, _PRIOR)
+        weights = variances(total, MAP_PRIOR)
         for name, camera in shown.items():
             plain = colors_only(scene, camera.time)
-            variance = fisher.variance_map(plain, camera, weights, settings, sphere=sphere).numpy()
+            variance = blocks.variance_map(camera, weights).numpy()
             with torch.no_grad():  # a picture
                 alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
             bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)

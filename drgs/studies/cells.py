@@ -55,8 +55,8 @@ class Metric:
 
     Attributes:
         key: Its name in rows.
-        title: In tables.
-        digits: Behind the decimal point in tables.
+        title: Heading in tables.
+        digits: Digits behind the decimal point in tables.
         larger: Whether larger is better.
         path: Keys that lead to it in metrics.json; default ("mean", key).
         optional: Not every data set has what it takes: where a key is missing, the number is None.
@@ -90,7 +90,7 @@ class Study:
     """What its cells have in common.
 
     Attributes:
-        name: Of the study and its scale; in every row, and the folder of its runs.
+        name: Name of the study and its scale; in every row, and the folder of its runs.
         folder: Scene and split -> folder of the data set, made where it is not there yet.
         policies: Label -> fields of `SelectionConfig` and its scoring; None: all views are known from the start, and
             none is picked.
@@ -176,7 +176,7 @@ def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int,
     """The first seeds that draw different sets of initial views.
 
     Args:
-        study, scene, split: Of the cells.
+        study, scene, split: The cells' own.
         count: How many.
         protocol: A name of `PROTOCOLS`, which may say how many initial views there are.
     Raises:

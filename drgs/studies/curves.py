@@ -24,9 +24,9 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
     """Write what a study's fits had at each number of views, on average over the units of a scene.
 
     Args:
-        study: Whose policies are drawn, in their order.
-        rows: Of one protocol.
-        metric: Its.
+        study: Study; its policies are drawn in their order.
+        rows: Rows of one protocol.
+        metric: Metric on the vertical axis.
         path: A .png or .svg.
     Returns:
         False where there is no matplotlib, or no row was measured on the way.

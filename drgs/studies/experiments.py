@@ -32,8 +32,9 @@ _DEFAULT = "geometry+semantic+backdrop, v_opt"
 _MOVING_DEFAULT = "joint+backdrop, v_opt"
 
 
-def fisher_policy(criterion: str, *blocks: str, **fields: Any) -> dict[str, Any]:
-    """Fields of a `SelectionConfig` of policy `fisher` with a criterion and blocks, and whatever else is given."""
+def fisher_policy(criterion: str, *blocks: str, prior: float | None = None) -> dict[str, Any]:
+    """Fields of a `SelectionConfig` of policy `fisher` with a criterion, blocks and, unless it is None, lambda."""
+    fields = {} if prior is None else {"prior": Prior(prior)}
     return {"policy": "fisher", "criterion": criterion, "blocks": blocks, **fields}
 
 
@@ -46,7 +47,7 @@ _POLICIES: Mapping[str, Mapping[str, Any] | None] = {
     "geometry+semantic": fisher_policy("eig", "geometry", "semantic"),
     "geometry+deformation": fisher_policy("eig", "geometry", "deformation"),
     "joint": fisher_policy("eig", *_EVERYTHING),
-    **{f"joint, lambda {x}": fisher_policy("eig", *_EVERYTHING, prior=Prior(float(x))) for x in ("0", "1e-7", "1e-5")},
+    **{f"joint, lambda {x}": fisher_policy("eig", *_EVERYTHING, prior=float(x)) for x in ("0", "1e-7", "1e-5")},
     _MOVING_DEFAULT: {"policy": "fisher"},
     "all views": None,
 }
@@ -62,7 +63,7 @@ class Experiment:
         policies: Label -> what the table calls it.
         reference: The label that the others are compared with.
         paper: Label -> the paper's numbers, as far as its text states them.
-        source: Where in the paper, on which data.
+        source: Place in the paper, and its data.
     """
 
     title: str
@@ -221,8 +222,8 @@ def study_of(
     """The study that an experiment's cells are of.
 
     Args:
-        study: Which of the two.
-        scale: Of its fits, and of the scenes that are made.
+        study: Name of the study.
+        scale: Scale of its fits, and of the scenes that are made.
         made: Folder of the scenes that are made.
         given: Scene -> data set, of those that are not made.
         policies: Label -> fields of `SelectionConfig`; default those of all its experiments.

@@ -22,13 +22,13 @@ class Sizes:
     """How large the fits of a study are, and the scenes that are made for it.
 
     Attributes:
-        fit: Of every cell.
+        fit: Configuration of every cell.
         image, teacher: (width, height) of images and of a teacher's maps.
         every: Steps between two picks; None: by the number of steps, where things move.
         add: Views to be picked; None: 10, or one at each later time.
-        views: Of a room.
-        cameras: Of a kitchen; it has as many times as the fit takes.
-        info_pixels: Of the views that information is computed from; None: those of the fit.
+        views: Views of a room.
+        cameras: Cameras of a kitchen; it has as many times as the fit takes.
+        info_pixels: Pixels of the views that information is computed from; None: those of the fit.
     """
 
     fit: FitConfig

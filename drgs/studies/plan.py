@@ -28,8 +28,8 @@ class StudyPlan:
     """What is to be done.
 
     Attributes:
-        experiment: Whose table it is.
-        study: Of its cells.
+        experiment: Experiment, a table of the paper.
+        study: Study of its cells.
         cells: Units outermost.
         notes: Sentences about what is left out, and why.
     """
@@ -55,8 +55,8 @@ def plan_of(
     """The cells of an experiment.
 
     Args:
-        name: Of the experiment.
-        scale: Of fits and of the scenes that are made.
+        name: Name of the experiment.
+        scale: Scale of fits and of the scenes that are made.
         made: Folder of these.
         given: Data sets in place of them.
         seeds: Sets of initial views of each static scene; where things move, kitchens, or fits of each data set.

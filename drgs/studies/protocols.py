@@ -16,7 +16,7 @@ class Protocol:
     """What a cell's fit is told beyond its study.
 
     Attributes:
-        told: In words, for pages.
+        told: Description for pages.
         points: `init_points` of the fit's data.
         selection: Fields of `SelectionConfig` that replace those of the study.
         static: Whether it is only for loops that add views of one time.

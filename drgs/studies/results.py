@@ -27,10 +27,10 @@ def results_page(
     """The section of one experiment as Markdown.
 
     Args:
-        study: Whose cells they are.
+        study: Study of the cells.
         experiment: The table.
         rows: ResultRows of the study; those of other policies are left out.
-        level: Of its heading.
+        level: Level of its heading.
         told: More sentences, e.g. of what is not there and why.
     """
     labels = [label for label in experiment.policies if any(row["policy"] == label for row in rows)]
@@ -88,7 +88,7 @@ def best_of_units(rows: ResultRows, metric: str = _BEST_BY) -> tuple[dict[str, i
     """In how many units each policy has the largest number, and how many units have all policies.
 
     Args:
-        rows: Of one protocol.
+        rows: Rows of one protocol.
         metric: Larger is better.
     """
     labels = [label for label in dict.fromkeys(row["policy"] for row in rows) if label != _UPPER]

@@ -27,8 +27,8 @@ class Cell:
         start: `first` view by name, or the one that the `seed` draws; the others of the initial views follow from it.
         policy: Label of a policy of the study.
         protocol: A name of `drgs.studies.protocols.PROTOCOLS`.
-        seed: Of everything random in the fit.
-        camera: Of what several cameras film at once: the one that is held out at all times, in place of `split`, which
+        seed: Seed of everything random in the fit.
+        camera: Camera that is held out at all times, where several film at once, in place of `split`, which
             is (0, 0); what is known at the start is what all others see at the first time, whatever `start` says.
     """
 

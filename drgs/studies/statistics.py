@@ -52,12 +52,12 @@ class Effect:
     """A mean difference.
 
     Attributes:
-        mean: Of the scenes' means.
+        mean: Mean of the scenes' means.
         low, high: Its 95 % interval.
         detectable: How large a true difference has to be for a t test of so many scenes' means (of one scene: of its
             units) to tell it from 0 in 4 of 5 studies, with 5 % of false alarms; None with a single mean.
         units, scenes: How many there are.
-        positive, negative: In how many units the difference is above 0, and below.
+        positive, negative: Units in which the difference is above 0, and below.
     """
 
     mean: float
@@ -122,7 +122,7 @@ def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Effect:
 
     Args:
         values: Unit -> difference, at least one.
-        draws: Of the bootstrap, the same ones every time.
+        draws: Draws of the bootstrap, the same ones every time.
     """
     scenes: dict[str, list[float]] = {}
     for unit, value in values.items():

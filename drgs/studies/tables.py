@@ -45,7 +45,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
     Args:
         study: What was studied.
         rows: Its rows (`drgs.studies.rows.read_study`); others are left out.
-        level: Of the headings.
+        level: Level of the headings.
     """
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in study.policies]
     if not rows:

@@ -35,7 +35,7 @@ from drgs.tracing.kernels import HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.sort_keys import EMPTY, positive
 from drgs.tracing.tiles import depth_order
-from drgs.tracing.walk import BUFFER, Part
+from drgs.tracing.walk import Part
 
 __all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 
@@ -97,7 +97,7 @@ class BvhTraversal:
             stream,
             ordered=True,
             center_key=self.center_key,
-            buffer=_NEARLY if s.order == "entry" else BUFFER,
+            buffer=_NEARLY if s.order == "entry" else None,
         )
         return [part]
 

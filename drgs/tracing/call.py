@@ -68,8 +68,8 @@ class Call:
             `time`, `w2c` (12 floats), rays where they are traced.
         field: Takes the scene's parameters to the Gaussians'; None where inputs are those of the Gaussians themselves.
         shape: Shape of the images: (H, W), or that of the rays.
-        extra: After `trace`, outputs without a derivative.
-        certificate: After `trace`, `Output.certificate`.
+        extra: Outputs without a derivative, after `trace`.
+        certificate: What becomes `Output.certificate`, after `trace`.
     """
 
     def __init__(

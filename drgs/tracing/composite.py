@@ -92,10 +92,10 @@ class Compositor:
         basis: How many of the arrays that rays carry are SH basis values.
         couple: Derivatives of the feature image reach all that it depends on; else only the features.
     Attributes:
-        certificate: After `forward`: rays, redone rays, entries listed.
-        extra: After `forward`: outputs without a derivative.
-        passes: After `forward`: what each traversal composited.
-        finals: After `forward`: per traversal, (part, final states) pairs.
+        certificate: Numbers of rays, of redone rays and of listed entries, after `forward`.
+        extra: Outputs without a derivative, after `forward`.
+        passes: What each traversal composited, after `forward`.
+        finals: (part, final states) pairs of each traversal, after `forward`.
     """
 
     def __init__(
@@ -404,8 +404,8 @@ class Compositor:
         """Images of K tangents: dicts like the output of `forward`.
 
         Args:
-            buffers: Per tangent, how the arguments `record` (a list), `sh` and `features` change.
-            carried: Per tangent, how the argument `carried` changes.
+            buffers: How, for each tangent, the arguments `record` (a list), `sh` and `features` change.
+            carried: How, for each tangent, the argument `carried` changes.
         """
         lib = self.lib
         slots = self.model.slots("depth" in self.want)

@@ -68,8 +68,8 @@ class Adjoint:
 
     Args:
         grads: Buffers like `channels.buffers`, added to.
-        finals: Per shared ray, the final state of the Primal pass.
-        cotangents: Per shared ray: `sum` (a float a channel), `alpha` (of sum w), `depth` (of sum w t*).
+        finals: Final state of the Primal pass, of each shared ray.
+        cotangents: Cotangents of each shared ray: `sum` (a float a channel), `alpha` (of sum w), `depth` (of sum w t*).
         depth: There is a depth cotangent.
         scalar: What the features add to s: `scalar(shared ray, place, is hit)`; None without features here. The
             cotangents then have `rest`, the sum of it over the ray's weights.
@@ -192,8 +192,9 @@ class Tangent:
         records: Tangents of the records, from `pack`: slot by slot, the K columns of each side by side.
         slots: Entries of a record that they hold.
         tangents: K dicts of buffers laid out like those of `channels.buffers` besides the records.
-        carried: Per shared ray and tangent, the tangent of what the ray carries.
-        emits: Per tangent, what is told of that of every weight, as `Primal.emit` of the weight; None or empty without.
+        carried: Tangents of what each shared ray carries.
+        emits: Called with the tangent of every weight, one for each tangent, as `Primal.emit` is with the weight; None
+            or empty: nothing is called.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ class Replayed(Protocol):
     Attributes:
         m: Says what a hit is.
         channels: What the primal pass composited.
-        finals: Per shared ray, its final state.
+        finals: Final state of each shared ray.
     """
 
     m: HitModel

@@ -153,7 +153,7 @@ class _Finder:
     Args:
         part: Rays that look for hits.
         words: Buffer of all rows.
-        starts: Per shared ray, where its row starts.
+        starts: Start of the row of each shared ray.
         cut: What is taken off the squared extents.
     """
 

@@ -76,7 +76,7 @@ class Slots:
     Attributes:
         first: First entry of these lists among those of the whole view.
         size: Number of slots: entries times pixels of a tile, one entry to spare.
-        columns: Per shared ray, its pixel of the tile.
+        columns: Pixel of the tile that each shared ray belongs to.
     """
 
     first: UInt32
@@ -92,20 +92,20 @@ class Part:
         model: The formula of a hit.
         records: Flat record buffer of the view.
         rays: One or four a lane, all of which walk along the same stream.
-        flat: Per shared ray, the pixel (row-major index) it belongs to.
-        inside: Per shared ray, whether there is such a pixel and this part decides it.
+        flat: Pixel (row-major index) that each shared ray belongs to.
+        inside: Whether, of each shared ray, there is such a pixel and this part decides it.
         stream: Candidate Gaussians of every lane.
         ordered: Rays sort their candidates on the way; else these come in the order in which they are composited.
         center_key: (N,) order keys of Gaussians that are sorted by their centers; None where a ray's own order counts.
-        buffer: Number of hits that a ray is sorted among.
+        buffer: Number of hits that a ray is sorted among; default `BUFFER`.
         first: These rays were not walked before, with a shorter buffer.
         slots: Places of entries and pixels in tables, for rays through tiles; None for others. A hit's place is then
             where it stands in the ray's row and in the tile's list.
-        in_lists: For rays that walk along rows of their own hits, makes a part with the same rays along the lists of
-            their tiles.
+        in_lists: Makes a part with the same rays along the lists of their tiles; of rays that walk along rows of their
+            own hits.
         weights: Holds the weights of these rays; None where they are not held.
     Attributes:
-        failed: After a primal pass of rays that sort: lanes whose buffer was too short.
+        failed: Lanes whose buffer was too short, after a primal pass of rays that sort.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Part:
         *,
         ordered: bool,
         center_key: Float | None = None,
-        buffer: int = BUFFER,
+        buffer: int | None = None,
         first: bool = True,
         slots: Slots | None = None,
         in_lists: Callable[[], Part] | None = None,
@@ -135,7 +135,7 @@ class Part:
         self.stream = stream
         self.ordered = ordered
         self.center_key = center_key
-        self.buffer = buffer
+        self.buffer = buffer or BUFFER
         self.first = first
         self.slots = slots
         self.in_lists = in_lists
@@ -327,7 +327,7 @@ class Traversal(Protocol):
         projected: The Gaussians of the view.
         world: Their records are world records.
         rays: How many there are, in the order of the pixels.
-        certificate: After `start`: what it says of lists.
+        certificate: What the traversal says of its lists, after `start`.
     """
 
     projected: Projected

@@ -40,7 +40,7 @@ class _Group:
 
     Attributes:
         rows: (tiles, entries) rows in the buffer; those left over are the last row, which is 0.
-        index: Like `rows`, the Gaussians.
+        index: Gaussians, laid out as `rows` are.
         pixels: (tiles 64) row-major pixels, 0 where outside of the image.
         inside: (tiles 64) bool: inside of the image.
     """

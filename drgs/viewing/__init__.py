@@ -14,3 +14,7 @@ splats      Gaussians as the client takes them
 placed_views where photographs were taken, or could be
 poses       the client's cameras and ours
 """
+
+from drgs.guards.imports import modules_of
+
+__getattr__ = modules_of(__name__)

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.gain import Information, Prior, check, variances
+from drgs.information.blocks import add
 
 if TYPE_CHECKING:
+    import torch
+
     from drgs.cameras import Camera
 
 __all__ = ["Uncertainty"]
@@ -19,7 +22,7 @@ class Uncertainty:
     """Maps of the predictive variance, given the views that a scene was fitted to.
 
     Args:
-        cameras: Of these views, at least one.
+        cameras: The cameras of these views, at least one.
         said: What a view says about the parameters.
         mapped: (camera, weights) -> (H, W) sum over the parameters of squared derivatives times weights.
         prior: lambda.
@@ -37,7 +40,7 @@ class Uncertainty:
         self._mapped = mapped
         self._prior = prior
         self.done = 0
-        self._sum: Information = {}
+        self._sum: dict[str, torch.Tensor] = {}
         self._weights: Information | None = None
 
     @property
@@ -49,13 +52,13 @@ class Uncertainty:
         """Add what is not yet, a view a step.
 
         Args:
-            told: Called after each.
+            told: Called after each view.
         """
         while self.done < len(self.cameras):
             camera = self.cameras[self.done]
             said = self._said(camera)
             check(f"view: {camera.name}", said)
-            self._sum = {name: x + self._sum[name] if name in self._sum else x for name, x in said.items()}
+            add(self._sum, said)
             self.done += 1
             if self.done == len(self.cameras):
                 self._weights = variances(self._sum, self._prior)

@@ -1,0 +1,101 @@
+"""Claims of `import drgs`: everything is reached from it, at first access, and what docstrings show runs."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+import textwrap
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from doc_pages import make_folder
+
+import drgs
+from drgs.cameras import orbit
+
+# What is no room of a user's: tables of a machine, math of lenses, and options in, files out.
+_INSIDE = {"commands", "lenses", "libllvm", "llvm_target", "machine", "scenes", "sizes"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """`scene`, a data set, and `point_cloud.ply`, Gaussians."""
+    return make_folder(tmp_path_factory.mktemp("facade"))
+
+
+def test_every_module_is_reached():
+    """Whatever lies directly in the package is an attribute of it, but for what is nobody's."""
+    found = {path.stem for path in Path(drgs.__file__).parent.iterdir() if path.suffix == ".py" or path.is_dir()}
+    assert {name for name in found if not name.startswith("_")} - _INSIDE == drgs._MODULES
+    assert all(isinstance(getattr(drgs, name), types.ModuleType) for name in drgs._MODULES)
+
+
+def test_a_plain_import_is_enough():
+    """In a fresh process a module, a function and a type are there without another import; others are not loaded."""
+    code = (
+        "import sys, drgs\n"
+        "assert not {'torch', 'numpy', 'drgs.train'} & set(sys.modules)\n"
+        "assert callable(drgs.train.fit) and drgs.train.fit is drgs.fit\n"
+        "assert drgs.features.segmentation and drgs.data.load is drgs.load_data\n"
+        "assert drgs.select.select is drgs.select_views and drgs.crossval.crossval\n"
+        "assert drgs.fitting.records.load_run is drgs.load_run\n"
+        "assert not {'drgs.viewing', 'drgs.cluster.connect'} & set(sys.modules)\n"
+        "assert not hasattr(drgs.features, 'nothing') and not hasattr(drgs.features, '_nothing')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_users_import_is_public():
+    """The journey from photographs to the next view, and the types that its functions take, are in `__all__`."""
+    wanted = (
+        "fit load_data load_run select_views rasterization render render_jvp diagonal load_gaussians save_gaussians"
+    )
+    types_ = "Camera Gaussians DynamicGaussians DeformationField RenderSettings FitConfig SelectionConfig Scoring Prior"
+    assert {*wanted.split(), *types_.split(), "Selection", "Dataset", "View"} <= set(drgs.__all__)
+    assert set(drgs.__all__) <= set(dir(drgs))
+    with pytest.raises(AttributeError, match="module 'drgs' has no attribute 'rendr'"):
+        _ = drgs.rendr
+
+
+def test_every_public_name_has_a_docstring():
+    """What it does, in its own words."""
+    for name in set(drgs.__all__) - {"__version__"}:
+        assert len(inspect.getdoc(getattr(drgs, name)) or "") > 40, name
+
+
+def examples(text: str) -> list[str]:
+    """Indented blocks of a docstring before its first section."""
+    before = re.split(r"^(?:Args|Attributes|Returns|Raises):$", text, maxsplit=1, flags=re.M)[0]
+    found = re.findall(r"(?:(?<=\n\n)|^)((?: {4}.*\n?|\n(?= {4}))+)", before, flags=re.M)
+    return [textwrap.dedent(block) for block in found]
+
+
+def test_examples_of_docstrings_run(folder, tmp_path, monkeypatch):
+    """What the docstrings of public names show, on a tiny scene; a fit takes few steps, whatever it says."""
+    monkeypatch.chdir(folder)
+    g = drgs.load_ply("point_cloud.ply")
+    cameras = orbit((0, 0, 0), 3.0, 5, width=32, height=24, up=(0, -1, 0))
+    known = {
+        **{"drgs": drgs, "torch": torch, "camera": cameras[0], "cameras": cameras, "width": 32, "height": 24},
+        **{"means": g.means, "quats": g.quats, "scales": g.log_scales.exp(), "sh": g.sh},
+        **{"opacities": g.logit_opacities.sigmoid(), "rgb": torch.rand(len(g), 3), "photograph": torch.rand(24, 32, 3)},
+        "viewmats": torch.from_numpy(np.stack([camera.w2c for camera in cameras])).float(),
+        "Ks": torch.from_numpy(np.stack([camera.K for camera in cameras])).float(),
+    }
+    shown = set()
+    drgs.fit(drgs.load_data("scene"), "runs/scene", drgs.FitConfig.of(max_steps=6, max_gaussians=100), progress=False)
+    names = sorted(name for name in drgs.__all__ if not isinstance(getattr(drgs, name), types.ModuleType))
+    for name, owner in [("drgs", drgs), *((name, getattr(drgs, name)) for name in names)]:
+        for block in examples(inspect.getdoc(owner) or ""):
+            text = re.sub(r"max_steps=\d+", "max_steps=6", block)
+            text = text.replace('"runs/scene", drgs', f'"{tmp_path / name}", drgs')  # a folder that holds no run yet
+            exec(compile(text, f"docstring of {name}", "exec"), {**known, "g": g.detach()})
+            shown.add(name)
+    assert shown >= {"drgs", "fit", "load_data", "load_run", "select_views", "rasterization", "render", "render_jvp"}
+    assert shown >= {"diagonal", "load_gaussians", "save_gaussians", "load_ply", "save_ply", "Camera", "Gaussians"}
