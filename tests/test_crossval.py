@@ -584,6 +584,11 @@ def constant(width, height, means, **arguments):
 def nan(width, height, means, **arguments):
     image, alpha, info = constant(width, height, means)
     return image / 0 + means.sum(), alpha, info
+def hole(**arguments):
+    image, alpha, info = nan(**arguments)
+    image = image.nan_to_num()
+    image[0, 5, 3:5, 1] = float("inf")
+    return image, alpha, info
 not_a_function = 3
 """
 
@@ -597,6 +602,7 @@ not_a_function = 3
         ("bad_rasterizers:shape", "its image must have shape (1, 24, 32, 3)"),
         ("bad_rasterizers:constant", "must be differentiable by torch"),
         ("bad_rasterizers:nan", "its image must be finite"),
+        ("bad_rasterizers:hole", "has NaN or Inf in 2 of 768 pixels, first at (3, 5); correct the rasterizer"),
         ("bad_rasterizers:not_a_function", "must have a function not_a_function, has none"),
         ("bad_rasterizers:missing", "must have a function missing, has none"),
         ("no_such_module:f", "must be importable, got ModuleNotFoundError"),

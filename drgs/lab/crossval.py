@@ -156,8 +156,13 @@ def crossval(
     else:
         pairs = [rasterizer.image(raw, camera, background) for camera in cameras]
         pictures, alphas = ([pair[k] for pair in pairs] for k in range(2))
-    if bad := [i for i, x in enumerate(pictures) if not torch.isfinite(x).all()]:
-        raise ValueError(f"{rasterizer.name}: its image must be finite, view {bad[0]} has NaN or Inf")
+    for camera, picture in zip(cameras, pictures, strict=True):
+        if len(bad := (~torch.isfinite(picture)).any(-1).nonzero()):
+            y, x = bad[0].tolist()
+            raise ValueError(
+                f"{rasterizer.name}: its image must be finite, view {camera.name} has NaN or Inf in {len(bad)} of "
+                f"{picture[..., 0].numel()} pixels, first at ({x}, {y}); correct the rasterizer"
+            )
     say("conventions")
     first = int(np.argmax([float(x.var()) for x in pictures]))  # the view that shows most
 
