@@ -15,8 +15,11 @@ import pytest
 from doc_pages import PAGES, ROOT, blocks, elsewhere, figures, inline_commands, lines_of, make_folder, smaller
 
 from drgs import cli
+from drgs.codecs import CODECS
+from drgs.data import LOADERS
 from drgs.information.choices import BLOCKS, POLICIES
 from drgs.information.criteria import CRITERIA
+from drgs.settings import RESPONSES
 
 # What has tests of its own, which run the very blocks.
 _README = ROOT / "README.md"
@@ -45,7 +48,7 @@ def test_blocks_run(page, made, tmp_path, monkeypatch, capsys):
     shutil.copytree(made, folder)
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
-    for registry in (POLICIES, CRITERIA, BLOCKS):  # which pages add to
+    for registry in (POLICIES, CRITERIA, BLOCKS, RESPONSES, LOADERS, CODECS):  # which pages add to
         monkeypatch.setattr(registry, "_rows", dict(registry._rows))
     names: dict = {"__name__": "docs"}
     for block in blocks(page):

@@ -123,8 +123,7 @@ def test_without_the_package_the_names_are_refused(folder):
         (("render", "point_cloud.ply", "--set", "response=narrow", "-o", "out/none"), "response must be one of peak"),
         (("convert", "point_cloud.ply", "out/none.rows"), "must end with .ply, .spz, .glb, got .rows"),
     ):
-        found = command(None, folder, *words)
+        found = command(None, folder, *words, "--quiet")  # no progress: a busy machine says how long it takes
         assert found.returncode == 2
         assert told in found.stderr
-        said = [line for line in found.stderr.splitlines() if not line.startswith("loading libraries")]
-        assert len(said) == 1
+        assert len(found.stderr.splitlines()) == 1

@@ -385,7 +385,7 @@ def test_bad_run_folders_are_refused(tmp_path):
     with pytest.raises(ValueError, match="must be valid JSON"):
         Run(tmp_path).config()
     (tmp_path / "config.json").write_text('{"schema": 99}')
-    with pytest.raises(ValueError, match="schema must be 1, got 99"):
+    with pytest.raises(ValueError, match="schema must be 1 or 2, got 99"):
         Run(tmp_path).config()
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="must be a folder, is a file"):
