@@ -35,7 +35,8 @@ def run(tmp_path):
     """Writes the record of a fit; what it does not say is as a plain fit of a transforms.json has it."""
 
     def write(preset: str = "fast", active: SelectionConfig | None = None, lpips: float | None = None, **fields):
-        config = FitConfig(settings=RenderSettings.preset(preset), selection=active)
+        settings = RenderSettings.preset("fast" if preset == "any" else preset)
+        config = FitConfig(settings=settings, renderers=(preset,), selection=active)
         record = {"schema": SCHEMA, "command": "fit", "data": "scene", "format": "transforms", "train": ["a"]}
         record |= {"test": ["b"], "fit": config.to_json(), **fields}
         if active is not None:
