@@ -63,6 +63,7 @@ def test_a_plain_fit(run, capsys):
     ("asked", "more"),
     [
         ({"preset": "gsplat"}, {"zwicker2001ewa", "ye2025gsplat"}),
+        ({"preset": "any"}, {"moenneloccoz2024raytracing", "zwicker2001ewa", "ye2025gsplat", "wu2025threedgut"}),
         ({"preset": "inria"}, {"zwicker2001ewa"}),
         ({"preset": "exact"}, {"moenneloccoz2024raytracing"}),
         ({"format": "colmap"}, {"moenneloccoz2024raytracing", "schoenberger2016sfm"}),
