@@ -318,7 +318,7 @@ def through_renderers(
     rows = []
     with Bar("views as each renderer draws them", len(renderers) * len(frames)) as bar:
         for name, settings in renderers.items():
-            views = []
+            views: list[dict[str, Any]] = []
             for frame in frames:
                 with torch.no_grad():  # pictures of whatever an optimizer may hold
                     seen = colors_only(g, frame.camera.time)
@@ -349,6 +349,7 @@ def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], l
         metrics: Content of metrics.json; older versions measured one renderer more than the run's own, as `viewers`.
     """
     head = ("renderer", "PSNR", "worst\nPSNR", "worst view")
+    rows: list[tuple[str, ...]] = []
     if (found := metrics.get("renderers")) and found["rows"]:
         rows = [
             (row["name"], f"{row['mean']['psnr']:.2f}", f"{row['worst']['psnr']:.2f}", row["worst"]["name"])
@@ -360,7 +361,7 @@ def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], l
         rows = [(name, f"{value:.2f}", "-", "-") for name, value in values.items()]
         count = len(found["views"])
     else:
-        return "", head, []
+        return "", head, rows
     shown = f"{count} {found['split']} views of {found['width']}x{found['height']}"
     return f"The same Gaussians in several renderers, {shown}", head, rows
 
