@@ -92,7 +92,7 @@ def study_of(scale: str, runs: Path) -> Study:
     width, height = sizes.image
     # Colors alone: what the paper's study says of features holds for none of these fits.
     sized = {"max_pixels": sizes.fit.data.max_pixels, "max_gaussians": sizes.fit.density.max_gaussians}
-    fit = FitConfig.of(semantics="ignore", max_steps=sizes.fit.max_steps, **sized)
+    fit = FitConfig.of(renderers=("fast",), semantics="ignore", max_steps=sizes.fit.max_steps, **sized)
 
     def folder(scene: str, split: tuple[int, int]) -> Path:
         name, _, seed = scene.partition("-")

@@ -60,7 +60,13 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
     dataset = data.load(source)
     run = folder / name.replace(" ", "-")
     if not (run / "point_cloud.ply").exists():
-        fit(dataset, run, FitConfig.of(max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"))
+        fit(
+            dataset,
+            run,
+            FitConfig.of(
+                renderers=("fast",), max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"
+            ),
+        )
     view = dataset.views[len(dataset.views) // 2]
     return drgs.load_ply(run / "point_cloud.ply"), at_most(view.camera.undistorted(), PIXELS)
 

@@ -57,7 +57,8 @@ def run(name: str, data: Path, runs: Path) -> dict:
             if not source.exists():
                 command = ["sfm", str(data / scene / "images"), "-o", str(source)]
                 subprocess.run([sys.executable, "-m", "drgs", *command], check=True, cwd=ROOT)
-        fit(load(source), folder, FitConfig.of(**options), resume=folder.exists())
+        alone = (options.get("settings", Preset("fast")).nearest_preset()[0],)  # what the table says of its fits
+        fit(load(source), folder, FitConfig.of(renderers=alone, **options), resume=folder.exists())
     metrics = json.loads((folder / "metrics.json").read_text())
     events = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     config = json.loads((folder / "config.json").read_text())

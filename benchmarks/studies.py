@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 SCENES = ("office", "head", "still_life")
-BASE = {"max_pixels": 12_000, "max_gaussians": 15_000}
+BASE = {"renderers": ("fast",), "max_pixels": 12_000, "max_gaussians": 15_000}
 """Size of the base models."""
 
 

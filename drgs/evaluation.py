@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 from drgs.display.pictures import file_names
 from drgs.fitting.frames import load_dataset, load_frames
 from drgs.fitting.records import fit_record, fitted_views, load_run
+from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
-from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_viewers, write_metrics
+from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
@@ -23,7 +24,12 @@ __all__ = ["evaluate_run"]
 
 
 def evaluate_run(
-    run: Run, claimed: Claim, split: str = "test", lpips: Lpips | None = None, strict: bool = False
+    run: Run,
+    claimed: Claim,
+    split: str = "test",
+    lpips: Lpips | None = None,
+    strict: bool = False,
+    renderer: str | None = None,
 ) -> dict[str, Any]:
     """Measure a run and write its metrics.json and the pictures of its views.
 
@@ -33,6 +39,8 @@ def evaluate_run(
         split: `test`, `train` (of an active fit the views that it saw) or `all`.
         lpips: LPIPS for `drgs.metrics.evaluate`.
         strict: Refuse a data set some of whose images are missing.
+        renderer: Preset to measure with beside the run's own settings, or `all`; None: those that it was fitted for,
+            and what viewers draw with.
     Returns:
         What metrics.json holds.
     Raises:
@@ -73,7 +81,8 @@ def evaluate_run(
         segmentation=segmentation,
         moving=moving_labels(dataset) if recorded.times else frozenset(),
     )
-    viewers = through_viewers(scene, frames, config.settings, split)
+    wanted = renderers_to_measure(config.renderers, config.settings, renderer)
+    renderers = through_renderers(scene, frames, wanted, split)
     return write_metrics(
         run,
         split,
@@ -82,7 +91,7 @@ def evaluate_run(
         split_rule=dataset.split_rule(),
         gaussians=len(g),
         **{name: getattr(loaded, name) for name in ("step", "seconds", "bad_steps")},
-        viewers=viewers,
+        renderers=renderers,
         **chosen,
         **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
     )

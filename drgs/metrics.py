@@ -6,6 +6,7 @@ Metrics that cannot be computed are None with a reason, never left out. `DEFINIT
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,15 +32,15 @@ __all__ = [
     "METRICS",
     "MOVING",
     "DEFINITIONS",
-    "VIEWERS",
+    "RENDERERS_VIEWS",
     "VIEW_PICTURES",
     "Lpips",
     "evaluate",
     "flip",
     "psnr",
-    "settings_of_viewers",
+    "renderers_table",
     "ssim",
-    "through_viewers",
+    "through_renderers",
     "uncovered",
     "write_metrics",
 ]
@@ -55,8 +56,8 @@ DEFINITIONS = {
 METRICS = tuple(DEFINITIONS)
 MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
 """What is measured beside `METRICS` where labels say what moves: a background that stands still hides the rest."""
-VIEWERS = "gsplat"
-"""The preset that viewers of PLY files draw with."""
+RENDERERS_VIEWS = 8
+"""Views, at most, that a fit is measured with in every renderer at its end: `drgs eval` takes all."""
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
@@ -64,7 +65,6 @@ _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torch
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11
-_VIEWERS_VIEWS = 8  # enough for a mean difference, and a second at most
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
@@ -244,7 +244,7 @@ def _evaluated(
         shown = image if frame.mask is None else image * frame.mask[..., None]
         height, width = target.shape[:2]
         row: dict[str, Any] = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
-        row["psnr"] = psnr(image, frame.image(), frame.mask)
+        row |= _photometric(image, frame)
         if moving:
             row["psnr_moving"] = _moving_psnr(image, frame, moving)
         row["uncovered"] = uncovered(out.alpha.cpu(), frame.mask)
@@ -293,59 +293,77 @@ def _moving_psnr(image: torch.Tensor, frame: Frame, moving: frozenset[int]) -> f
     return psnr(image, frame.image(), chosen) if bool((chosen > 0).any()) else None
 
 
-def settings_of_viewers(settings: RenderSettings) -> RenderSettings | None:
-    """What viewers of PLY files draw with, before the background of `settings`; None where it is `settings`."""
-    viewers = RenderSettings.preset(VIEWERS, background=settings.background)
-    return None if settings == viewers else viewers
+def through_renderers(
+    g: Scene, frames: list[Frame], renderers: Mapping[str, RenderSettings], split: str, limit: int | None = None
+) -> dict | None:
+    """How Gaussians look in several renderers, view by view, so that no mean hides one that fails.
 
-
-def viewers_hint(settings: RenderSettings) -> str:
-    """What a fit trains for, if viewers of PLY files will show another picture, and how to train for them; else ""."""
-    if settings_of_viewers(settings) is None:
-        return ""
-    name, differences = settings.nearest_preset()
-    changed = f" with {', '.join(f'{field}={value}' for field, value in differences.items())}" if differences else ""
-    wanted = f"preset {VIEWERS}" if name != VIEWERS else f"preset {VIEWERS} alone"
-    return (
-        f"this fit trains for preset {name}{changed}; viewers of PLY files draw with preset {VIEWERS}, whose picture "
-        f"of it will differ, most where Gaussians are smaller than a pixel; {wanted} trains for viewers"
-    )
-
-
-def through_viewers(g: Scene, frames: list[Frame], settings: RenderSettings, split: str) -> dict | None:
-    """How Gaussians look in the viewers of PLY files, which draw with the rasterizers' model, not with `settings`.
-
-    That model widens every Gaussian by 0.3 px^2 on the screen, so what is lost depends on the image size: it is most
-    where Gaussians are smaller than a pixel, least where a viewer draws more pixels than were fitted.
+    Rasterizers widen every Gaussian by 0.3 px^2 on the screen, so what differs depends on the image size: it is most
+    where Gaussians are smaller than a pixel.
 
     Args:
-        g: Fitted with `settings`; what moves is drawn as it is at the time of each view, which a PLY cannot hold.
-        frames: Photographs to compare with, at the size of the fit; at most 8 of them, evenly spaced, are looked at.
-        settings: Settings of the fit.
+        g: What is shown; what moves is drawn as it is at the time of each view, which a PLY cannot hold.
+        frames: Photographs to compare with, at the size of the fit.
+        renderers: Name -> settings, as `drgs.fitting.renderers.renderers_to_measure` says.
         split: Split of the frames, to be recorded.
+        limit: Largest number of views, which are evenly spaced; None takes all.
     Returns:
-        JSON-serializable: `preset` (the viewers'), `psnr` and `own_psnr` (means in dB, through that preset and through
-        `settings`), `split`, `views` (names), `width` and `height` of the first; None if there is no view, or
-        `settings` are the viewers' own.
+        JSON-serializable: `split`, `width` and `height` of the first view, and `rows`, for each renderer its `name`,
+        `mean` of each metric over the views, `worst` (the view of the lowest PSNR) and `views`; None without frames.
     """
-    viewers = settings_of_viewers(settings)
-    if viewers is None or not frames:
+    if not frames:
         return None
-    frames = frames[:: -(-len(frames) // _VIEWERS_VIEWS)]
-    models = {"psnr": viewers, "own_psnr": settings}
-    values = {}
-    with Bar("views as viewers of PLY files draw them", len(models) * len(frames)) as bar:
-        for name, model in models.items():
-            found = []
+    if limit is not None:
+        frames = frames[:: -(-len(frames) // limit)]
+    rows = []
+    with Bar("views as each renderer draws them", len(renderers) * len(frames)) as bar:
+        for name, settings in renderers.items():
+            views: list[dict[str, Any]] = []
             for frame in frames:
-                with torch.no_grad():  # as above
+                with torch.no_grad():  # pictures of whatever an optimizer may hold
                     seen = colors_only(g, frame.camera.time)
-                    image = render(seen, frame.camera, model, outputs=()).rgb.cpu().clamp(0, 1)
-                found.append(psnr(image, frame.image(), frame.mask))
+                    image = render(seen, frame.camera, settings, outputs=()).rgb.cpu().clamp(0, 1)
+                views.append({"name": frame.name, **_photometric(image, frame)})
                 bar.advance()
-            values[name] = float(np.mean(found))
-    size = {"width": frames[0].camera.width, "height": frames[0].camera.height}
-    return {"preset": VIEWERS, **values, "split": split, "views": [frame.name for frame in frames], **size}
+            mean = {key: float(np.mean([row[key] for row in views])) for key in views[0] if key != "name"}
+            worst = min(views, key=lambda row: row["psnr"])
+            rows.append({"name": name, "mean": mean, "worst": worst, "views": views})
+    return {"split": split, "width": frames[0].camera.width, "height": frames[0].camera.height, "rows": rows}
+
+
+def _photometric(image: torch.Tensor, frame: Frame) -> dict[str, float]:
+    """What every rendered view is measured by, whatever renderer drew it: those of `DEFINITIONS` that need colors
+    alone and take no time.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        frame: The photograph of the view.
+    """
+    return {"psnr": psnr(image, frame.image(), frame.mask)}
+
+
+def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
+    """Title, head and rows of what `through_renderers` found; no rows where nothing was.
+
+    Args:
+        metrics: Content of metrics.json; older versions measured one renderer more than the run's own, as `viewers`.
+    """
+    head = ("renderer", "PSNR", "worst\nPSNR", "worst view")
+    rows: list[tuple[str, ...]] = []
+    if (found := metrics.get("renderers")) and found["rows"]:
+        rows = [
+            (row["name"], f"{row['mean']['psnr']:.2f}", f"{row['worst']['psnr']:.2f}", row["worst"]["name"])
+            for row in found["rows"]
+        ]
+        count = len(found["rows"][0]["views"])
+    elif found := metrics.get("viewers"):
+        values = {"the run's own": found["own_psnr"], found["preset"]: found["psnr"]}
+        rows = [(name, f"{value:.2f}", "-", "-") for name, value in values.items()]
+        count = len(found["views"])
+    else:
+        return "", head, rows
+    shown = f"{count} {found['split']} views of {found['width']}x{found['height']}"
+    return f"The same Gaussians in several renderers, {shown}", head, rows
 
 
 def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields: Any) -> dict:

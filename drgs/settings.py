@@ -17,7 +17,7 @@ from drgs.guards.registry import Registry
 
 __all__ = ["EPS_ALPHA", "PRESETS", "RESPONSES", "Preset", "RenderSettings", "legal"]
 
-Preset = Literal["exact", "fast", "inria", "gsplat", "mitsuba"]
+Preset = Literal["exact", "fast", "inria", "gsplat", "3dgut", "mitsuba"]
 PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
 
 # Depth is divided by max(alpha, EPS_ALPHA): what no ray meets has a finite one.
@@ -126,7 +126,10 @@ class RenderSettings:
         `exact` is the claim of this package: within 1e-5 of the float64 oracle. `fast` has the cut-offs of Mitsuba's
         `volprim_rf_basic` and is the default for training; `mitsuba` is that integrator's model: its acceleration
         structure, order of entry points, SH along each ray, 64 hits a ray, without the hits that it loses. `inria` and
-        `gsplat` are those rasterizers' models. docs/conventions.md lists the source of every constant.
+        `gsplat` are those rasterizers' models. `3dgut` is what gsplat composites with `with_ut` and `with_eval3d`: the
+        peak on each ray, with the rasterizer's cut-offs. It does not model 3DGUT's projection: neither the unscented
+        transform of lenses and rolling shutters, nor the culling by the box of the covariance that this gives, which
+        leaves out Gaussians whose rays it misjudges. docs/conventions.md lists the source of every constant.
 
         Args:
             name: One of `PRESETS`.
@@ -170,6 +173,15 @@ class RenderSettings:
                 "near": 0.01,
                 "fov_clamp": "gsplat",
                 "culling": "gsplat",
+            },
+            "3dgut": {
+                "depth_key": "z",
+                "extent": 3.33,
+                "alpha_min": 1 / 255,
+                "alpha_max": 0.999,
+                "transmittance_min": 1e-4,
+                "stop": "before_eq",
+                "near": 0.01,
             },
         }
         must_be("RenderSettings.preset", "name", name, str, 'e.g. RenderSettings.preset("fast", extent=4.0)')

@@ -41,6 +41,7 @@ from drgs.fitting.config import (
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
+from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
 from drgs.fitting.stages import moving_labels
@@ -187,6 +188,7 @@ def _fit(
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds = seconds_of(run, header) or 0.0
         source = header["point_source"]
+        config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
         trainer, source = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
@@ -209,8 +211,8 @@ def _fit(
 
     loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured)
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
-        if hint := metrics.viewers_hint(config.settings):
-            bar.note(hint)
+        if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
+            bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")
         loop.run(bar)
     g, scene = trainer.gaussians(), trainer.scene()
     moved = None
@@ -228,8 +230,12 @@ def _fit(
         step=trainer.step_index,
         seconds=loop.seconds,
         bad_steps=trainer.bad_steps,
-        viewers=metrics.through_viewers(
-            scene, held_out or trainer.frames, config.settings, "test" if held_out else "train"
+        renderers=metrics.through_renderers(
+            scene,
+            held_out or trainer.frames,
+            renderers_to_measure(config.renderers, config.settings),
+            "test" if held_out else "train",
+            metrics.RENDERERS_VIEWS,
         ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),

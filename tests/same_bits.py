@@ -63,8 +63,8 @@ def made(folder: Path) -> dict:
         if code := cli.main([*arguments]):
             raise SystemExit(f"{' '.join(arguments)}: {code}")
 
-    run("fit", "still", "-o", "run", *quick, "--feature-width", "4")
-    run("fit", "moving", "-o", "moved", *quick, "--static-share", "0.4")
+    run("fit", "still", "-o", "run", *quick, "--feature-width", "4", "--for", "fast")
+    run("fit", "moving", "-o", "moved", *quick, "--static-share", "0.4", "--for", "fast")
     active = ["--views", "active", "--initial", "3", "--add", "2", "--every", "6"]
     run("fit", "still", "-o", "picked", *quick, *active, "--preset", "exact", "--feature-width", "4")
     ask = ["run", "--candidates", "around.json", "-k", "2", "--quiet"]

@@ -120,7 +120,15 @@ def lazily(folder, **options):
 
 def config(**fields):
     return FitConfig.of(
-        **{"max_steps": 16, "max_gaussians": 60, "sh_degree": 1, "test_every": 4, "save_every": 1000, **fields}
+        **{
+            "renderers": ("fast",),
+            "max_steps": 16,
+            "max_gaussians": 60,
+            "sh_degree": 1,
+            "test_every": 4,
+            "save_every": 1000,
+            **fields,
+        }
     )
 
 

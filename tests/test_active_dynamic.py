@@ -74,7 +74,15 @@ def lazily(folder: Path):
 def config(**fields) -> FitConfig:
     """8 steps of the static stage and 16 of the dynamic one."""
     return FitConfig.of(
-        **{"max_steps": 24, "static_share": 1 / 3, "max_gaussians": 60, "sh_degree": 1, "save_every": 1000, **fields}
+        **{
+            "renderers": ("fast",),
+            "max_steps": 24,
+            "static_share": 1 / 3,
+            "max_gaussians": 60,
+            "sh_degree": 1,
+            "save_every": 1000,
+            **fields,
+        }
     )
 
 

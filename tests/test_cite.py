@@ -35,7 +35,8 @@ def run(tmp_path):
     """Writes the record of a fit; what it does not say is as a plain fit of a transforms.json has it."""
 
     def write(preset: str = "fast", active: SelectionConfig | None = None, lpips: float | None = None, **fields):
-        config = FitConfig(settings=RenderSettings.preset(preset), selection=active)
+        settings = RenderSettings.preset("fast" if preset == "any" else preset)
+        config = FitConfig(settings=settings, renderers=(preset,), selection=active)
         record = {"schema": SCHEMA, "command": "fit", "data": "scene", "format": "transforms", "train": ["a"]}
         record |= {"test": ["b"], "fit": config.to_json(), **fields}
         if active is not None:
@@ -62,6 +63,7 @@ def test_a_plain_fit(run, capsys):
     ("asked", "more"),
     [
         ({"preset": "gsplat"}, {"zwicker2001ewa", "ye2025gsplat"}),
+        ({"preset": "any"}, {"moenneloccoz2024raytracing", "zwicker2001ewa", "ye2025gsplat", "wu2025threedgut"}),
         ({"preset": "inria"}, {"zwicker2001ewa"}),
         ({"preset": "exact"}, {"moenneloccoz2024raytracing"}),
         ({"format": "colmap"}, {"moenneloccoz2024raytracing", "schoenberger2016sfm"}),

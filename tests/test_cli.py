@@ -165,7 +165,7 @@ def test_options_of_fit(monkeypatch):
     cli.main(["fit", "DATA", "--output", "RUN", "--max-steps", "7", "--resume", "--mask", "ignore"])
     assert (got[0].data, got[0].output) == (Path("DATA"), Path("RUN"))
     assert (got[0].max_steps, got[0].max_pixels, got[0].max_gaussians) == (3000, 130_000, 30_000)
-    assert (got[0].test_every, got[0].sh_degree, got[0].preset) == (8, 3, "fast")
+    assert (got[0].test_every, got[0].sh_degree, got[0].renderers) == (8, 3, ("auto",))
     assert (got[1].max_steps, got[1].resume, got[1].mask) == (7, True, "ignore")
 
 

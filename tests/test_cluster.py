@@ -528,7 +528,17 @@ def study_of(folder: Path, **fields) -> Study:
         name="tiny",
         folder=functools.partial(folder_of, folder),
         policies={name: {"policy": name} for name in ("farthest", "random", "uniform")},
-        fit=FitConfig.of(**{"max_steps": 12, "max_gaussians": 60, "sh_degree": 1, "save_every": 4, **few, **fields}),
+        fit=FitConfig.of(
+            **{
+                "renderers": ("fast",),
+                "max_steps": 12,
+                "max_gaussians": 60,
+                "sh_degree": 1,
+                "save_every": 4,
+                **few,
+                **fields,
+            }
+        ),
         metrics=(Metric("psnr", "PSNR", 2),),
         reference="random",
     )

@@ -225,7 +225,8 @@ def test_select_and_reproduce_take_the_same_file(files, tmp_path):
         plan_of("static", "tiny", tmp_path, policies=["random"], fields=fields).study.fit
         for fields in ({}, config_fields(files / "a.toml"))
     )
-    assert changed == usual.replace(**{k: x for k, x in config_fields(files / "a.toml").items() if k != "selection"})
+    stated = {k: x for k, x in config_fields(files / "a.toml").items() if k != "selection"}
+    assert changed == usual.replace(renderers=("gsplat",), **stated)
     assert (changed.max_steps, changed.density.max_gaussians) == (500, usual.density.max_gaussians)
     args = cli._parse_arguments(["reproduce", "static", "-o", "x", "--config", str(files / "a.toml")])
     assert args.test_every == 4

@@ -329,7 +329,7 @@ def test_cameras_that_show_nothing():
         crossval(function(torch_rasterizer.rasterization, "correct"), g, [away], "gsplat")
 
 
-@pytest.mark.parametrize("preset", ["exact", "fast", "inria", "gsplat"])
+@pytest.mark.parametrize("preset", ["exact", "fast", "inria", "gsplat", "3dgut"])
 def test_our_own_presets_agree_with_the_oracle(preset):
     """`drgs:PRESET` is held against float64."""
     g, cameras = random_scene(1)

@@ -51,7 +51,7 @@ def test_numbers(result):
     """`exact` is the oracle's image; the other presets are near it, each at its own distance."""
     _, report, _ = result
     rows = {row["preset"]: row for row in report["presets"]}
-    assert set(rows) == {"exact", "fast", "inria", "gsplat", "mitsuba"}
+    assert set(rows) == {"exact", "fast", "inria", "gsplat", "3dgut", "mitsuba"}
     assert report["oracle"]["max_error"] < 1e-5
     assert rows["exact"]["psnr_to_exact"] is None
     assert all(25 < row["psnr_to_exact"] < 99 for name, row in rows.items() if name != "exact")

@@ -82,7 +82,14 @@ def dataset(tmp_path_factory):
 
 def config(**fields) -> FitConfig:
     """Short, with rates for few steps."""
-    short = {"max_steps": 12, "max_gaussians": 16, "sh_degree": 0, "save_every": 2, "means_rate": (1e-3, 1e-4)}
+    short = {
+        "renderers": ("fast",),
+        "max_steps": 12,
+        "max_gaussians": 16,
+        "sh_degree": 0,
+        "save_every": 2,
+        "means_rate": (1e-3, 1e-4),
+    }
     rates = {"dc_rate": 0.03, "field_rate": (3e-3, 3e-4), "grid_rate": (3e-2, 3e-3), "static_share": 1 / 3}
     return FitConfig.of(**{**short, **rates, **fields})
 

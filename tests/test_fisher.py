@@ -268,7 +268,7 @@ def test_channel_weights():
         assert error(found[name], want) <= 1e-4, name
 
 
-@pytest.mark.parametrize("preset", ["fast", "inria", "gsplat", "mitsuba"])
+@pytest.mark.parametrize("preset", ["fast", "inria", "gsplat", "3dgut", "mitsuba"])
 def test_presets(preset):
     """With every system's cut-offs the information is that of its columns."""
     g, cam = gaussians(np.random.default_rng(2), 8, 4, scale=0.25), camera(np.random.default_rng(2), (12, 10))

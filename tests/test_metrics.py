@@ -146,7 +146,7 @@ def test_what_lpips_needs(rng, monkeypatch, installed, expected):
 def test_lpips_is_spoken_of_where_it_was_asked_for(rng, monkeypatch, capsys):
     """Nothing of it is printed without weights, of held-out views or of none; with weights the reason of a null is."""
     a, b = images(rng)
-    beside = {"split": "test", "viewers": None}
+    beside = {"split": "test", "renderers": None}
     for frames in ([frame(a)], []):
         result = evaluate(monkeypatch, b, frames)
         assert "lpips" in result["reasons"]

@@ -14,6 +14,7 @@ from drgs.commands import making_options, options
 from drgs.commands.option_help import options_in
 from drgs.data import sfm
 from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.fitting.renderers import own_preset
 from drgs.guards.records import hints_of, part_of, texts_of, ways_of
 from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Criterion, Policy
 from drgs.settings import PRESETS, RenderSettings
@@ -77,11 +78,15 @@ def test_information_options_are_those_of_an_active_fit(command):
 
 def test_choices_are_what_there_is():
     """What an option offers is what the code knows, no more and no fewer."""
-    for command in (options.Render, options.Fit, options.Select, options.Fisher, options.Tradeoff):
+    for command in (options.Render, options.Select, options.Fisher, options.Tradeoff):
         assert _choices(command, "preset") == PRESETS
+    for command, more in ((options.Fit, ()), (options.Eval, ("all",))):  # or none, which says what the fit is for
+        named, none = _choices(command, "preset")
+        assert (typing.get_args(named), none) == ((*more, *PRESETS), type(None))
     assert _choices(options.Crossval, "preset") == ("auto", *PRESETS)
     assert len({RenderSettings.preset(name) for name in PRESETS}) == len(PRESETS)
-    assert options.Fit.preset == next(name for name in PRESETS if RenderSettings.preset(name) == FitConfig().settings)
+    assert options.Fit.preset is None
+    assert FitConfig().settings == RenderSettings.preset(own_preset(FitConfig().renderers))
     for command in (options.Fit, options.Select):
         named, _ = _choices(command, "policy")
         assert typing.get_args(named) == tuple(select.POLICIES) == POLICY_NAMES

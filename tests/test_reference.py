@@ -589,7 +589,7 @@ def test_near_ties_are_marked():
 def test_few_pixels_are_marked(rng):
     """On a dense scene the marks stay a small part, or comparisons would test little."""
     g = _random(rng, n=60, spread=0.8)
-    for preset, most in (("exact", 0.05), ("fast", 0.05), ("inria", 0.05), ("gsplat", 0.05)):
+    for preset, most in (("exact", 0.05), ("fast", 0.05), ("inria", 0.05), ("gsplat", 0.05), ("3dgut", 0.05)):
         out = render(g, _camera(16, 12, 15.0), RenderSettings.preset(preset))
         assert out.ambiguous.double().mean() < most
         assert out.alpha.max() > 0.9

@@ -99,7 +99,7 @@ def page_of(run: Path, tmp_path: Path) -> Page:
 def test_a_fit_ends_with_its_report(active):
     """All sections, every view and pick, the numbers of metrics.json; pictures are JPEGs of the stated size."""
     page, metrics = Page(active / "report.html"), json.loads((active / "metrics.json").read_text())
-    assert page.sections == {"fit", "views", "cameras", "time-spent", "repeat"}
+    assert page.sections == {"fit", "views", "renderers", "cameras", "time-spent", "repeat"}
     assert f"{metrics['mean']['psnr']:.2f} dB" in page.texts["b"]
     cells = page.texts["td"]
     for row in metrics["views"]:
@@ -172,7 +172,7 @@ def test_what_is_not_there_is_left_out(run, tmp_path, caplog):
     page = page_of(run, tmp_path)
     assert "the report goes without the data set's cameras" in caplog.text
     assert "no map of cameras" in page.texts["p"]
-    assert page.sections == {"fit", "views", "cameras", "time-spent", "repeat"}
+    assert page.sections == {"fit", "views", "renderers", "cameras", "time-spent", "repeat"}
     assert not page.all("img")
     for name in ("metrics.json", "state.safetensors", "point_cloud.ply", "log.jsonl", "env.json"):
         (run / name).unlink()

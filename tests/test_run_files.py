@@ -88,12 +88,14 @@ def test_evaluating_keeps_what_the_fit_said(place):
 
 
 def test_metrics_inside(place):
-    """Of views, and of what viewers show."""
+    """Of views, and of what each renderer shows."""
     metrics = _read(place / "all/metrics.json")
     measured = {name for name in re.findall(r"`(\w+)`", PAGE.split("The metrics of a view are ")[1].split(".")[0])}
     assert set(metrics["mean"]) <= measured
     assert set(metrics["views"][0]) == _told_of("metrics.json", "views") | set(metrics["mean"])
-    assert set(metrics["viewers"]) == _told_of("metrics.json", "viewers")
+    (row, *_) = metrics["renderers"]["rows"]
+    told = _told_of("metrics.json", "renderers")
+    assert {*metrics["renderers"], *row, *row["worst"], *row["views"][0]} <= told
     assert metrics["scores"] == metrics["mean"]  # of a run without labels
 
 

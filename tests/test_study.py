@@ -47,7 +47,7 @@ SPLIT = (4, 1)
 
 def small(folder: Path, **fields) -> Study:
     """Two policies, ten steps; `fields` of the FitConfig."""
-    config = {"max_steps": 10, "max_gaussians": 60, "sh_degree": 1, "save_every": 3, **fields}
+    config = {"renderers": ("fast",), "max_steps": 10, "max_gaussians": 60, "sh_degree": 1, "save_every": 3, **fields}
     return Study(
         name="tiny",
         folder=lambda scene, split: folder,

@@ -5,18 +5,14 @@ import json
 import math
 import os
 import signal
-import sys
 
 import numpy as np
 import pytest
 import torch
-from test_active import write_still
 
 import drgs
 import drgs.commands.fit
-from drgs import cli, metrics
 from drgs.cameras import orbit
-from drgs.commands.eval import print_table, viewers_line
 from drgs.commands.eval import run as run_eval
 from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
@@ -64,8 +60,15 @@ def masked(dataset):
 
 
 def config(**fields):
-    """A short fit: rates are higher than the defaults, which are made for thousands of steps."""
-    short = {"max_steps": 60, "max_gaussians": 80, "sh_degree": 1, "save_every": 25, "dc_rate": 0.03}
+    """A short fit, by one renderer: rates are higher than the defaults, which are made for thousands of steps."""
+    short = {
+        "renderers": ("fast",),
+        "max_steps": 60,
+        "max_gaussians": 80,
+        "sh_degree": 1,
+        "save_every": 25,
+        "dc_rate": 0.03,
+    }
     return FitConfig.of(**{**short, "means_rate": (1e-3, 1e-4), **fields})
 
 
@@ -118,79 +121,11 @@ def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys
         "bad_steps": 0,
         "seconds": result.seconds,
     }
-    assert again["viewers"]["psnr"] == pytest.approx(result.metrics["viewers"]["psnr"], abs=1e-3)
     said = capsys.readouterr().out
     assert "2 test views" in said
-    assert f"In a viewer of PLY files (preset gsplat, {SIZE}x{SIZE}): PSNR {again['viewers']['psnr']:.2f} dB" in said
     run_eval(Eval(run=tmp_path / "run", split="train"))
     again = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (again["split"], again["count"]) == ("train", 7)
-
-
-@pytest.mark.parametrize("preset", ["fast", "gsplat"])
-def test_fit_says_how_viewers_show_it(dataset, tmp_path, preset, capsys):
-    """metrics.json and the end of the output hold the PSNR through the viewers' model: that of evaluating with preset
-    gsplat. Nothing is said of a fit with that preset. Without held-out views it is the PSNR of training views.
-    """
-    settings = drgs.RenderSettings.preset(preset, background=(0.1, 0.2, 0.3))
-    result = fit(dataset, tmp_path / "run", config(max_steps=5, settings=settings), progress=False)
-    print_table(result.metrics)
-    viewers, said = result.metrics["viewers"], capsys.readouterr().out
-    if preset == "gsplat":
-        assert viewers is None
-        assert "viewer" not in said
-        return
-    frames = load_frames(dataset.split()[1], SIZE * SIZE)
-    gsplat = drgs.RenderSettings.preset("gsplat", background=(0.1, 0.2, 0.3))
-    want = metrics.evaluate(result.gaussians, frames, gsplat)["mean"]["psnr"]
-    assert viewers["psnr"] == pytest.approx(want, abs=1e-3)
-    assert viewers["own_psnr"] == pytest.approx(result.metrics["mean"]["psnr"], abs=1e-3)
-    assert (viewers["split"], viewers["views"]) == ("test", ["0", "8"])
-    assert f"PSNR {want:.2f} dB instead of {viewers['own_psnr']:.2f} dB, mean of 2 test views" in said
-    unheld = fit(dataset, tmp_path / "all", config(max_steps=2, test_every=0), progress=False).metrics["viewers"]
-    assert (unheld["split"], len(unheld["views"])) == ("train", 5)  # every second of nine
-
-
-def test_a_fit_says_first_what_viewers_will_show(tmp_path, capsys, monkeypatch):
-    """A fit says which preset it trains for, what viewers draw with and how to train for them, before its first step;
-    nothing with the viewers' own preset, nor without progress.
-    """
-    write_still(tmp_path / "data")
-    step = Trainer.step
-    monkeypatch.setattr(Trainer, "step", lambda self: (print("stepping", file=sys.stderr), step(self))[1])
-
-    def said(*options):
-        name = str(tmp_path / f"run{len(list(tmp_path.iterdir()))}")
-        words = ["fit", str(tmp_path / "data"), "-o", name, "--max-steps", "1", "--no-report", *options]
-        assert cli.main(words) == 0
-        return [line for line in capsys.readouterr().err.partition("stepping")[0].splitlines() if "viewers" in line]
-
-    (hint,) = said()
-    assert hint.startswith("this fit trains for preset fast; viewers of PLY files draw with preset gsplat")
-    assert hint.endswith("; preset gsplat trains for viewers")
-    (hint,) = said("--preset", "gsplat", "--set", "dilation=0.1")
-    assert hint.startswith("this fit trains for preset gsplat with dilation=0.1; ")
-    assert hint.endswith("; preset gsplat alone trains for viewers")
-    assert said("--preset", "gsplat", "--background", "1", "1", "1") == said("--quiet") == []
-
-
-def test_viewers_widen_what_is_small():
-    """Gaussians of a third of a pixel are another picture in the viewers' model (measured: 17.9 dB), of 1.3 pixels
-    nearly the same one (36.7); the line says how to train for it.
-    """
-    camera = orbit((0, 0, 0), 3.0, 1, width=SIZE, height=SIZE)[0]
-    sigma = math.log(0.33 * 3.0 / float(camera.K[0, 0]))
-    g = dataclasses.replace(scene(200), log_scales=torch.full((200, 3), sigma))
-    psnr = []
-    for size in (SIZE, 4 * SIZE):
-        view = camera.resized(size, size)
-        frame = Frame("0", view, drgs.render(g, view, FAST).rgb.clamp(0, 1))
-        viewers = metrics.through_viewers(g, [frame], FAST, "test")
-        assert viewers["own_psnr"] == 100
-        assert viewers_line(viewers).endswith("to train for viewers, fit with --preset gsplat")
-        psnr.append(viewers["psnr"])
-    assert psnr[0] < 22
-    assert psnr[1] > 32
 
 
 def test_resumed_run_equals_an_uninterrupted_one(dataset, tmp_path, monkeypatch, two_threads):

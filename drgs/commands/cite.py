@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from drgs.fitting.renderers import RendererSchedule
 from drgs.guards.json_files import read_json
 from drgs.runtime import version
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from drgs.commands.options import Cite
     from drgs.fitting.config import SelectionConfig
     from drgs.fitting.records import FitRecord
+    from drgs.settings import RenderSettings
 
 __all__ = ["cited", "run"]
 
@@ -36,6 +38,11 @@ class _Used(NamedTuple):
     format: str
     selection: SelectionConfig | None
     lpips: bool
+
+    def rendered(self) -> tuple[RenderSettings, ...]:
+        """What its steps were rendered with."""
+        config = self.record.config
+        return RendererSchedule.of(config.renderers, config.settings, config.max_steps).all_settings
 
     def chose(self, *policies: str) -> bool:
         """Whether views were chosen by one of these policies."""
@@ -58,11 +65,10 @@ _EVERY_USE = ("drgs", "jakob2022drjit", "mitsuba3", "kerbl2023gaussians", "li202
 
 _RUNS: dict[str, _Test] = {
     "kheradmand2024mcmc": lambda used: True,
-    "moenneloccoz2024raytracing": lambda used: used.record.config.settings.response == "peak",
-    "zwicker2001ewa": lambda used: used.record.config.settings.response == "ewa",
-    "ye2025gsplat": lambda used: (
-        "gsplat" in (used.record.config.settings.fov_clamp, used.record.config.settings.culling)
-    ),
+    "moenneloccoz2024raytracing": lambda used: any(s.response == "peak" for s in used.rendered()),
+    "zwicker2001ewa": lambda used: any(s.response == "ewa" for s in used.rendered()),
+    "ye2025gsplat": lambda used: any("gsplat" in (s.fov_clamp, s.culling) for s in used.rendered()),
+    "wu2025threedgut": lambda used: any(s.nearest_preset()[0] == "3dgut" for s in used.rendered()),
     "schoenberger2016sfm": lambda used: used.format == "colmap",
     "zhou2024feature3dgs": lambda used: used.record.semantics is not None,
     "wu2024fourd": lambda used: bool(used.record.times),

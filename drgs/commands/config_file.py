@@ -13,6 +13,7 @@ from typing import Any
 
 from drgs.commands.overrides import override
 from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.renderers import AUTO
 from drgs.guards.json_files import read_json, read_toml
 from drgs.guards.records import Record, hints_of, nearest, part_of, stated
 from drgs.settings import RenderSettings
@@ -89,7 +90,10 @@ def default_of(options: type, fields: Mapping[str, Any], required: Any) -> Any:
     given = dict(fields)
     settings = given.pop("settings", None)
     if settings is not None:
-        given["preset"], differences = settings.nearest_preset()
+        preset, differences = settings.nearest_preset()
+        # `auto` is said by no preset: naming fast would mean fast alone.
+        if not (preset == _PRESET and tuple(given.get("renderers", ())) == AUTO and hasattr(options, "renderers")):
+            given["preset"] = preset
         given["overrides"] = tuple(override(name, x) for name, x in differences.items())
         if hasattr(options, "background"):
             given["background"] = settings.background

@@ -44,6 +44,7 @@ _PRESETS = {
     "fast": "one depth a Gaussian, cut at 3 sigma",
     "inria": "INRIA's rasterizer: projected covariance, its cut-offs",
     "gsplat": "gsplat's rasterizer, its cut-offs",
+    "3dgut": "as exact at each hit, gsplat's order and cut-offs",
     "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
 }
 _GAIN = 8  # factor of difference pictures

@@ -9,14 +9,12 @@ from drgs.evaluation import evaluate_run
 from drgs.files import Run
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
-from drgs.metrics import METRICS, MOVING, Lpips
+from drgs.metrics import METRICS, MOVING, Lpips, renderers_table
 
 if TYPE_CHECKING:
     from drgs.commands.options import Eval
 
-__all__ = ["print_table", "run", "viewers_line"]
-
-_NOISE = 0.1  # dB; two fits differ by that much
+__all__ = ["print_table", "run"]
 
 
 def run(args: Eval) -> None:
@@ -25,13 +23,13 @@ def run(args: Eval) -> None:
     recorded = fit_record(run)
     recorded.check_data(run.path)
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
-    written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict)
+    written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict, args.preset)
     if not args.quiet:
         print_table(written, lpips=lpips is not None)
 
 
 def print_table(metrics: dict, *, lpips: bool = False) -> None:
-    """Print metrics as tables on stdout, reasons of missing ones below, and what viewers show.
+    """Print metrics as tables on stdout, reasons of missing ones below, and what each renderer shows.
 
     Args:
         metrics: Content of metrics.json.
@@ -51,8 +49,9 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
         if name == "lpips" and not lpips:
             continue
         print(f"{name}: none ({reason})")
-    if metrics["viewers"]:
-        print(viewers_line(metrics["viewers"]))
+    title, head, rows = renderers_table(metrics)
+    if rows:
+        tables.show(title, head, rows, texts=("worst view",))
     if moved := metrics.get("motion"):
         print(_motion_line(moved, metrics["gaussians"]))
 
@@ -87,15 +86,3 @@ def _print_segmentation(metrics: dict, found: dict) -> None:
             ("", *shown.values()),
             [(name, *(f"{values[key]:.4f}" for key in shown)) for name, values in rows],
         )
-
-
-def viewers_line(viewers: dict) -> str:
-    """What `through_viewers` found, and what to do about it."""
-    line = (
-        f"In a viewer of PLY files (preset {viewers['preset']}, {viewers['width']}x{viewers['height']}): PSNR "
-        f"{viewers['psnr']:.2f} dB instead of {viewers['own_psnr']:.2f} dB, mean of {len(viewers['views'])} "
-        f"{viewers['split']} views"
-    )
-    if viewers["own_psnr"] - viewers["psnr"] <= _NOISE:
-        return line
-    return f"{line}; to train for viewers, fit with --preset {viewers['preset']}"

@@ -49,7 +49,7 @@ _HEADING_OF_NAME = {
     **dict.fromkeys(("times", "test_cameras", "strict", "lpips_weights"), "Data"),
     **dict.fromkeys(("cameras", "candidates", "train", "selection", "views", "split", "limit", "count"), "Views"),
     **dict.fromkeys(("orbit", "time", "view", "frames", "prior", "relative_prior", "k"), "Views"),
-    **dict.fromkeys(("preset", "overrides", "background", "width", "height"), "Rendering"),
+    **dict.fromkeys(("renderers", "preset", "overrides", "background", "width", "height"), "Rendering"),
     **dict.fromkeys(("variant", "threads", "deterministic", "scheduler", "workers", "quiet", "debug"), "Machine"),
     **dict.fromkeys(("sh_degree",), "Quality"),
 }
@@ -59,7 +59,8 @@ _COMMON = ("variant", "threads", "quiet", "debug")
 EVERYDAY: dict[str, tuple[str, ...]] = {
     "fit": (
         *("data", "output", "config", "resume", "max_steps", "max_pixels", "test_every", "times", "mask", "views"),
-        *("policy", "add", "max_gaussians", "sh_degree", "semantics", "dynamics", "preset", "background", "seed"),
+        *("policy", "add", "max_gaussians", "sh_degree", "semantics", "dynamics", "renderers", "preset"),
+        *("background", "seed"),
         *_COMMON,
     ),
     "select": (

@@ -32,6 +32,7 @@ from drgs.commands.orbit_keys import ORBIT_KEYS
 from drgs.commands.overrides import check_color
 from drgs.commands.record_options import BLOCKS_TEXT, options_of
 from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.fitting.renderers import AUTO, own_preset
 from drgs.guards.records import ways_of
 from drgs.information.choices import Block
 from drgs.settings import Preset, RenderSettings
@@ -108,8 +109,8 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
     """COLMAP, transforms.json (D-NeRF too), LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, or folders cam00, ..."""
     output: OutputPath
     """The run folder."""
-    preset: Preset = "fast"
-    """Render settings of a named system. Train with what will be rendered with: gsplat for viewers of PLY files."""
+    preset: Preset | None = None
+    """Render settings of a named system: fit for it alone, or with --for of several draw previews and views by it."""
     resume: bool = False
     """Continue from the last checkpoint in the run folder."""
     background: tuple[float, float, float] = RenderSettings.background
@@ -120,11 +121,14 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
     """Write report.html into the run folder at the end, unless --no-report is given, which saves its seconds."""
 
     def settings(self) -> RenderSettings:
-        """As for every command, with the background that the photographs are composited on."""
+        """As for every command, with the background that the photographs are composited on; without --preset those of
+        the renderer that the fit is for, `fast` of several.
+        """
         if any(text.startswith("background=") for text in self.overrides):
             raise ValueError("--set background: must be --background here, which photographs are composited on as well")
         check_color("--background", self.background)
-        return super().settings().replace(background=self.background)
+        preset = self.preset or own_preset(self.renderers)
+        return RenderSettings.preset(preset, **self.replaced()).replace(background=self.background)
 
     def fit_config(self) -> FitConfig:
         """What these options say of the fit, its selection with --views active.
@@ -133,7 +137,10 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
             ValueError: If an option is out of range, or belongs to --views active and that is missing.
         """
         names = {*ways_of(FitConfig)} & {field.name for field in dataclasses.fields(_Fitted)}
-        config = FitConfig.of(settings=self.settings(), **{name: getattr(self, name) for name in names})
+        fields = {name: getattr(self, name) for name in names}
+        if self.renderers == AUTO and self.preset == "fast":
+            fields["renderers"] = ("fast",)  # asked for by name, it is not the default
+        config = FitConfig.of(settings=self.settings(), **fields)
         if self.views != "active" and (self.scheduler, self.workers) != (None, None):
             raise ValueError(
                 "fit: --scheduler and --workers must have --views active, got --views all; workers compute what "
@@ -310,6 +317,8 @@ class Eval(Common, Data):
     """A run folder."""
     split: Split = "test"
     """Which views."""
+    preset: Literal["all", Preset] | None = None
+    """Renderers to measure with, beside the run's own settings; default those that it was fitted for, and gsplat."""
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
 

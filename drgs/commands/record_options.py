@@ -38,7 +38,17 @@ CAMERAS_TEXT: Any = PrimitiveConstructorSpec(
 CARRIED: Any = Suppress[Fixed[Any]]
 """Type of a field that no option sets."""
 
-_SPECS = {"blocks": BLOCKS_TEXT, "test_cameras": CAMERAS_TEXT}
+# One text, `gsplat,fast`; what is none of the names is refused by the configuration of the fit.
+_RENDERERS_TEXT: Any = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="any|drgs|viewers|PRESET,PRESET",
+    instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
+    is_instance=lambda x: isinstance(x, tuple),
+    str_from_instance=lambda x: [",".join(x)],
+)
+
+_SPECS = {"blocks": BLOCKS_TEXT, "test_cameras": CAMERAS_TEXT, "renderers": _RENDERERS_TEXT}
+_SPELLINGS = {"renderers": "for"}  # where an option has another name than its field
 # Help shows the names; a function of one's own has another.
 _TYPES: dict[str, Any] = {"policy": Policy | str, "criterion": Criterion | str}
 _CARRIED = ("weights", "groups")  # mappings and lists of names, which a file says better than a line
@@ -77,6 +87,6 @@ def _option(kind: type, name: str, hint: Any, default: Any, text: str) -> tuple[
         usual = {"default_factory": dict} if isinstance(default, dict) else {"default": default}
         return CARRIED, dataclasses.field(**usual, metadata={HIDDEN: True})
     marks = (_SPECS[name],) if name in _SPECS else ()
-    return Annotated[(_TYPES.get(name, hint), arg(help=text), *marks)], dataclasses.field(
+    return Annotated[(_TYPES.get(name, hint), arg(name=_SPELLINGS.get(name), help=text), *marks)], dataclasses.field(
         default=default, metadata={OF_RECORD: kind.__name__}
     )

@@ -8,9 +8,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from drgs.commands.options import Fit
 from drgs.commands.overrides import override
 from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.fitting.renderers import AUTO, own_preset
 from drgs.settings import RenderSettings
 
 __all__ = ["fit_command"]
@@ -27,7 +27,7 @@ def fit_command(config: FitConfig, data: Path, output: Path) -> tuple[str, list[
         The line for a shell, and the fields that no option sets, as `name=value`: these need a file (--config).
     """
     usual = FitConfig()
-    words = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings)]
+    words = ["drgs", "fit", str(data), "-o", str(output), *_settings(config.settings, config.renderers)]
     for name in ("max_steps", "seed", "sh_degree", "deterministic"):
         words += _option(name, getattr(config, name), getattr(usual, name))
     for part in ("data", "density", "rates", "loss", "features", "motion", "saving"):
@@ -47,12 +47,13 @@ def fit_command(config: FitConfig, data: Path, output: Path) -> tuple[str, list[
     return shlex.join(words), beyond
 
 
-def _settings(settings: RenderSettings) -> list[str]:
-    """The preset that is nearest, and what replaces its fields."""
+def _settings(settings: RenderSettings, renderers: tuple[str, ...]) -> list[str]:
+    """The renderers, the preset that is nearest, and what replaces its fields."""
     nearest, differences = settings.nearest_preset()
-    words = [] if nearest == Fit.preset else ["--preset", nearest]
+    words = [] if nearest == own_preset(renderers) else ["--preset", nearest]
     for name, value in differences.items():
         words += ["--set", override(name, value)]
+    words = [*([] if renderers == AUTO else ["--for", ",".join(renderers)]), *words]
     return words + _option("background", settings.background, RenderSettings.background)
 
 

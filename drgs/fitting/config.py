@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from drgs.fitting.renderers import AUTO, check_renderers, named_renderers
 from drgs.guards.arguments import check_fields
 from drgs.guards.records import Record, ways_of
 from drgs.information.choices import POLICIES, check_named
@@ -397,11 +398,13 @@ def recorded_config(fit: Any, active: Mapping[str, Any] | None = None) -> FitCon
     Args:
         fit: What `to_json` made, or all fields beside each other, as older versions wrote them.
         active: Those of the selection, which older versions wrote elsewhere. The first did not begin again after a
-            pick, and had no field that says so.
+            pick, and had no field that says so. Nor had they one for renderers: all steps had the same settings.
     Raises:
         ValueError: If a field is unknown or out of range.
     """
     config = FitConfig.from_json(fit)
+    if "renderers" not in fit:
+        config = config.replace(renderers=(config.settings.nearest_preset()[0],))
     return config.replace(selection=selection_of_flat({"restart": "never", **active})) if active else config
 
 
@@ -426,8 +429,15 @@ class FitConfig(Record):
     `deterministic`: an image that is drawn again without gradients differs from the one that was fitted by 1e-7, the
     rounding of its sums (presets `fast`, `inria` and `gsplat`; those of `exact` and `mitsuba` have the same bits).
 
+    `renderers`: with several of them every step is rendered with the preset that is due (`drgs.fitting.renderers`), and
+    `settings`, which are a preset's then, are those of the fit's own pictures and numbers, by which views are chosen as
+    well; their background is that of all. A single renderer is drawn with `settings`, whatever fields they replace.
+    `auto` is `any`, and with other settings than those of preset `fast` these alone.
+
     Attributes:
         settings: What `drgs.render` computes.
+        renderers: Renderers that the fit must look right in, taken in turn: any (exact, fast, inria, gsplat, 3dgut),
+            drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone where it is given.
         max_steps: Optimizer steps.
         seed: Seed of everything random.
         sh_degree: Highest degree of the view-dependent color.
@@ -446,6 +456,7 @@ class FitConfig(Record):
     """
 
     settings: RenderSettings = _FAST
+    renderers: tuple[str, ...] = AUTO
     max_steps: int = 3000
     seed: int = 0
     sh_degree: Degree = 3
@@ -462,13 +473,19 @@ class FitConfig(Record):
 
     def __post_init__(self) -> None:
         check_fields("fit", self, {"max_steps": _COUNT, "seed": (0, 2**31 - 1)})  # a seed is what COLMAP takes
+        check_renderers(self.renderers, self.settings)
 
     def difference(self, other: FitConfig) -> tuple[str, Any, Any] | None:
         """The first field whose value in `other` makes another fit, and both values as JSON has them.
 
         When checkpoints are written makes none; how views are chosen is compared where it is known what `auto` is.
         """
-        mine, theirs = (config.replace(saving=SavingConfig(), selection=None).to_json() for config in (self, other))
+        mine, theirs = (
+            config.replace(
+                renderers=named_renderers(config.renderers, config.settings), saving=SavingConfig(), selection=None
+            ).to_json()
+            for config in (self, other)
+        )
         return _difference(mine, theirs)
 
 

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.config import FitConfig
+from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
+from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
 from drgs.integrator import render
@@ -63,6 +64,7 @@ class Trainer:
         extent: Extent of the scene, its unit of length.
         parts: Terms of the loss, learning rates, networks, and what is rendered.
         motion: The stages of a fit to what moves; None of what stands still.
+        renderers: What each step is rendered with.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
@@ -96,6 +98,7 @@ class Trainer:
         self.parts = parts_of(config, extent) if parts is None else parts
         self.motion = motion
         self._check_parts()
+        self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -238,7 +241,10 @@ class Trainer:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
         # What an older drgs did not know, it did as the defaults say.
-        if other := config.difference(FitConfig.from_json(header["config"])):
+        before = recorded_config(header["config"])
+        if config.renderers == AUTO and config.settings == before.settings:
+            config = config.replace(renderers=before.renderers)  # `auto` goes on with what the fit began with
+        if other := config.difference(before):
             name, now, was = other
             raise ValueError(
                 f"{where}: --resume must continue the same fit, {name} was {was!r} and is {now!r}; "
@@ -348,7 +354,7 @@ class Trainer:
         return render(
             gaussians,
             frame.camera,
-            self.config.settings,
+            self.renderers.settings_at(self.step_index),
             outputs=tuple(outputs),
             couple_features=parts.couple_features,
         )

@@ -41,7 +41,7 @@ from drgs.sizes import cropped
 __all__ = ["VERDICTS", "Result", "crops", "crossval"]
 
 VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
-_STARTS = ("gsplat", "inria", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
+_STARTS = ("gsplat", "inria", "3dgut", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
 _ORACLE_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a scene that the oracle takes as it is
 _TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}
 _SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs

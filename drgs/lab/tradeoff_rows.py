@@ -110,6 +110,7 @@ TRADEOFF_VARIANTS = (
     Variant("model", "mitsuba"),
     Variant("model", "inria"),
     Variant("model", "gsplat"),
+    Variant("approximation", "3dgut"),
     *(Variant("resolution", preset, share=share) for preset in ("exact", "fast") for share in (0.5, 0.25)),
 )
 

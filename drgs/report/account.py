@@ -20,6 +20,10 @@ _EVENTS: dict[str, dict] = {
     "preview": {"test_psnr": _NUMBER},
     "done": {"seconds": float},
 }
+_SHOWN = {"name": str, "psnr": float}  # of a renderer in a view
+_RENDERER = {"name": str, "mean": {"psnr": float}, "worst": _SHOWN, "views": [_SHOWN]}
+_RENDERERS = {"split": str, "width": int, "height": int, "rows": [_RENDERER]}
+_VIEWERS = {"split": str, "width": int, "height": int, "preset": str, "psnr": float, "own_psnr": float, "views": [str]}
 _METRICS = {"split": str, "count": int, "gaussians": int, "mean": dict, "views": [{"name": str}], "reasons": dict}
 _PICK = {"number": int, "step": int, "index": int, "name": str, "score": _NUMBER, "margin": _NUMBER, "seconds": float}
 _PICK |= {"policy": str, "parts": dict, "candidates": [{"index": int, "name": str, "score": _NUMBER}]}
@@ -80,6 +84,9 @@ def account_of(run: Run) -> Account:
     metrics = _optional(run.path / "metrics.json", _METRICS)
     for row in [] if metrics is None else [metrics["mean"], *metrics["views"]]:
         _check_numbers(run.path / "metrics.json", {name: x for name, x in row.items() if name != "name"})
+    for name, kind in {"renderers": _RENDERERS, "viewers": _VIEWERS}.items():
+        if metrics is not None and metrics.get(name) is not None:
+            check_json(str(run.path / "metrics.json"), metrics[name], kind, _ADVICE)
     selection = _optional(run.path / "selection.json", _SELECTION) if record.is_active else None
     for pick in [] if selection is None else selection["picks"]:
         _check_numbers(run.path / "selection.json", pick["parts"])

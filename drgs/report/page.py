@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.metrics import renderers_table
 from drgs.report.pictures import Picture
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
         else "Photograph and rendering of the first view, as it came along.",
         "split": {"test": "Held-out", "train": "Fitted"}.get(metrics.get("split", ""), "Measured"),
         **_views(metrics, shown),
+        "renderers": renderers_table(metrics),
         "segmentation": _segmentation(metrics),
         "moments": shown.moments,
         "moments_text": f"Camera {shown.moments_of}, stopped where it is, at times of the sequence.",
@@ -109,6 +111,7 @@ def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
     there = {
         "fit": ("How it went", context["charts"].get("progress") or context["previews"]),
         "views": ("Views", context["views"]),
+        "renderers": ("Renderers", context["renderers"][2]),
         "labels": ("Labels", context["segmentation"]),
         "time": ("Over time", context["moments"]),
         "cameras": ("Cameras", context["charts"].get("cameras") or context["picks"]),

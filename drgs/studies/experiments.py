@@ -142,7 +142,7 @@ their distances), and of every lambda."""
 
 
 def _fit(**fields: Any) -> FitConfig:
-    return FitConfig.of(**{"feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
+    return FitConfig.of(**{"renderers": ("fast",), "feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
 
 
 _TINY: Mapping[str, Any] = {"max_gaussians": 500, "feature_width": 8, "feature_rate": 5e-2, "decoder_rate": 1e-2}
@@ -164,7 +164,9 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
         every=40,
         views=84,
     ),
-    ("static", "paper"): Sizes(FitConfig(max_steps=7000), (320, 240), (80, 60), every=200, views=84),
+    ("static", "paper"): Sizes(
+        FitConfig(renderers=("fast",), max_steps=7000), (320, 240), (80, 60), every=200, views=84
+    ),
     ("dynamic", "tiny"): Sizes(
         _fit(
             times=4,
@@ -191,7 +193,7 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
         cameras=10,
         info_pixels=2_700,
     ),
-    ("dynamic", "paper"): Sizes(FitConfig(max_steps=17_000), (240, 180), (60, 45), cameras=15),
+    ("dynamic", "paper"): Sizes(FitConfig(renderers=("fast",), max_steps=17_000), (240, 180), (60, 45), cameras=15),
 }
 """Of the fits, and of the scenes that are made. As `small` has a fifth of the paper's steps on static scenes, and a
 nineteenth on those that move, features and decoder go five times as fast, and there the field, too."""

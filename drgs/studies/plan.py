@@ -85,6 +85,8 @@ def plan_of(
         raise ValueError("reproduce: --data must be folders of different names, got one twice; rename or link one")
     study = study_of(experiment.study, scale, made, scenes, lpips=lpips)
     own = {name: x for name, x in fields.items() if name != "selection"}  # every fit of a study has one
+    if "settings" in own:  # the scale's renderer is not that of other settings
+        own = {"renderers": (own["settings"].nearest_preset()[0],), **own}
     study = dataclasses.replace(
         study, policies={label: study.policies[label] for label in wanted}, fit=study.fit.replace(**own)
     )

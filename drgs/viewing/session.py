@@ -39,7 +39,7 @@ __all__ = ["REST", "Session"]
 REST = 0.3
 """Seconds that a camera rests before our picture is drawn."""
 
-_PRESETS = ("exact", "fast", "gsplat")
+_PRESETS = ("exact", "fast", "gsplat", "3dgut")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
 _COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden

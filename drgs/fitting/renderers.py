@@ -1,0 +1,175 @@
+"""Which renderers a fit must look right in: a preset a step, taken in turn.
+
+Gaussians that are fitted with one renderer alone fit its approximations, too: what another one shows of them may be
+several dB worse, where they are large and near above all, whose order the renderers disagree about. Gaussians that have
+met each of them agree with all. Which preset is due is a function of the step alone, so that a fit that goes on after
+a pause meets the same ones; views come in another random order every epoch, so that each view meets every renderer,
+whatever their number is. Imports nothing heavy: options are checked here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from drgs.settings import PRESETS, Preset, RenderSettings
+
+__all__ = [
+    "ANY",
+    "AUTO",
+    "VIEWERS",
+    "RendererSchedule",
+    "check_renderers",
+    "named_renderers",
+    "own_preset",
+    "renderers_to_measure",
+]
+
+AUTO = ("auto",)
+"""`any`; where a fit has other settings than those of preset `fast`, these alone."""
+ANY: tuple[Preset, ...] = ("exact", "fast", "inria", "gsplat", "3dgut")
+"""The presets that a fit is measured with where nothing else is said."""
+VIEWERS: Preset = "gsplat"
+"""The preset that viewers of PLY files draw with."""
+
+_MEANINGS: dict[str, tuple[Preset, ...]] = {"any": ANY, "drgs": ("exact", "fast"), "viewers": ("gsplat", "inria")}
+# Name -> (share of the steps from which on, presets in turn). `exact` takes about four times as long as the others.
+# `inria` differs from `gsplat` in cut-offs only, and looks right where that does.
+_CYCLES: dict[str, tuple[tuple[float, tuple[Preset, ...]], ...]] = {
+    "any": ((0.0, ("gsplat", "fast", "3dgut", "gsplat", "fast", "3dgut", "gsplat", "exact")),),
+    "drgs": ((0.0, ("fast", "fast", "fast", "exact")),),
+    "viewers": ((0.0, ("gsplat", "inria")),),
+}
+
+
+def check_renderers(names: Sequence[str], settings: RenderSettings) -> None:
+    """Raise ValueError unless names and settings are of one fit.
+
+    Args:
+        names: Presets, each once, or one of `auto`, `any`, `drgs` and `viewers`.
+        settings: The fit's own: those of a single renderer, or a preset's, but for the background, beside several.
+    """
+    _check_names(names)
+    if tuple(names) == AUTO:
+        return
+    got = ",".join(names)
+    nearest, differences = settings.nearest_preset()
+    if _is_single(names):
+        if nearest != names[0] and not differences:
+            raise ValueError(
+                f"fit: renderers {got} must have the settings of that preset, got those of {nearest}; leave one of the "
+                f"two out, or say preset {got}"
+            )
+    elif differences:
+        field, value = next(iter(differences.items()))
+        raise ValueError(
+            f"fit: renderers {got} must have the settings of presets, got {field}={value}; name a single renderer, or "
+            f"leave {field} as it is"
+        )
+
+
+def named_renderers(names: Sequence[str], settings: RenderSettings) -> tuple[str, ...]:
+    """The names that a fit's `renderers` and settings mean: without `auto`, and of a single renderer the nearest
+    preset's.
+    """
+    if tuple(names) == AUTO and settings == RenderSettings.preset("fast", background=settings.background):
+        return ("any",)
+    if tuple(names) == AUTO or _is_single(names):
+        return (settings.nearest_preset()[0],)
+    return tuple(names)
+
+
+def own_preset(names: Sequence[str]) -> str:
+    """The preset of a fit's own pictures and numbers where nothing else is said: `fast`, or else the first.
+
+    Raises:
+        ValueError: As `check_renderers` does of names.
+    """
+    _check_names(names)
+    meant = _MEANINGS["any"] if tuple(names) == AUTO else _MEANINGS.get(names[0], tuple(names))
+    return "fast" if "fast" in meant else meant[0]
+
+
+def renderers_to_measure(names: Sequence[str], settings: RenderSettings, asked: str | None = None) -> dict:
+    """Name -> settings of the renderers that a fit is measured with, beside its own.
+
+    Args:
+        names: The fit's `renderers`.
+        settings: Its own settings; all have their background.
+        asked: A preset, or `all`; None: those that the fit is for, and what viewers draw with.
+    """
+    background = settings.background
+    if asked is None:
+        named = named_renderers(names, settings)
+        wanted = () if _is_single(named) else _MEANINGS.get(named[0], named)
+        wanted = tuple(dict.fromkeys([*wanted, VIEWERS]))
+    else:
+        wanted = ANY if asked == "all" else (asked,)
+    found = {name: RenderSettings.preset(name, background=background) for name in wanted}
+    if settings in found.values():
+        return found
+    name, differences = settings.nearest_preset()
+    return {" ".join([name, *(f"{field}={value}" for field, value in differences.items())]): settings, **found}
+
+
+@dataclasses.dataclass(frozen=True)
+class RendererSchedule:
+    """What each step of a fit is rendered with.
+
+    Attributes:
+        max_steps: Steps of the fit.
+        stages: Shares of the steps from which on each holds, in their order, with the settings taken in turn.
+    """
+
+    max_steps: int
+    stages: tuple[tuple[float, tuple[RenderSettings, ...]], ...]
+
+    @classmethod
+    def of(cls, names: Sequence[str], settings: RenderSettings, max_steps: int) -> RendererSchedule:
+        """That of a fit.
+
+        Args:
+            names: Its `renderers`, as `check_renderers` takes them.
+            settings: Its own: all there is with a single renderer, else only their background counts.
+            max_steps: Its steps.
+        """
+        named = named_renderers(names, settings)
+        if _is_single(named):
+            return cls(max_steps, ((0.0, (settings,)),))
+        cycles = _CYCLES.get(named[0], ((0.0, named),))
+        background = settings.background
+        return cls(
+            max_steps,
+            tuple(
+                (begin, tuple(RenderSettings.preset(name, background=background) for name in cycle))
+                for begin, cycle in cycles
+            ),
+        )
+
+    def settings_at(self, step: int) -> RenderSettings:
+        """The settings that a step, from 0 on, is rendered with."""
+        cycle = next(cycle for begin, cycle in reversed(self.stages) if step >= begin * self.max_steps)
+        return cycle[step % len(cycle)]
+
+    @property
+    def all_settings(self) -> tuple[RenderSettings, ...]:
+        """All settings of its steps, each once, in the order of their first turn."""
+        return tuple(dict.fromkeys(settings for _, cycle in self.stages for settings in cycle))
+
+
+def _is_single(names: Sequence[str]) -> bool:
+    """Whether names, none of them `auto`, mean one renderer."""
+    return len(names) == 1 and names[0] in PRESETS
+
+
+def _check_names(names: Sequence[str]) -> None:
+    """Raise ValueError unless these are presets, each once, or one name of several."""
+    groups = (*AUTO, *_MEANINGS)
+    if unknown := [name for name in names if name not in (*groups, *PRESETS)]:
+        raise ValueError(
+            f"fit: renderers must be one of {', '.join(groups)}, or of {', '.join(PRESETS)}, got {unknown[0]!r}"
+        )
+    if not names or len(set(names)) < len(names) or (len(names) > 1 and set(names) & set(groups)):
+        raise ValueError(
+            f"fit: renderers must be one of {', '.join(groups)}, or presets, each once, got {','.join(names) or 'none'}"
+        )
