@@ -35,10 +35,18 @@ CAMERAS_TEXT: Any = PrimitiveConstructorSpec(
     is_instance=lambda x: x is None or isinstance(x, tuple),
     str_from_instance=lambda x: ["the first" if x is None else ",".join(x) or "none"],
 )
+# One text, `exposure,pose`; `none` is the empty tuple.
+NUISANCES_TEXT: Any = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="UNKNOWN,UNKNOWN|none",
+    instance_from_str=lambda texts: () if texts[0] == "none" else tuple(name.strip() for name in texts[0].split(",")),
+    is_instance=lambda x: x is None or isinstance(x, tuple),
+    str_from_instance=lambda x: ["as the fit" if x is None else ",".join(x) or "none"],
+)
 CARRIED: Any = Suppress[Fixed[Any]]
 """Type of a field that no option sets."""
 
-_SPECS = {"blocks": BLOCKS_TEXT, "test_cameras": CAMERAS_TEXT}
+_SPECS = {"blocks": BLOCKS_TEXT, "test_cameras": CAMERAS_TEXT, "eliminate": NUISANCES_TEXT}
 # Help shows the names; a function of one's own has another.
 _TYPES: dict[str, Any] = {"policy": Policy | str, "criterion": Criterion | str}
 _CARRIED = ("weights", "groups")  # mappings and lists of names, which a file says better than a line
