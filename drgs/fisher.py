@@ -52,8 +52,8 @@ from drgs.information.backdrop import (
 from drgs.information.choices import METHODS
 from drgs.information.columns import jacobian_columns
 from drgs.information.diagonal import check_same_parameters, diagonal_and_opacity
-from drgs.information.groups import GROUPS, Information, groups_of
 from drgs.information.elimination import BLOCK_INPUTS, ViewRows, backdrop_taken
+from drgs.information.groups import GROUPS, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.nuisances import Nuisances
 from drgs.information.replay import Replay
@@ -276,7 +276,7 @@ def backdrop(
             None: infinitely far away.
         seen_opacity: (H, W) of each view, where they are known, as `drgs.render` gives them; None: they are rendered.
         nuisances: The same as for `diagonal`.
-        semantics: The same; features tell about a pose that is eliminated, too.
+        semantics: The metric of the features, which show where the camera stands, too; None: only colors do.
     """
     cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
     if seen_opacity is not None and [x.shape for x in seen_opacity] != [(c.height, c.width) for c in cameras]:

@@ -438,10 +438,16 @@ class SceneBlocks:
         """Block -> what it alone says of a view.
 
         Each looks at the view anew: what `drgs fisher` writes of the backdrop is of the opacity that is rendered, which
-        is up to 6e-6 off the one that a diagonal has found on its way.
+        is up to 6e-6 off the one that a diagonal has found on its way. Unknowns of the view are eliminated from each by
+        its own rows: what colors and features tell together, with a pose eliminated from both at once, is more than the
+        sum of these.
         """
         with torch.no_grad():  # information is a number
             return {name: one.information(self._view(camera)) for name, one in self._apart()}
+
+    def with_unknowns(self) -> SceneBlocks:
+        """The same, but that nothing is eliminated from what views tell."""
+        return dataclasses.replace(self, scoring=dataclasses.replace(self.scoring, nuisances=Nuisances(eliminate=())))
 
     def variance_maps(self, camera: Camera, weights: Information) -> dict[str, torch.Tensor]:
         """Block -> (H, W) float32 map of its rows: sums of J_pk^2 weights_k, see `drgs.fisher.variance_map`.

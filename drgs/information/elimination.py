@@ -1,8 +1,8 @@
 """The rows of a view as an image that can be differentiated, freed of what its own unknowns explain.
 
 The equations are in `drgs.information.complement`. N of the pose is forward mode, that of the exposure the image
-itself. The six numbers of the pose are a rotation about the camera's center and a translation: the same span as the world's
-twist, without the leverage of an origin that is far away.
+itself. The six numbers of the pose are a rotation about the camera's center and a translation: the same span as the
+world's twist, without the leverage of an origin that is far away.
 """
 
 from __future__ import annotations

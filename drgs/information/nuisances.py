@@ -77,6 +77,10 @@ class Nuisances(Record):
         """Those that are eliminated."""
         return self.eliminate or ()
 
+    def if_any(self) -> dict[str, dict]:
+        """As files hold them, under their name; nothing where none are eliminated."""
+        return {"nuisances": self.to_json()} if self.names else {}
+
     def over(self, fitted: Sequence[Nuisance]) -> Nuisances:
         """With those that a fit has estimated, unless these say themselves which."""
         return self if self.eliminate is not None else self.replace(eliminate=tuple(fitted))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from drgs.guards.arguments import kind_of, must_be
@@ -25,7 +25,7 @@ from drgs.information.choices import (
     checked_blocks,
 )
 from drgs.information.criteria import CRITERIA, criterion_named
-from drgs.information.nuisances import Nuisances
+from drgs.information.nuisances import Nuisance, Nuisances
 from drgs.information.prior import Prior
 from drgs.settings import RenderSettings
 
@@ -129,6 +129,15 @@ class Scoring(Record):
             from drgs.information.semantics import SemanticMetric  # with torch, which an option list does not need
 
             must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
+
+    def over(self, estimated: Sequence[Nuisance]) -> Scoring:
+        """With the unknowns of photographs that a fit has estimated eliminated, unless it says itself which are.
+
+        FisherRF's code knows none: with its method it is as it was.
+        """
+        if self.method == "fisherrf":
+            return self
+        return dataclasses.replace(self, nuisances=self.nuisances.over(estimated))
 
     def blocks_of(self, gaussians: Gaussians, where: str = "select", scene: Scene | None = None) -> tuple[Block, ...]:
         """The blocks that are scored of a scene.
