@@ -300,7 +300,7 @@ class BackdropQuestion(BlockQuestion):
             view.scene, view.camera, view.settings, (1.0, 1.0, 1.0), self.semantics, view.mask, self.nuisances
         )
         if taken is not None:
-            answer[_TAKEN] = taken
+            answer[_TAKEN] = taken.float()  # as a cache keeps it: the same bits with and without
         return self.finished(answer, view.camera, view.mask) if self.is_painted else answer
 
     def variance_map(self, view: SeenView, weights: Information) -> torch.Tensor:
