@@ -324,7 +324,7 @@ def test_select_scores_and_keeps_them_apart(rng):
     g, cache, cameras = gaussians(rng, 8, 1, scale=0.25).detach(), Cache(), around(rng, 4)
     ask = {"criterion": "eig", "cache": cache}
     plain = select(g, cameras[2:], cameras[:2], **ask)
-    freed = Nuisances(eliminate=("exposure",))
+    freed = Nuisances(eliminate=BOTH)
     first = select(g, cameras[2:], cameras[:2], nuisances=freed, **ask)
     again = select(g, cameras[2:], cameras[:2], nuisances=freed, **ask)
     fresh = select(g, cameras[2:], cameras[:2], nuisances=freed, criterion="eig")

@@ -44,6 +44,7 @@ __all__ = [
     "GEOMETRY_BLOCK",
     "MAP_PRIOR",
     "SEMANTIC_BLOCK",
+    "TAKEN",
     "BlockQuestion",
     "CoverageQuestion",
     "DiagonalQuestion",
@@ -59,8 +60,10 @@ MAP_PRIOR = Prior(1.0)
 
 _GAUSSIAN_GROUPS = ("means", "rotations", "log_scales", "logit_opacities", "sh", "features")
 _WITH_SCENES = ("columns", "probes")  # methods that know the parameters that a scene computes its Gaussians from
-_OPACITY = "opacity"  # the names under which a view's opacity, and what its unknowns take, travel as an Information
-_TAKEN = "taken"
+_OPACITY = "opacity"  # the name under which a view's opacity travels as an Information
+TAKEN = "taken"
+"""The name under which what a view's unknowns take of the backdrop travels with it: directions, of either sign."""
+
 _NO_NUISANCES = Nuisances()
 
 Answers = Callable[[Callable, Sequence["Camera"]], Iterable["Information"]]
@@ -300,7 +303,7 @@ class BackdropQuestion(BlockQuestion):
             view.scene, view.camera, view.settings, (1.0, 1.0, 1.0), self.semantics, view.mask, self.nuisances
         )
         if taken is not None:
-            answer[_TAKEN] = taken.float()  # as a cache keeps it: the same bits with and without
+            answer[TAKEN] = taken.float()  # as a cache keeps it: the same bits with and without
         return self.finished(answer, view.camera, view.mask) if self.is_painted else answer
 
     def variance_map(self, view: SeenView, weights: Information) -> torch.Tensor:
@@ -317,7 +320,7 @@ class BackdropQuestion(BlockQuestion):
         """Painted on the sphere of this call."""
         found = dict(answer)
         mask = None if self.empty_outside else mask
-        opacity, taken = found.pop(_OPACITY), found.pop(_TAKEN, None)
+        opacity, taken = found.pop(_OPACITY), found.pop(TAKEN, None)
         found[BACKDROP] = painted_opacity(opacity, camera, (1.0, 1.0, 1.0), mask, self.sphere, taken)
         return found
 

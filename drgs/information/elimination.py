@@ -53,6 +53,7 @@ def eliminated_of(call: Call, scales: torch.Tensor, nuisances: Nuisances) -> Eli
             columns.append(column)
         precision += [_precision(nuisances.exposure_std)] * 3
     if "pose" in nuisances.names:
+        assert call.camera is not None  # as of every view; rays have no pose
         with own_errors():
             moved = push_forward(call, {"camera": _twists(call.camera)})
         rows = moved.rgb if moved.features is None else torch.cat([moved.rgb, moved.features], -1)

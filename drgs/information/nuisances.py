@@ -66,7 +66,7 @@ class Nuisances(Record):
     @staticmethod
     def _check(name: str, value: object) -> None:
         low, high = _STD
-        if isinstance(value, bool) or not (isinstance(value, numbers.Real) and low <= value <= high):
+        if isinstance(value, bool) or not (isinstance(value, numbers.Real) and low <= float(value) <= high):
             raise ValueError(
                 f"nuisances: {name} must be within {low:g} and {high:g}, got {value!r}; leave it out where nothing is "
                 "known"
