@@ -389,6 +389,7 @@ class SelectionConfig(Record):
         record = self.to_json()
         scoring = record.pop("scoring")
         prior = scoring.pop("prior") or {"value": None, "relative": False}
+        scoring |= scoring.pop("nuisances")
         return record | scoring | {"prior": prior["value"], "relative_prior": prior["relative"]}
 
 
