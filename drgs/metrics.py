@@ -48,10 +48,10 @@ __all__ = [
 
 DEFINITIONS = {
     "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
-    "cc_psnr": "as psnr, after the rendering's colors were corrected to the photograph (multinerf's color_correct): each "
-    "channel by a least-squares fit of the products of two channels, the channels and 1, made five times, each time to "
-    "pixels inside the mask that are not saturated (within 0.5/255 of 0 or 1) in either image, clipped to [0, 1]; a "
-    "channel without such a pixel stays as it is",
+    "cc_psnr": "as psnr, after the rendering's colors were corrected to the photograph (multinerf's color_correct): "
+    "each channel by a least-squares fit of the products of two channels, the channels and 1, made five times, each "
+    "time to pixels inside the mask that are not saturated (within 0.5/255 of 0 or 1) in either image, clipped to "
+    "[0, 1]; a channel without such a pixel stays as it is",
     "ssim": "11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
