@@ -82,9 +82,10 @@ def start(
     if parts is None and config.data.exposure != "off":
         from drgs.fitting.exposure import estimate_exposure
 
-        found = estimate_exposure(frames, points, config.seed)
-        is_on = config.data.exposure != "auto" or found.is_clear
+        with Bar("exposure") as bar:
+            found = estimate_exposure(frames, points, config.seed)
+            is_on = config.data.exposure != "auto" or found.is_clear
+            bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else 'off, all have the same'}")
         if is_on:
             made = with_exposure(made, frames, config, found)
-        _log.info("exposure: %s; %s", found.words(), "each has its own" if is_on else "off, all have the same")
     return Trainer(config, frames, model, extent, made, motion), source, found
