@@ -111,7 +111,7 @@ def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) ->
     there &= (shared.sum(axis=0) >= 2)[None, :, None]  # a point that one photograph shows compares nothing
     robust = there.any(axis=2).astype(np.float64)
     observations = int(robust.sum())
-    label = _components(robust)
+    label = _components(there)
     gains = np.zeros((len(frames), 3))
     errors = np.zeros((len(frames), 3))
     for step in range(_STEPS if observations else 0):
@@ -161,7 +161,7 @@ class Exposure(torch.nn.Module):
     def center(self) -> None:
         """Give the log gains zero mean over the photographs: gain 1, which viewers show, is the mean exposure."""
         with torch.no_grad():  # a gauge, no step
-            self.log_gains -= self.log_gains.mean(dim=0)
+            self.log_gains.sub_(self.log_gains.mean(dim=0))
 
 
 def exposure_network(frames: list[Frame], learned: bool, log_gains: np.ndarray | None = None) -> Network:
@@ -219,12 +219,12 @@ def _solved(weights: np.ndarray, logs: np.ndarray, label: np.ndarray) -> tuple[n
     return gains, inverse, ((weighted.sum(axis=0) - gains @ weights) * scale)
 
 
-def _components(weights: np.ndarray) -> np.ndarray:
-    """(V,) label of the set of photographs that share points with each photograph, of (V, P) weights."""
-    shown = (weights > 0).astype(np.float32)
+def _components(there: np.ndarray) -> np.ndarray:
+    """(V,) label of the set of photographs that share points with each photograph, of (V, P, 3) observations."""
+    shown = there.any(axis=2).astype(np.float32)
     linked = shown @ shown.T >= _SUPPORT
-    label = np.arange(len(weights))
-    for _ in range(len(weights)):
+    label = np.arange(len(there))
+    for _ in range(len(there)):
         lowest = np.where(linked, label[None, :], len(label)).min(axis=1, initial=len(label))
         new = np.minimum(label, lowest)
         if (new == label).all():
