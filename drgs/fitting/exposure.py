@@ -221,7 +221,7 @@ def _solved(weights: np.ndarray, logs: np.ndarray, label: np.ndarray) -> tuple[n
 
 def _components(there: np.ndarray) -> np.ndarray:
     """(V,) label of the set of photographs that share points with each photograph, of (V, P, 3) observations."""
-    shown: np.ndarray = there.any(axis=2).astype(np.float32)
+    shown = np.asarray(there.any(axis=2), np.float32)
     linked = shown @ shown.T >= _SUPPORT
     label = np.arange(len(there))
     for _ in range(len(there)):
