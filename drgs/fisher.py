@@ -52,8 +52,10 @@ from drgs.information.backdrop import (
 from drgs.information.choices import METHODS
 from drgs.information.columns import jacobian_columns
 from drgs.information.diagonal import check_same_parameters, diagonal_and_opacity
+from drgs.information.elimination import BLOCK_INPUTS, ViewRows, backdrop_taken
 from drgs.information.groups import GROUPS, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
+from drgs.information.nuisances import Nuisances
 from drgs.information.replay import Replay
 from drgs.information.semantics import SemanticMetric
 from drgs.runtime import alone
@@ -68,6 +70,7 @@ __all__ = [
     "GROUPS",
     "METHODS",
     "Information",
+    "Nuisances",
     "Prior",
     "SemanticMetric",
     "backdrop",
@@ -108,6 +111,7 @@ def diagonal(
     seed: int = 0,
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
+    nuisances: Nuisances | None = None,
     **splats: Unpack[SplatTensors],
 ) -> Information:
     """The diagonal of J^T J, summed over views.
@@ -134,6 +138,9 @@ def diagonal(
             `probes`; only `exact` makes use of its `estimate`).
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared, as a fit
             does, so that squares are multiplied by its square; or None: 1. Outside, a view tells nothing.
+        nuisances: Unknowns of each view that are eliminated from what it tells, its exposure and its pose
+            (`drgs.information.elimination`); None: there are none. Not of `fisherrf`. Features tell about themselves
+            alone, as they are, unless semantics make them a part of the image.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
             `height`, and maybe `sh_degree` and `backgrounds`.
@@ -168,6 +175,7 @@ def diagonal(
         seed=seed,
         semantics=semantics,
         masks=masks,
+        nuisances=nuisances,
         backgrounds=backgrounds,
     )
     if "sh" in total:
@@ -197,11 +205,12 @@ def blocks(
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
+    nuisances: Nuisances | None = None,
 ) -> torch.Tensor:
     """One dense block of J^T J for every Gaussian, summed over views.
 
     Args:
-        gaussians, cameras, settings, channel_weights, semantics, masks: The same as for `diagonal`.
+        gaussians, cameras, settings, channel_weights, semantics, masks, nuisances: The same as for `diagonal`.
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
@@ -217,6 +226,9 @@ def blocks(
             semantics.check("fisher.blocks", seen)
         if len(seen):
             total += Replay(seen, camera, settings, semantics=semantics, mask=mask).blocks(weights)
+            rows = ViewRows.of(seen, camera, settings, weights, semantics, mask, nuisances)
+            if rows is not None:
+                total -= rows.taken_of_blocks(groups_of(seen, BLOCK_INPUTS))
     return total
 
 
@@ -252,6 +264,8 @@ def backdrop(
     masks: Masks = None,
     sphere: Sphere | None = None,
     seen_opacity: Sequence[torch.Tensor] | None = None,
+    nuisances: Nuisances | None = None,
+    semantics: SemanticMetric | None = None,
 ) -> torch.Tensor:
     """(1536, 3) float64 sum over views and pixels of (1 - alpha)^2: the information about the color behind everything,
     a row for each cell. See `drgs.information.backdrop`.
@@ -261,6 +275,8 @@ def backdrop(
         sphere: What the color is painted on, the same for all views that are compared, as `backdrop_sphere` makes it;
             None: infinitely far away.
         seen_opacity: (H, W) of each view, where they are known, as `drgs.render` gives them; None: they are rendered.
+        nuisances: The same as for `diagonal`.
+        semantics: The metric of the features, which show where the camera stands, too; None: only colors do.
     """
     cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
     if seen_opacity is not None and [x.shape for x in seen_opacity] != [(c.height, c.width) for c in cameras]:
@@ -274,7 +290,8 @@ def backdrop(
     known: Sequence[torch.Tensor | None] = seen_opacity or [None] * len(cameras)
     for camera, mask, opacity in zip(cameras, mask_list("fisher.backdrop", masks, cameras), known, strict=True):
         seen = opacity_of(gaussians, camera, settings) if opacity is None else opacity
-        total += painted_opacity(seen, camera, weights, mask, sphere)
+        taken = backdrop_taken(gaussians, camera, settings, weights, semantics, mask, nuisances)
+        total += painted_opacity(seen, camera, weights, mask, sphere, taken)
     return total
 
 

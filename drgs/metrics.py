@@ -35,6 +35,8 @@ __all__ = [
     "RENDERERS_VIEWS",
     "VIEW_PICTURES",
     "Lpips",
+    "cc_psnr",
+    "color_corrected",
     "evaluate",
     "flip",
     "psnr",
@@ -47,6 +49,10 @@ __all__ = [
 
 DEFINITIONS = {
     "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
+    "cc_psnr": "as psnr, after the rendering's colors were corrected to the photograph (multinerf's color_correct): "
+    "each channel by a least-squares fit of the products of two channels, the channels and 1, made five times, each "
+    "time to pixels inside the mask that are not saturated (within 0.5/255 of 0 or 1) in either image, clipped to "
+    "[0, 1]; a channel without such a pixel stays as it is",
     "ssim": "11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
@@ -65,6 +71,8 @@ _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torch
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11
+_CORRECTIONS = 5  # fits of the color correction, each to the pixels that the one before it left unsaturated
+_SATURATED = 0.5 / 255  # distance from 0 or 1 within which a value of 8 bits says nothing
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
@@ -82,6 +90,53 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     else:
         mse = float(error.mean())
     return psnr_of(mse)
+
+
+def cc_psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """`psnr` of the color-corrected image in dB: what is left of the error once exposure, white balance and tone agree.
+
+    Args:
+        image, target: (H, W, 3) in [0, 1].
+        mask: (H, W) weights in [0, 1], or None.
+    """
+    return psnr(color_corrected(image, target, mask), target, mask)
+
+
+def color_corrected(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+    """An image with the colors of another, as far as one quadratic function of the color brings them there.
+
+    Args:
+        image, target: (H, W, 3) in [0, 1].
+        mask: (H, W) weights in [0, 1] of the least squares, or None.
+    Returns:
+        (H, W, 3) float64 in [0, 1].
+    Reference:
+        Mildenhall et al., "NeRF in the Dark", CVPR 2022; `color_correct` of multinerf.
+    """
+    colors = image.detach().double().reshape(-1, 3).numpy()  # a measure, not a loss
+    wanted = target.detach().double().reshape(-1, 3).numpy()
+    # A weighted least squares is one of rows that are scaled by the roots of the weights.
+    scale = np.ones(len(colors)) if mask is None else mask.double().reshape(-1).sqrt().numpy()
+    is_fitted = _unsaturated(colors) & _unsaturated(wanted) & (scale > 0)[:, None]
+    for _ in range(_CORRECTIONS):
+        products = [colors[:, i] * colors[:, j] for i in range(3) for j in range(i, 3)]
+        terms = np.stack([*products, *colors.T, np.ones(len(colors))], axis=1)
+        usable = is_fitted & _unsaturated(colors)
+        corrected = colors.copy()
+        for channel in range(3):
+            rows = usable[:, channel]
+            if rows.any():
+                weights = scale[rows]
+                # The solution of least norm, where there are fewer colors than terms.
+                fitted = np.linalg.lstsq(terms[rows] * weights[:, None], wanted[rows, channel] * weights)[0]
+                corrected[:, channel] = terms @ fitted
+        colors = corrected.clip(0, 1)
+    return torch.from_numpy(colors).reshape(image.shape)
+
+
+def _unsaturated(colors: np.ndarray) -> np.ndarray:
+    """Which values are far enough from 0 and 1 to tell what was there."""
+    return (colors >= _SATURATED) & (colors <= 1 - _SATURATED)
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
@@ -339,7 +394,8 @@ def _photometric(image: torch.Tensor, frame: Frame) -> dict[str, float]:
         image: (H, W, 3) in [0, 1].
         frame: The photograph of the view.
     """
-    return {"psnr": psnr(image, frame.image(), frame.mask)}
+    target = frame.image()
+    return {"psnr": psnr(image, target, frame.mask), "cc_psnr": cc_psnr(image, target, frame.mask)}
 
 
 def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
@@ -348,17 +404,16 @@ def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], l
     Args:
         metrics: Content of metrics.json; older versions measured one renderer more than the run's own, as `viewers`.
     """
-    head = ("renderer", "PSNR", "worst\nPSNR", "worst view")
+    head = ("renderer", "PSNR", "color-corrected", "worst\nPSNR", "worst view")
     rows: list[tuple[str, ...]] = []
     if (found := metrics.get("renderers")) and found["rows"]:
-        rows = [
-            (row["name"], f"{row['mean']['psnr']:.2f}", f"{row['worst']['psnr']:.2f}", row["worst"]["name"])
-            for row in found["rows"]
-        ]
+        for row in found["rows"]:
+            means = (f"{row['mean'][key]:.2f}" if key in row["mean"] else "-" for key in ("psnr", "cc_psnr"))
+            rows.append((row["name"], *means, f"{row['worst']['psnr']:.2f}", row["worst"]["name"]))
         count = len(found["rows"][0]["views"])
     elif found := metrics.get("viewers"):
         values = {"the run's own": found["own_psnr"], found["preset"]: found["psnr"]}
-        rows = [(name, f"{value:.2f}", "-", "-") for name, value in values.items()]
+        rows = [(name, f"{value:.2f}", "-", "-", "-") for name, value in values.items()]
         count = len(found["views"])
     else:
         return "", head, rows

@@ -13,14 +13,16 @@ What computes is decorated with `alone`: one thread at a time, and not in a fork
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import functools
+import gc
 import os
 import sys
 import threading
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -97,6 +99,7 @@ class Backend:
 
 _active: Backend | None = None
 _computing = threading.RLock()
+_abandoned: list[Any] = []  # graphs that nobody wants any more, and that were left while another thread computed
 _owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
 
 
@@ -137,10 +140,89 @@ def alone(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
         global _owner
         _refuse_fork()
         _owner = os.getpid()
-        with _computing:
+        with _computing, _no_garbage():
+            _abandoned.clear()
             return function(*args, **kwargs)
 
     return uncompiled(one_at_a_time)
+
+
+# Dr.Jit frees a variable of a graph under its lock on graphs. If its numbers are those of a torch tensor, torch lets go
+# of Python's lock in the middle (`THPVariable_clear`); the thread that takes it may need the lock on graphs next, which
+# it waits for without letting go of Python's, and both wait for ever. So such variables end while no other thread
+# computes: those that a torch graph keeps by `Graph`, and those in reference cycles, as `dr.wrap` makes them, because
+# the garbage collector does not run by itself while something is computed, and nothing is computed while it runs.
+
+_is_paused = False  # the garbage collector, by a computation
+_COLLECTS = 10.0  # seconds that the garbage collector waits for another thread, whatever that is waiting for
+
+
+@contextlib.contextmanager
+def _no_garbage() -> Iterator[None]:
+    """Python's garbage collector does not begin by itself within."""
+    global _is_paused
+    pauses = gc.isenabled()
+    gc.disable()
+    _is_paused |= pauses
+    try:
+        yield
+    finally:
+        if pauses:
+            _is_paused = False
+            gc.enable()
+
+
+class _Collector:
+    """What Python's garbage collector calls before and after it runs, one run at a time: nobody computes meanwhile."""
+
+    def __init__(self) -> None:
+        self._is_alone = False
+
+    def __call__(self, phase: str, info: Any) -> None:
+        """Take what a computation takes, and give it back."""
+        if phase == "start":
+            self._is_alone = _computing.acquire(timeout=_COLLECTS)
+        elif self._is_alone:
+            self._is_alone = False
+            _computing.release()
+
+
+def _after_fork() -> None:
+    """A forked child waits for no computation: one that its parent was at never ends here."""
+    gc.callbacks.remove(_collector)
+    if _is_paused:
+        gc.enable()
+
+
+_collector = _Collector()
+gc.callbacks.append(_collector)
+os.register_at_fork(after_in_child=_after_fork)
+
+
+class Graph:
+    """Dr.Jit arrays with a graph that outlive a computation: they end while no other thread computes.
+
+    Args:
+        arrays: What is kept, any object.
+    """
+
+    def __init__(self, arrays: Any) -> None:
+        self._arrays = arrays
+
+    def take(self) -> Any:
+        """What is kept, at the first time; then None."""
+        arrays, self._arrays = self._arrays, None
+        return arrays
+
+    def __del__(self) -> None:
+        # Not waited for: the thread that computes may be waiting for what this one has.
+        if _computing.acquire(blocking=False):
+            try:
+                self._arrays = None
+            finally:
+                _computing.release()
+        else:
+            _abandoned.append(self._arrays)
 
 
 def _refuse_fork() -> None:

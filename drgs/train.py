@@ -38,8 +38,9 @@ from drgs.fitting.config import (
     SavingConfig,
     SelectionConfig,
 )
+from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, load_frames
-from drgs.fitting.parts import parts_of
+from drgs.fitting.parts import parts_of, with_exposure
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
@@ -168,6 +169,11 @@ def _fit(
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
+    if config.data.exposure != "off" and (selection or motion):
+        raise NotImplementedError(
+            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
+            "leave --exposure out"
+        )
     plan = ActiveViews(train, config, motion is not None, workers) if selection else None
     if selection and selection.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
@@ -185,15 +191,20 @@ def _fit(
         check_references(held_out)
     if tensors is not None and header is not None:
         made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
+        if parts is None and EXPOSURE in header.get("networks", ()):
+            made = with_exposure(made, frames, config)
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds = seconds_of(run, header) or 0.0
+        exposure = None
         source = header["point_source"]
         config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
+        trainer, source, exposure = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
+    if exposure is not None:
+        recorded["exposure"] = exposure.to_json(recorded["train"])
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:

@@ -32,6 +32,16 @@ def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run tests marked slow")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """A test that ends its process, as one does that hangs, fails once, and all others are run."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from scheduling import FilesOnce
+
+    return FilesOnce(config, log)
+
+
 @pytest.fixture(autouse=True)
 def _skip_by_marker(request):
     if request.node.get_closest_marker("slow") and not request.config.getoption("--slow"):

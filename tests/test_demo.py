@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 
 import pytest
 from json_page import check
@@ -65,8 +66,9 @@ def test_text(result):
     """What is said names the held-out views, the oracle and the files, without superlatives."""
     out, report, said = result
     text = said
-    assert [line[0] for line in said.splitlines() if line[:1].isdigit()] == list("123456")
-    assert max(len(line) for line in said.splitlines() if not line[:1].isdigit() and str(out) not in line) <= 80
+    is_part = re.compile(r"\d\. ").match
+    assert [line[0] for line in said.splitlines() if is_part(line)] == list("123456")
+    assert max(len(line) for line in said.splitlines() if not is_part(line) and str(out) not in line) <= 80
     assert "never saw" in text
     assert f"{report['oracle']['max_error']:.1e}" in text
     assert str(out / "demo.json") in text

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import drjit as dr
@@ -13,7 +15,7 @@ import numpy as np
 import torch
 from scenes_random import camera, gaussians
 
-from drgs import fisher
+from drgs import fisher, runtime
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
 from drgs.tracing.call import Call
@@ -139,3 +141,83 @@ def test_spawn():
         got = pool.apply(everything, (0,))
     for a, b in zip(got, want, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
+
+
+GARBAGE = """
+import concurrent.futures, gc, sys, time
+import drjit as dr
+import numpy as np
+import torch
+from drgs import fisher
+from drgs.integrator import render
+from drgs.lab.accuracy import random_camera, random_gaussians
+from drgs.settings import RenderSettings
+
+SETTINGS = RenderSettings.preset("fast")
+rng = np.random.default_rng(0)
+g, cam = random_gaussians(rng, 10, 1), random_camera(rng, (18, 14))
+lib = dr.llvm.ad
+
+def work(_):
+    fisher.diagonal(g.detach(), cam, SETTINGS, "probes", probes=2)
+    render(g.detach(), cam, SETTINGS)
+
+work(0)
+gc.collect()
+gc.freeze()
+sys.setswitchinterval(5e-4)
+with concurrent.futures.ThreadPoolExecutor(4) as pool:
+    running, end = [], time.monotonic() + 6
+    while time.monotonic() < end:
+        running = [each for each in running if not each.done() or each.result() is not None]
+        running += [pool.submit(work, 0) for _ in range(6 - len(running))]
+        numbers = lib.Float(torch.ones(7))
+        dr.enable_grad(numbers)
+        cycle = [numbers, 2 * numbers]
+        cycle.append(cycle)
+        del numbers, cycle
+        gc.collect()
+        render(g, cam, SETTINGS)  # whose graph nobody wants
+print("ended")
+"""
+
+
+def test_graphs_end_beside_computations():
+    """Garbage in cycles, and images that are dropped, of one thread do not stop others that compute, nor itself."""
+    done = _run(GARBAGE)
+    assert done.stdout == "ended\n", done.stderr
+
+
+def test_the_garbage_collector_waits():
+    """It does not run by itself while something is computed, and is as it was afterwards; computations wait for it."""
+    seen = []
+
+    @runtime.alone
+    def compute() -> None:
+        seen.append(gc.isenabled())
+
+    compute()
+    assert gc.isenabled()
+    gc.disable()
+    compute()
+    assert not gc.isenabled()
+    gc.enable()
+    assert seen == [False, False]
+
+    class Garbage:
+        """Takes a while to be collected, and tells whether another thread computed meanwhile."""
+
+        def __init__(self) -> None:
+            self.itself = self
+
+        def __del__(self) -> None:
+            thread.start()
+            time.sleep(0.2)
+            seen.append(thread.is_alive())
+
+    thread = threading.Thread(target=compute)
+    Garbage()
+    gc.collect()
+    thread.join(30)
+    assert seen == [False, False, True, False]
+    assert gc.isenabled()

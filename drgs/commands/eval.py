@@ -35,7 +35,7 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
         metrics: Content of metrics.json.
         lpips: Whether LPIPS was asked for; otherwise nothing is said of it, as it is null for a reason that is known.
     """
-    digits = {"psnr": ".2f", "psnr_moving": ".2f"}
+    digits = {"psnr": ".2f", "cc_psnr": ".2f", "psnr_moving": ".2f"}
     names = [name for name in (*METRICS, *MOVING) if metrics["mean"].get(name) is not None]
     rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
     tables.show(

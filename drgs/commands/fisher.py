@@ -6,6 +6,9 @@ known views and Hc that of the view itself:
     variance    sum_k J_pk^2 / (H_k + lambda): predictive variance of the pixel for unit noise; its sum is `eig`
     share       sum_k J_pk^2 / Hc_k log(1 + Hc_k / (H_k + lambda)): the pixel's share of the view's `logdet`
 
+With --eliminate, H and Hc are what is left of both, the map of the variance is that of a picture whose own exposure and
+pose are known, so that its sum is more than `eig`, and shares go by J_pk^2 / sum_p J_pk^2.
+
 The rows of J are the pixel's colors and, where the scene has features, its decoded features; the parameters are those
 of the Gaussians and, where a network moves them, the network's, estimated by random probes. Where several blocks count
 there is a map of each beside that of all, whose sum it is a part of.
@@ -101,6 +104,7 @@ def run(args: Fisher) -> None:
         "prior": prior.to_json(),
         "blocks": list(blocks.names),
         "semantics": blocks.metric.to_json() if blocks.metric else None,
+        **blocks.scoring.nuisances.if_any(),
         "probes": args.probes if "deformation" in blocks.names or args.method == "probes" else None,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
@@ -123,9 +127,14 @@ def asked_blocks(
         ValueError: If a block is named that the scene does not have.
     """
     scoring = Scoring(
-        settings=settings, method=args.method, blocks=args.blocks, semantics=given.semantics(), probes=args.probes
+        settings=settings,
+        method=args.method,
+        blocks=args.blocks,
+        semantics=given.semantics(),
+        probes=args.probes,
+        nuisances=args.given_nuisances(),
     )
-    return SceneBlocks.of(given.scene, scoring, cameras, "fisher")
+    return SceneBlocks.of(given.scene, scoring.over(given.estimated), cameras, "fisher")
 
 
 def _map_kinds(names: Sequence[str]) -> list[str]:
@@ -215,12 +224,16 @@ class MappedView:
         return fields | ({} if self.pose is None else {"pose": dataclasses.asdict(self.pose)})
 
 
-def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[Information, Information]:
+def map_weights(
+    H: Information, candidate: Information, prior: Prior, rows: Information | None = None
+) -> tuple[Information, Information]:
     """Weights of `drgs.fisher.variance_map` for the two maps of the module's text.
 
     Args:
         H, candidate: Information of the known views and of the view shown, same groups.
         prior: lambda; parameters with H + lambda = 0 weigh nothing.
+        rows: The sums of the squared derivatives of the view shown, where its own unknowns have been eliminated from
+            `candidate`: what is left of a score is shared among pixels in proportion to these. None: they are it.
     Returns:
         Those of `variance` and of `share`.
     """
@@ -228,6 +241,10 @@ def map_weights(H: Information, candidate: Information, prior: Prior) -> tuple[I
     share = {}
     for name in H:
         Hc = candidate[name].double()
+        if rows is not None:
+            squares = rows[name].double()
+            share[name] = torch.where(squares > 0, (Hc * variance[name]).log1p() / squares, 0.0)
+            continue
         # log(1 + x) / Hc tends to the variance where the view says nothing about a parameter.
         share[name] = torch.where(Hc > 0, (Hc * variance[name]).log1p() / Hc, variance[name])
     return variance, share
@@ -244,7 +261,8 @@ def _view(
 ) -> MappedView:
     """Maps of one view, and what it says."""
     Hc = together(asked.information(camera))
-    weights = dict(zip(KINDS, map_weights(H, Hc, prior), strict=True))
+    rows = together(asked.with_unknowns().information(camera)) if asked.scoring.nuisances.names else None
+    weights = dict(zip(KINDS, map_weights(H, Hc, prior, rows), strict=True))
     maps = {
         kind: {block: x.numpy() for block, x in asked.variance_maps(camera, of_kind).items()}
         for kind, of_kind in weights.items()

@@ -13,6 +13,7 @@ from drgs.commands.overrides import parsed
 from drgs.commands.record_options import CAMERAS_TEXT, CARRIED, HIDDEN, options_of
 from drgs.fitting.config import SelectionConfig
 from drgs.guards.records import texts_of
+from drgs.information.nuisances import Nuisances
 from drgs.information.prior import Prior
 from drgs.information.scoring import Scoring
 from drgs.settings import Preset, RenderSettings
@@ -136,7 +137,8 @@ class Seen(Settings, Around, Views):
     """Seed of everything random."""
 
 
-_Information: Any = options_of(Scoring, only=("method", "blocks", "probes"))
+_UNKNOWN = ("eliminate", "exposure_std", "pose_std")
+_Information: Any = options_of(Scoring, only=("method", "blocks", "probes", *_UNKNOWN))
 _Pixels: Any = options_of(SelectionConfig, only=("info_pixels",))
 
 
@@ -147,6 +149,14 @@ class Informed(Settings, _Information, _Pixels):
     prior: Annotated[float | None, arg(help=texts_of(Scoring)["prior"])] = None
     relative_prior: Annotated[bool, arg(help=texts_of(Prior)["relative"])] = Prior.relative
     prior_groups: CARRIED = dataclasses.field(default_factory=dict, metadata={HIDDEN: True})
+
+    def given_nuisances(self) -> Nuisances:
+        """Unknowns of views as these options name them.
+
+        Raises:
+            ValueError: If one is unknown, or a standard deviation out of range.
+        """
+        return Nuisances(**{name: getattr(self, name) for name in _UNKNOWN})
 
     def given_prior(self) -> Prior | None:
         """lambda as these options name it; None where they leave it to the criterion.
@@ -195,7 +205,8 @@ class Choosing(Informed, _Choice):
             ValueError: If they cannot be, or not together.
         """
         names = ("criterion", "method", "weights", "groups", "blocks", "network", "combine", "probes")
-        return Scoring(prior=self.given_prior(), **{name: getattr(self, name) for name in names})
+        given = {"prior": self.given_prior(), "nuisances": self.given_nuisances()}
+        return Scoring(**given, **{name: getattr(self, name) for name in names})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -35,6 +35,14 @@ CAMERAS_TEXT: Any = PrimitiveConstructorSpec(
     is_instance=lambda x: x is None or isinstance(x, tuple),
     str_from_instance=lambda x: ["the first" if x is None else ",".join(x) or "none"],
 )
+# One text, `exposure,pose`; `none` is the empty tuple.
+NUISANCES_TEXT: Any = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="UNKNOWN,UNKNOWN|none",
+    instance_from_str=lambda texts: () if texts[0] == "none" else tuple(name.strip() for name in texts[0].split(",")),
+    is_instance=lambda x: x is None or isinstance(x, tuple),
+    str_from_instance=lambda x: ["as the fit" if x is None else ",".join(x) or "none"],
+)
 CARRIED: Any = Suppress[Fixed[Any]]
 """Type of a field that no option sets."""
 
@@ -47,7 +55,12 @@ _RENDERERS_TEXT: Any = PrimitiveConstructorSpec(
     str_from_instance=lambda x: [",".join(x)],
 )
 
-_SPECS = {"blocks": BLOCKS_TEXT, "test_cameras": CAMERAS_TEXT, "renderers": _RENDERERS_TEXT}
+_SPECS = {
+    "blocks": BLOCKS_TEXT,
+    "test_cameras": CAMERAS_TEXT,
+    "eliminate": NUISANCES_TEXT,
+    "renderers": _RENDERERS_TEXT,
+}
 _SPELLINGS = {"renderers": "for"}  # where an option has another name than its field
 # Help shows the names; a function of one's own has another.
 _TYPES: dict[str, Any] = {"policy": Policy | str, "criterion": Criterion | str}

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
+    from drgs.information.nuisances import Nuisance
     from drgs.information.semantics import SemanticMetric
 
 __all__ = ["SceneInput"]
@@ -97,6 +98,11 @@ class SceneInput:
         from drgs.information.semantics import SemanticMetric  # not for those that ask for no information
 
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
+
+    @property
+    def estimated(self) -> tuple[Nuisance, ...]:
+        """Unknowns of the photographs that the run has estimated."""
+        return () if self.record is None else self.record.estimated
 
     @property
     def scene(self) -> Scene:

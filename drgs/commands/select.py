@@ -42,7 +42,7 @@ def run(args: Select) -> None:
     criterion_named(args.criterion, "--criterion")
     given = SceneInput.of(args)
     settings = given.over_background(settings)
-    scoring = dataclasses.replace(wanted, settings=settings, semantics=given.semantics())
+    scoring = dataclasses.replace(wanted.over(given.estimated), settings=settings, semantics=given.semantics())
     known = known_views(args.train, args, given)
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     candidates = timed(candidates, args, given)
@@ -73,6 +73,7 @@ def run(args: Select) -> None:
         "method": args.method,
         "prior": scoring.prior_of(args.policy).to_json(),
         **selection.blocks_json(),
+        **(scoring.nuisances.if_any() if args.policy == "fisher" else {}),
         "seed": args.seed,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,

@@ -30,12 +30,15 @@ from drgs.fitting.timetable import Timetable
 from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Scene
     from drgs.features.decoder import Decoder
     from drgs.fitting.config import FitConfig
     from drgs.information.choices import Block
+    from drgs.information.nuisances import Nuisance
     from drgs.information.pool import Workers
 
 __all__ = ["SELECTION", "ActiveViews"]
@@ -246,7 +249,14 @@ class ActiveViews:
         numbers = {name: x for name, x in labels.items() if isinstance(x, float)}
         self.measured.append(record | ({"segmentation": {"run": numbers}} if numbers else {}))
 
-    def pick(self, scene: Scene, frames: list[Frame], step: int, decoder: Decoder | None = None) -> tuple[Frame, dict]:
+    def pick(
+        self,
+        scene: Scene,
+        frames: list[Frame],
+        step: int,
+        decoder: Decoder | None = None,
+        estimated: Sequence[Nuisance] = (),
+    ) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
         Args:
@@ -254,6 +264,8 @@ class ActiveViews:
             frames: The photographs seen so far; of these, too, only the cameras matter, and the masks.
             step: Steps done.
             decoder: Decoder of the features at this step; they count in its metric.
+            estimated: Unknowns of the photographs that the fit estimates, and that are eliminated from what views tell
+                unless the selection says which are.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """
@@ -264,7 +276,7 @@ class ActiveViews:
         left = self.timetable.left(len(self.picks), self.chosen)
         pixels = active.info_pixels or self._config.data.max_pixels
         semantics = None if decoder is None else SemanticMetric(decoder.metric())
-        scoring = active.scoring_of(self._config.settings, semantics)
+        scoring = active.scoring_of(self._config.settings, semantics).over(estimated)
         seen = [at_most(frame.camera, pixels) for frame in frames]
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
@@ -291,6 +303,7 @@ class ActiveViews:
             "criterion": scoring.criterion if active.policy == "fisher" else None,
             "prior": scoring.prior_of(active.policy).to_json(),
             **selection.blocks_json(),
+            **(scoring.nuisances.if_any() if active.policy == "fisher" else {}),
             "gaussians": len(scene.at(frames[0].camera.time)),
             "left_out": selection.left_out,
             "notes": selection.notes,

@@ -29,6 +29,7 @@ __all__ = [
     "Degree",
     "DensityConfig",
     "Dynamics",
+    "ExposureUse",
     "FeatureConfig",
     "FeatureSize",
     "FieldPreset",
@@ -49,6 +50,7 @@ __all__ = [
 ]
 
 InitPoints = Literal["auto", "views", "all"]
+ExposureUse = Literal["off", "auto", "points", "learned"]
 MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
 Restart = Literal["auto", "always", "never"]
@@ -90,6 +92,8 @@ class DataConfig(Record):
             included.
         mask: Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files,
             valid where undistorted photographs have empty corners; ignore reads none.
+        exposure: Multiply what is rendered for a photograph by its own gain of R, G and B: none (off), those that
+            initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
     """
 
     max_pixels: int = 130_000
@@ -99,6 +103,7 @@ class DataConfig(Record):
     test_cameras: tuple[str, ...] | None = None
     times: int = 40
     mask: MaskUse = "auto"
+    exposure: ExposureUse = "off"
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
@@ -389,6 +394,7 @@ class SelectionConfig(Record):
         record = self.to_json()
         scoring = record.pop("scoring")
         prior = scoring.pop("prior") or {"value": None, "relative": False}
+        scoring |= scoring.pop("nuisances")
         return record | scoring | {"prior": prior["value"], "relative_prior": prior["relative"]}
 
 

@@ -27,6 +27,7 @@ class Network:
         module: What losses, or the scene, call.
         rate: Its learning rate.
         factors: Factors of the learning rate of some parameters, by name, e.g. of those that have a unit of length.
+        constraint: Called after every step, to restore what must hold exactly; None: nothing must.
         fused: One pass of the optimizer over the memory of a parameter, for large ones; rounds in other places.
         optimizer: Adam, with torch's defaults.
     """
@@ -38,10 +39,12 @@ class Network:
         rate: Rate,
         factors: Mapping[str, float] | None = None,
         fused: bool = False,
+        constraint: Callable[[], None] | None = None,
     ) -> None:
         self.name = name
         self.module = module
         self.rate = rate
+        self.constraint = constraint
         groups: dict[float, list] = {}
         for key, x in module.named_parameters():
             groups.setdefault((factors or {}).get(key, 1.0), []).append(x)

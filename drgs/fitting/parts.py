@@ -13,9 +13,11 @@ from drgs.fitting.networks import Network, Rate
 from drgs.fitting.rows import GaussianRows
 
 if TYPE_CHECKING:
+    from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.frames import Frame
+    from drgs.integrator import Output
 
-__all__ = ["Parts", "means_rate", "parts_of"]
+__all__ = ["Parts", "means_rate", "parts_of", "with_exposure"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Parts:
         shows_features: Whether the features, if there are any, are rendered with the colors of a photograph; default
             always. Terms get the Gaussians with their features either way.
         couple_features: Whether gradients of the features that are rendered reach the geometry.
+        exposure: What a photograph shows of a rendering, before terms of the loss see it; None: the rendering.
     """
 
     terms: Sequence[LossTerm]
@@ -38,6 +41,7 @@ class Parts:
     scene: Callable[[GaussianRows], Scene] = GaussianRows.gaussians
     shows_features: Callable[[Frame], bool] | None = None
     couple_features: bool = True
+    exposure: Callable[[Output, Frame], Output] | None = None
 
 
 def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> Parts:
@@ -76,3 +80,22 @@ def means_rate(config: FitConfig, part: float) -> float:
     """Learning rate of the means, in units of the extent, when the fraction `part` of the fit is done."""
     first, last = config.rates.means_rate
     return first * (last / first) ** part
+
+
+def with_exposure(
+    parts: Parts, frames: list[Frame], config: FitConfig, estimate: ExposureEstimate | None = None
+) -> Parts:
+    """The parts with gains of photographs.
+
+    Args:
+        parts: Parts of a fit without.
+        frames: Its training photographs.
+        config: Its configuration, whose `data.exposure` is not `off`.
+        estimate: What points say of the gains; None where a checkpoint brings them.
+    """
+    from drgs.fitting.exposure import exposure_network
+
+    network = exposure_network(
+        frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
+    )
+    return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)

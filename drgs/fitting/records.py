@@ -21,6 +21,7 @@ from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
 from drgs.guards.json_files import check_json, parse_json, read_json
+from drgs.information.nuisances import NUISANCES, Nuisance
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
@@ -49,6 +50,7 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _CONFIG = {"data": str, "train": [str], "test": [str], "fit": {"settings": dict}}
+_OPTIONAL = {"times": [float], "estimated": [str]}
 _VIEW = {"index": int, "name": str}
 _HEADER = {
     "step": int,
@@ -74,6 +76,8 @@ class FitRecord:
         config: How it was fitted.
         semantics: What its features were fitted to; None where it has none.
         times: Times of the views, sorted, where it was fitted to what moves; else none.
+        estimated: Unknowns of the photographs that were estimated beside the scene: information about the scene is
+            what is left when they are eliminated.
     """
 
     data: Path
@@ -82,6 +86,7 @@ class FitRecord:
     config: FitConfig
     semantics: SemanticRecord | None = None
     times: tuple[float, ...] = ()
+    estimated: tuple[Nuisance, ...] = ()
 
     @property
     def is_active(self) -> bool:
@@ -295,13 +300,17 @@ def fit_record(run: Run) -> FitRecord:
     config = run.config()
     where = f"{run.path / 'config.json'}"
     advice = "restore the file, or fit again in another folder"
-    check_json(where, config, _CONFIG | ({"times": [float]} if "times" in config else {}), advice)
+    optional = {name: kind for name, kind in _OPTIONAL.items() if name in config}
+    check_json(where, config, _CONFIG | optional, advice)
     active = config.get("active")  # of versions that wrote it there
     check_json(where, {"active": active}, {"active": (None, dict)}, advice)
     try:
         fit = recorded_config(config["fit"], active)
     except (ValueError, NotImplementedError) as error:
         raise ValueError(f"{where}: {error}; {advice}") from None
+    estimated = tuple(config.get("estimated", ()))
+    if odd := [name for name in estimated if name not in NUISANCES]:
+        raise ValueError(f"{where}: estimated must be among {', '.join(NUISANCES)}, got {odd[0]!r}; {advice}")
     return FitRecord(
         Path(config["data"]),
         tuple(config["train"]),
@@ -309,6 +318,7 @@ def fit_record(run: Run) -> FitRecord:
         fit,
         SemanticRecord.from_json(config.get("semantics"), f"{where}: semantics"),
         tuple(config.get("times", ())),
+        estimated,
     )
 
 

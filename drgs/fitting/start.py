@@ -9,7 +9,7 @@ import torch
 
 from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
-from drgs.fitting.parts import parts_of
+from drgs.fitting.parts import parts_of, with_exposure
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.fitting.config import FitConfig
     from drgs.fitting.dynamics import Motion
+    from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.frames import Frame
     from drgs.fitting.parts import Parts
     from drgs.fitting.semantic_record import SemanticRecord
@@ -54,8 +55,11 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
-) -> tuple[Trainer, str]:
-    """A trainer at step 0, and where its points come from: by default, if `strict`, only from `views`."""
+) -> tuple[Trainer, str, ExposureEstimate | None]:
+    """A trainer at step 0, where its points come from, and what they say of exposure, where that is asked for.
+
+    Points come, by default, if `strict`, only from `views`.
+    """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
@@ -73,4 +77,15 @@ def start(
         torch.from_numpy(points), torch.from_numpy(colors), *config.density.start_of(dense), features=width
     )
     _log.info("%d initial points: %s", len(points), source)
-    return Trainer(config, frames, model, extent, parts or parts_of(config, extent, channels), motion), source
+    made = parts or parts_of(config, extent, channels)
+    found = None
+    if parts is None and config.data.exposure != "off":
+        from drgs.fitting.exposure import estimate_exposure
+
+        with Bar("exposure") as bar:
+            found = estimate_exposure(frames, points, config.seed)
+            is_on = config.data.exposure != "auto" or found.is_clear
+            bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else 'off, all have the same'}")
+        if is_on:
+            made = with_exposure(made, frames, config, found)
+    return Trainer(config, frames, model, extent, made, motion), source, found

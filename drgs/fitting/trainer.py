@@ -153,6 +153,8 @@ class Trainer:
         frame = self.frames[self._next_view()]
         gaussians = self._fitted_scene().at(frame.camera.time)
         out = self._shown(gaussians, frame)
+        if self.parts.exposure is not None:
+            out = self.parts.exposure(out, frame)
         loss, terms = self._loss(out, frame, gaussians)
         optimizers = [rows.optimizer, *(network.optimizer for network in self.parts.networks)]
         for optimizer in optimizers:
@@ -165,6 +167,9 @@ class Trainer:
             self._bad = None
             for optimizer in optimizers:
                 optimizer.step()
+            for network in self.parts.networks:
+                if network.constraint is not None:
+                    network.constraint()
             stage = self._stage()
             density = config.density
             if density.noise and done - stage.begin < density.refine_stop * stage.length:

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from drgs.ellipsoids import colors_only
+from drgs.information.complement import left
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 
@@ -151,16 +152,28 @@ def painted_opacity(
     channel_weights: Sequence[float],
     mask: torch.Tensor | None = None,
     sphere: Sphere | None = None,
+    taken: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """(1536, 3) float64 H_c of a view of a known opacity (H, W), in each channel, times the channel's weight; with a
-    mask (H, W) of its square.
+    mask (H, W) of its square; less what the view's own unknowns explain.
+
+    Args:
+        taken: (pixels, 3, r) of the unknowns, as `drgs.information.elimination.backdrop_taken` gives them; None: none.
     """
     total = torch.zeros(CELLS, dtype=torch.float64)
     open_ = _open(opacity)
     if mask is not None:
         open_ = open_ * mask.detach().double().cpu().square()
-    total.index_add_(0, backdrop_cells(camera, sphere).flatten(), open_.flatten())
-    return total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
+    cells = backdrop_cells(camera, sphere).flatten()
+    total.index_add_(0, cells, open_.flatten())
+    told = total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
+    if taken is None:
+        return told
+    lost = torch.zeros(CELLS, *taken.shape[1:], dtype=torch.float64)
+    # The same clamp as of `_open`, and 1 - alpha in float64, as there.
+    rows = taken.double() * (1 - opacity.double().cpu()).clamp(min=0).reshape(-1, 1, 1)
+    lost.index_add_(0, cells, rows)
+    return left(told, lost.square().sum(-1))
 
 
 def backdrop_variance(

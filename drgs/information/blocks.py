@@ -25,6 +25,7 @@ from drgs.information.backdrop import BACKDROP, backdrop_sphere, opacity_of, pai
 from drgs.information.choices import BLOCKS
 from drgs.information.criteria import criterion_named
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
+from drgs.information.nuisances import Nuisances
 from drgs.information.prior import Prior
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
@@ -43,6 +44,7 @@ __all__ = [
     "GEOMETRY_BLOCK",
     "MAP_PRIOR",
     "SEMANTIC_BLOCK",
+    "TAKEN",
     "BlockQuestion",
     "CoverageQuestion",
     "DiagonalQuestion",
@@ -59,6 +61,10 @@ MAP_PRIOR = Prior(1.0)
 _GAUSSIAN_GROUPS = ("means", "rotations", "log_scales", "logit_opacities", "sh", "features")
 _WITH_SCENES = ("columns", "probes")  # methods that know the parameters that a scene computes its Gaussians from
 _OPACITY = "opacity"  # the name under which a view's opacity travels as an Information
+TAKEN = "taken"
+"""The name under which what a view's unknowns take of the backdrop travels with it: directions, of either sign."""
+
+_NO_NUISANCES = Nuisances()
 
 Answers = Callable[[Callable, Sequence["Camera"]], Iterable["Information"]]
 """Asks views one question, as `drgs.information.pool.Pool.answers`."""
@@ -143,6 +149,7 @@ class DiagonalQuestion(BlockQuestion):
         probes: Random images of method `probes`.
         channel_weights: Inverse noise variances of R, G and B; 0 where colors are no part of the blocks.
         semantics: The metric in which features tell about the geometry; None where they are no part of the blocks.
+        nuisances: Unknowns of the view that are eliminated.
     """
 
     method: str = "exact"
@@ -151,6 +158,7 @@ class DiagonalQuestion(BlockQuestion):
     probes: int = 16
     channel_weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
 
     def information(self, view: SeenView) -> Information:
         """Squares of the derivatives, and the opacity on the way."""
@@ -168,6 +176,7 @@ class DiagonalQuestion(BlockQuestion):
             probes=self.probes,
             semantics=self.semantics,
             masks=view.masks,
+            nuisances=self.nuisances,
         )
         if opacities and view.opacity is None:
             view.opacity = opacities[0]
@@ -187,11 +196,12 @@ class DenseBlocksQuestion(BlockQuestion):
     """`drgs.fisher.blocks` of a view.
 
     Attributes:
-        channel_weights, semantics: The same as of a `DiagonalQuestion`.
+        channel_weights, semantics, nuisances: The same as of a `DiagonalQuestion`.
     """
 
     channel_weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
 
     def information(self, view: SeenView) -> Information:
         """One dense block a Gaussian."""
@@ -199,7 +209,13 @@ class DenseBlocksQuestion(BlockQuestion):
         from drgs.gain import DENSE
 
         found = fisher.blocks(
-            view.gaussians, view.camera, view.settings, self.channel_weights, self.semantics, view.masks
+            view.gaussians,
+            view.camera,
+            view.settings,
+            self.channel_weights,
+            self.semantics,
+            view.masks,
+            self.nuisances,
         )
         return {DENSE: found}
 
@@ -212,7 +228,7 @@ class NetworkQuestion(BlockQuestion):
         estimate: What is estimated of H.
         probes: Random images, or tangents.
         groups: Groups of the network that count; None: all.
-        channel_weights, semantics: The same as of a `DiagonalQuestion`.
+        channel_weights, semantics, nuisances: The same as of a `DiagonalQuestion`.
     """
 
     estimate: NetworkEstimate = "diagonal"
@@ -220,6 +236,7 @@ class NetworkQuestion(BlockQuestion):
     groups: tuple[str, ...] | None = None
     channel_weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
 
     @property
     def asks_known(self) -> bool:  # type: ignore[override]
@@ -239,6 +256,7 @@ class NetworkQuestion(BlockQuestion):
             channel_weights=self.channel_weights,
             semantics=self.semantics,
             masks=view.masks,
+            nuisances=self.nuisances,
         )
         return {name: x for name, x in found.items() if self.groups is None or name in self.groups}
 
@@ -265,16 +283,27 @@ class BackdropQuestion(BlockQuestion):
         sphere: The sphere; None: infinitely far away.
         empty_outside: Whether it is known that nothing is outside of masks, so that the view has shown it.
         is_painted: Whether the answer is about the sphere. Else it is the view's opacity, which does not depend on
-            the other views of the pool, around which the sphere is.
+            the other views of the pool, around which the sphere is, with what its unknowns take where any are
+            eliminated.
+        semantics, nuisances: The same as of a `DiagonalQuestion`.
     """
 
     sphere: Sphere | None = None
     empty_outside: bool = False
     is_painted: bool = True
+    semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
 
     def information(self, view: SeenView) -> Information:
         """(1 - opacity)^2 by cell, or the opacity."""
+        from drgs.information.elimination import backdrop_taken  # loads Dr.Jit
+
         answer = {_OPACITY: view.known_opacity()}
+        taken = backdrop_taken(
+            view.scene, view.camera, view.settings, (1.0, 1.0, 1.0), self.semantics, view.mask, self.nuisances
+        )
+        if taken is not None:
+            answer[TAKEN] = taken.float()  # as a cache keeps it: the same bits with and without
         return self.finished(answer, view.camera, view.mask) if self.is_painted else answer
 
     def variance_map(self, view: SeenView, weights: Information) -> torch.Tensor:
@@ -285,13 +314,14 @@ class BackdropQuestion(BlockQuestion):
 
     def lasting(self) -> BlockQuestion:
         """The opacity."""
-        return BackdropQuestion(is_painted=False)
+        return BackdropQuestion(is_painted=False, semantics=self.semantics, nuisances=self.nuisances)
 
     def finished(self, answer: Information, camera: Camera, mask: torch.Tensor | None) -> Information:
         """Painted on the sphere of this call."""
         found = dict(answer)
         mask = None if self.empty_outside else mask
-        found[BACKDROP] = painted_opacity(found.pop(_OPACITY), camera, (1.0, 1.0, 1.0), mask, self.sphere)
+        opacity, taken = found.pop(_OPACITY), found.pop(TAKEN, None)
+        found[BACKDROP] = painted_opacity(opacity, camera, (1.0, 1.0, 1.0), mask, self.sphere, taken)
         return found
 
 
@@ -411,10 +441,16 @@ class SceneBlocks:
         """Block -> what it alone says of a view.
 
         Each looks at the view anew: what `drgs fisher` writes of the backdrop is of the opacity that is rendered, which
-        is up to 6e-6 off the one that a diagonal has found on its way.
+        is up to 6e-6 off the one that a diagonal has found on its way. Unknowns of the view are eliminated from each by
+        its own rows: what colors and features tell together, with a pose eliminated from both at once, is more than the
+        sum of these.
         """
         with torch.no_grad():  # information is a number
             return {name: one.information(self._view(camera)) for name, one in self._apart()}
+
+    def with_unknowns(self) -> SceneBlocks:
+        """The same, but that nothing is eliminated from what views tell."""
+        return dataclasses.replace(self, scoring=dataclasses.replace(self.scoring, nuisances=Nuisances(eliminate=())))
 
     def variance_maps(self, camera: Camera, weights: Information) -> dict[str, torch.Tensor]:
         """Block -> (H, W) float32 map of its rows: sums of J_pk^2 weights_k, see `drgs.fisher.variance_map`.
@@ -467,6 +503,7 @@ def _of_gaussians(of: SceneBlocks, names: tuple[str, ...]) -> BlockQuestion | No
     if groups is not None and set(groups) <= {*without}:
         return None
     rows = _rows(of, names)
+    rows |= {"nuisances": scoring.nuisances}
     if criterion_named(scoring.criterion).of_blocks:
         return DenseBlocksQuestion(**rows)
     if scoring.method != "probes":
@@ -481,14 +518,17 @@ def _of_network(of: SceneBlocks, names: tuple[str, ...]) -> BlockQuestion | None
         return None
     scoring = of.scoring
     estimate: NetworkEstimate = "diagonal" if scoring.network == "ratio" else scoring.network
-    return NetworkQuestion(estimate, scoring.probes, groups, **_rows(of, of.names))
+    return NetworkQuestion(estimate, scoring.probes, groups, **_rows(of, of.names), nuisances=scoring.nuisances)
 
 
 def _of_backdrop(of: SceneBlocks, names: tuple[str, ...]) -> BlockQuestion | None:
     """What the opacity tells about the color behind everything."""
     if of.wanted(BACKDROP_BLOCK.groups) == ():
         return None
-    return BackdropQuestion(of.prepared["backdrop"], of.empty_outside)
+    nuisances = of.scoring.nuisances
+    # Features show where the camera stands, too. Without unknowns, questions are alike whatever else counts.
+    semantics = of.prepared.get("semantic") if nuisances.names else None
+    return BackdropQuestion(of.prepared["backdrop"], of.empty_outside, semantics=semantics, nuisances=nuisances)
 
 
 def _metric(of: SceneBlocks, seen: Gaussians, cameras: Sequence[Camera], answers: Answers | None) -> SemanticMetric:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +11,15 @@ import torch
 
 from drgs.guards.arguments import must_be
 from drgs.guards.inputs import check_view, gaussians_at
+from drgs.information.complement import left
+from drgs.information.elimination import ViewRows
 from drgs.information.groups import Group, Information, groups_of, scene_groups
 from drgs.integrator import render_jvp
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
+    from drgs.information.nuisances import Nuisances
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
@@ -82,6 +86,7 @@ def by_columns(
     semantics: SemanticMetric | None,
     scene: Scene | None = None,
     mask: torch.Tensor | None = None,
+    nuisances: Nuisances | None = None,
 ) -> Information:
     """The diagonal of J^T J from every column of J.
 
@@ -92,8 +97,11 @@ def by_columns(
         semantics: The metric of the features, if these tell about the geometry.
         scene: The scene that the Gaussians come from.
         mask: (H, W) what the image is multiplied by; None: 1.
+        nuisances: Unknowns of the view that are eliminated.
     """
     result = {}
+    every = None if semantics is None else dataclasses.replace(semantics, estimate="exact")
+    rows_of_view = ViewRows.of(gaussians, camera, settings, weights, every, mask, nuisances) if wanted else None
     scale = torch.tensor(weights, dtype=torch.float64)
     # A mask is a number, whatever graph it is in; sums of squares of all pixels are float64, as everywhere here.
     factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
@@ -111,6 +119,8 @@ def by_columns(
                 told += semantics.squares(columns[..., 3:]).sum((1, 2))
             elif group.outputs != (0, 3):
                 told += columns[..., 3:].square().sum((1, 2, 3))
+            if rows_of_view is not None and (group.outputs == (0, 3) or semantics is not None):
+                told = left(told, rows_of_view.lost_of_columns(columns, group.outputs == (0, 3)))
             squares.append(told)
         result[name] = group.merge(torch.cat(squares).reshape(shape))
     return result

@@ -11,7 +11,10 @@ from drgs.ellipsoids import DeformableScene, Scene
 from drgs.guards.inputs import Masks, check_any_scene, check_scene, gaussians_at, mask_list, some_cameras
 from drgs.information.choices import METHODS
 from drgs.information.columns import by_columns
+from drgs.information.complement import left
+from drgs.information.elimination import ViewRows
 from drgs.information.groups import Group, groups_of
+from drgs.information.nuisances import Nuisances
 from drgs.information.probes import by_probes
 from drgs.information.replay import Replay
 from drgs.information.semantics import SemanticMetric
@@ -34,6 +37,7 @@ def diagonal_and_opacity(
     seed: int = 0,
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
+    nuisances: Nuisances | None = None,
     backgrounds: Sequence[tuple[float, ...]] = (),
 ) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     """The diagonal of J^T J, and the opacity of the views that it is of.
@@ -42,8 +46,8 @@ def diagonal_and_opacity(
     block `backdrop`, which is about (1 - opacity)^2, then need not render the view a second time.
 
     Args:
-        gaussians, cameras, settings, method, groups, channel_weights, probes, seed, semantics, masks: Those of
-            `drgs.fisher.diagonal`, of which messages speak.
+        gaussians, cameras, settings, method, groups, channel_weights, probes, seed, semantics, masks, nuisances: Those
+            of `drgs.fisher.diagonal`, of which messages speak.
         backgrounds: One for each view, in place of that of the settings; empty: none.
     Returns:
         Group -> float64 tensor on the CPU; and (H, W) float32 opacities on the CPU, one for each view, none of other
@@ -56,6 +60,8 @@ def diagonal_and_opacity(
     seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
     check_scene("fisher.diagonal", seen, settings)
     settings = settings or RenderSettings.preset("exact")
+    if nuisances is not None and nuisances.names and method == "fisherrf":
+        raise ValueError("fisher.diagonal: method fisherrf must have no nuisances, got some; it knows images only")
     wanted = _checked_groups(groups_of(seen, groups, gaussians), method, semantics)
     if semantics is not None:
         semantics.check("fisher.diagonal", seen)
@@ -75,19 +81,22 @@ def diagonal_and_opacity(
         network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
         part: dict[str, torch.Tensor] = {}
         if method == "columns":
-            part |= by_columns(seen, camera, settings, theirs, channel_weights, semantics, mask=shown[number])
-            part |= by_columns(seen, camera, settings, own, channel_weights, semantics, network, shown[number])
+            rest = (shown[number], nuisances)
+            part |= by_columns(seen, camera, settings, theirs, channel_weights, semantics, None, *rest)
+            part |= by_columns(seen, camera, settings, own, channel_weights, semantics, network, *rest)
         elif method == "probes":
             draw = (probes, seed + number)
-            part |= by_probes(seen, camera, settings, theirs, channel_weights, *draw, semantics, mask=shown[number])
+            rest = (shown[number], nuisances)
+            part |= by_probes(seen, camera, settings, theirs, channel_weights, *draw, semantics, None, *rest)
             if own:
-                part |= by_probes(
-                    seen, camera, settings, own, channel_weights, *draw, semantics, network, shown[number]
-                )
+                part |= by_probes(seen, camera, settings, own, channel_weights, *draw, semantics, network, *rest)
         else:
             replay = Replay(seen, camera, settings, semantics=semantics, mask=shown[number])
             part |= replay.diagonal(wanted, channel_weights, method == "fisherrf")
             opacities.append(replay.opacity)
+            rows = ViewRows.of(seen, camera, settings, channel_weights, semantics, shown[number], nuisances)
+            if rows is not None:
+                part |= {name: left(part[name], lost) for name, lost in rows.lost(wanted).items()}
         for name in wanted:
             total[name] += part[name]
     return total, opacities

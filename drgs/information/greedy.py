@@ -22,7 +22,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.gain import Gain, Information, Prior, check
 from drgs.guards.memory import available
-from drgs.information.blocks import add
+from drgs.information.blocks import TAKEN, add
 from drgs.information.cache import Cache, size_of
 from drgs.information.combine import Combination
 from drgs.information.criteria import criterion_named
@@ -104,7 +104,9 @@ class ViewInformation:
             # Rounded once, here, whoever computed it: a cache and workers give the same bits as neither.
             found = {name: x.to(torch.float32) for name, x in answer.items()}
             self.computed += 1
-            check(f"select: {views[i].what}", found, signed)
+            directions = {name: x for name, x in found.items() if name.rpartition(".")[2] == TAKEN}
+            check(f"select: {views[i].what}", directions, signed=True)
+            check(f"select: {views[i].what}", {n: x for n, x in found.items() if n not in directions}, signed)
             return found
 
         answers = self.pool.told([self._source(view).to(view) for view in views], accept)

@@ -44,8 +44,11 @@ from drgs.guards.inputs import (
     three_weights,
 )
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
+from drgs.information.complement import Eliminated
+from drgs.information.elimination import eliminated_of
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
-from drgs.information.probes import Pullback
+from drgs.information.nuisances import Nuisances
+from drgs.information.pullback import Pullback
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
 from drgs.tracing.bridge import own_errors
@@ -76,6 +79,7 @@ def network(
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
+    nuisances: Nuisances | None = None,
 ) -> Information:
     """What views say about a scene's deformation network, summed over views; an estimate.
 
@@ -90,7 +94,8 @@ def network(
         seed: Seed of the random signs, the same in all views.
         channel_weights: Inverse noise variances of R, G and B.
         semantics: The metric in which decoded features tell, too; its `estimate` says how many channels they take.
-        masks: The same as for `drgs.fisher.diagonal`.
+        masks, nuisances: The same as for `drgs.fisher.diagonal`. J is then W^(1/2) J, W what the unknowns leave of the
+            rows (`drgs.information.elimination`): each estimate is of H = J^T W J, and as unbiased as without.
     Returns:
         Group (`grid`, `mlp`; those that there are) -> float64 on the CPU: (P,) of its P parameters in the order of
         `scene.parameters()`, of `trace` and `paper` a number ().
@@ -103,7 +108,7 @@ def network(
              for name, own in groups.items()}  # fmt: skip
     views = some_cameras(where, cameras)
     for camera, mask in zip(views, mask_list(where, masks, views), strict=True):
-        view = _View.of(where, moving, camera, settings, channel_weights, semantics, mask)
+        view = _View.of(where, moving, camera, settings, channel_weights, semantics, mask, nuisances)
         if view is None:
             continue
         with own_errors():
@@ -172,10 +177,12 @@ class _View:
         call: The call of the view.
         scales: (C,) what the call's channels are multiplied by, colors, then semantic channels; with a mask
             (pixels, C).
+        eliminated: What the view's own unknowns explain of the rows, which are freed of it; None: nothing.
     """
 
     call: Call
     scales: torch.Tensor
+    eliminated: Eliminated | None = None
 
     @classmethod
     def of(
@@ -187,6 +194,7 @@ class _View:
         channel_weights: Sequence[float],
         semantics: SemanticMetric | None,
         mask: torch.Tensor | None = None,
+        nuisances: Nuisances | None = None,
     ) -> _View | None:
         """A scene at the time of a camera; None if there is nothing to see."""
         with torch.no_grad():  # derivatives are taken from Dr.Jit's side
@@ -210,7 +218,9 @@ class _View:
         if mask is not None:  # a number, whatever graph it is in
             scales = mask.detach().double().cpu().reshape(-1, 1) * scales
         # Detached: Dr.Jit differentiates through `deformed`, of which these are only the values now.
-        return cls(Call(seen.detach(), camera, settings, frozenset(), scene=deformed), scales)
+        call = Call(seen.detach(), camera, settings, frozenset(), scene=deformed)
+        eliminated = eliminated_of(call, scales, nuisances) if nuisances is not None and nuisances.names else None
+        return cls(call, scales, eliminated)
 
     @property
     def rows(self) -> int:
@@ -223,7 +233,8 @@ class _View:
 
     def pulled(self, pull: Pullback, groups: Groups, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """Group -> (P,) slopes along (pixels, C) rows."""
-        scaled = (rows * self.scales).float()  # as cotangents of images are
+        own = rows if self.eliminated is None else self.eliminated.root(rows)
+        scaled = (own * self.scales).float()  # as cotangents of images are
         slopes = pull(scaled[:, :3], scaled[:, 3:] if self.rows > 3 else None)
         return {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
 
@@ -231,7 +242,8 @@ class _View:
         """(K, pixels, C) float64 tangents of the rows, along (K, ...) tangents of phi by name."""
         out = push_forward(self.call, dict(tangents))
         rows = out.rgb if out.features is None else torch.cat([out.rgb, out.features], -1)
-        return rows.double().cpu().flatten(1, 2) * self.scales
+        scaled = rows.double().cpu().flatten(1, 2) * self.scales
+        return scaled if self.eliminated is None else self.eliminated.root(scaled)
 
     def batches(self, groups: Groups, count: int) -> Iterator[int]:
         """How many of `count` tangents are carried through each traversal."""

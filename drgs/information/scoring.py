@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from drgs.guards.arguments import kind_of, must_be
@@ -25,6 +25,7 @@ from drgs.information.choices import (
     checked_blocks,
 )
 from drgs.information.criteria import CRITERIA, criterion_named
+from drgs.information.nuisances import Nuisance, Nuisances
 from drgs.information.prior import Prior
 from drgs.settings import RenderSettings
 
@@ -76,6 +77,7 @@ class Scoring(Record):
             paper).
         combine: Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace.
         probes: Random probes of each view, for what it tells about a deformation field, and for --method probes.
+        nuisances: Unknowns of each view that are eliminated from what it tells; of policy fisher.
     Raises:
         ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
             the wrong kind.
@@ -92,6 +94,7 @@ class Scoring(Record):
     network: NetworkScore = NETWORK_SCORES[0]
     combine: Combine | None = None
     probes: int = 16
+    nuisances: Nuisances = dataclasses.field(default_factory=Nuisances)
     where: ClassVar[str] = "select"
 
     def __post_init__(self) -> None:
@@ -116,10 +119,25 @@ class Scoring(Record):
         check_combined("select", self.blocks, self.criterion, self.network, self.combine)
         if not (isinstance(self.probes, int) and self.probes >= 1):
             raise ValueError(f"select: probes must be a whole number >= 1, got {self.probes!r}; try 16")
+        must_be("select", "nuisances", self.nuisances, Nuisances, 'e.g. Nuisances(eliminate=("exposure",))')
+        if self.nuisances.names and self.method == "fisherrf":
+            raise ValueError(
+                "select: eliminate must be none with method fisherrf, got "
+                f"{', '.join(self.nuisances.names)}; use method exact"
+            )
         if self.semantics is not None:
             from drgs.information.semantics import SemanticMetric  # with torch, which an option list does not need
 
             must_be("select", "semantics", self.semantics, SemanticMetric, "e.g. SemanticMetric(decoder.metric())")
+
+    def over(self, estimated: Sequence[Nuisance]) -> Scoring:
+        """With the unknowns of photographs that a fit has estimated eliminated, unless it says itself which are.
+
+        FisherRF's code knows none: with its method it is as it was.
+        """
+        if self.method == "fisherrf":
+            return self
+        return dataclasses.replace(self, nuisances=self.nuisances.over(estimated))
 
     def blocks_of(self, gaussians: Gaussians, where: str = "select", scene: Scene | None = None) -> tuple[Block, ...]:
         """The blocks that are scored of a scene.

@@ -146,11 +146,13 @@ class SemanticMetric:
         """(...) gamma f^T M f of (..., D) features, exactly."""
         return self.weight * (features.double().cpu() @ self._factor).square().sum(-1)
 
-    def cotangent(self, pixels: int, generator: torch.Generator) -> torch.Tensor:
-        """(pixels, D) float32 sqrt(gamma) L v of random signs v, a sign a pixel and direction that the decoder sees."""
-        L = self._factor
-        signs = torch.randint(0, 2, (pixels, L.shape[1]), generator=generator).double() * 2 - 1
-        return (self.weight**0.5 * signs @ L.T).float()
+    def signs(self, pixels: int, generator: torch.Generator) -> torch.Tensor:
+        """(pixels, rank) float64 random signs v, one a pixel and direction that the decoder sees."""
+        return torch.randint(0, 2, (pixels, self._factor.shape[1]), generator=generator).double() * 2 - 1
+
+    def cotangent(self, v: torch.Tensor) -> torch.Tensor:
+        """(pixels, D) float32 sqrt(gamma) L v of (pixels, rank) v."""
+        return (self.weight**0.5 * v @ self._factor.T).float()
 
     def check(self, where: str, gaussians: Gaussians) -> None:
         """Raise ValueError unless the Gaussians have features of this width."""

@@ -28,7 +28,7 @@ GENERATOR = "drgs report"
 """What the page says of itself: a file that does is one that may be replaced."""
 
 _HERE = Path(__file__).parent
-_DIGITS = {"psnr": 2, "psnr_moving": 2}
+_DIGITS = {"psnr": 2, "cc_psnr": 2, "psnr_moving": 2}
 _NO_CHARTS = "Charts are left out: they need matplotlib, pip install 'drgs[report]'."
 
 
@@ -137,8 +137,15 @@ def _tiles(account: Account) -> list[tuple[str, str]]:
     metrics = account.metrics
     tiles = []
     if metrics is not None:
-        units = {"psnr": " dB", "psnr_moving": " dB"}
-        names = {"psnr": "PSNR", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS", "psnr_moving": "PSNR of what moves"}
+        units = {"psnr": " dB", "cc_psnr": " dB", "psnr_moving": " dB"}
+        names = {
+            "psnr": "PSNR",
+            "cc_psnr": "color-corrected PSNR",
+            "ssim": "SSIM",
+            "flip": "FLIP",
+            "lpips": "LPIPS",
+            "psnr_moving": "PSNR of what moves",
+        }
         for name, text in names.items():
             if (value := metrics["mean"].get(name)) is not None:
                 what = f"{text}, {metrics['count']} {metrics['split']} views"
@@ -238,7 +245,7 @@ def _picks(account: Account) -> dict[str, Any]:
     how = ", ".join([*policies, *criteria])
     leak = " Initial points are of the whole data set, views that were not picked included." * selection["pool_leak"]
     measured = []
-    names = ("psnr", "ssim", "flip")
+    names = ("psnr", "cc_psnr", "ssim", "flip")
     for row in selection.get("measured") or ():
         if isinstance(row, dict) and isinstance(row.get("mean"), dict):
             values = [row["mean"].get(name) for name in names]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
     from drgs.information.choices import Block
+    from drgs.information.nuisances import Nuisances
     from drgs.report.account import Account
     from drgs.settings import RenderSettings
 
@@ -110,18 +111,22 @@ def _read(path: Path) -> np.ndarray | None:
 
 
 def maps(
-    scene: Scene, known: Sequence[Camera], shown: Mapping[str, Camera], settings: RenderSettings
+    scene: Scene,
+    known: Sequence[Camera],
+    shown: Mapping[str, Camera],
+    settings: RenderSettings,
+    nuisances: Nuisances,
 ) -> dict[str, tuple[Picture, Picture]]:
     """View -> how uncertain each pixel is by what the fitted views say, and what no Gaussian covers.
 
     The first is the predictive variance by the blocks geometry and backdrop, with lambda = 1; of more than 24 known
-    views, 24 evenly chosen ones stand for all.
+    views, 24 evenly chosen ones stand for all. `nuisances` are eliminated from what they say.
     """
     if not known or not shown:
         return {}
     counted = spread(known, _KNOWN)
     result = dict[str, tuple[Picture, Picture]]()
-    scoring = Scoring(settings=settings, blocks=_MAPPED)
+    scoring = Scoring(settings=settings, blocks=_MAPPED, nuisances=nuisances)
     blocks = SceneBlocks.of(scene, scoring, [*known, *shown.values()], "report")
     with Bar("maps of information", len(counted) + len(shown)) as bar:
         total: dict[str, torch.Tensor] = {}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from drgs.display.progress import Bar
 from drgs.files import Run, atomic_write
 from drgs.fitting.records import load_run
+from drgs.information.nuisances import Nuisances
 from drgs.report import charts, pictures
 from drgs.report.account import Account, account_of
 from drgs.report.page import Shown, page_html
@@ -68,7 +69,9 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
     still_name = ""
     if loaded is not None and cast is not None:
         shown = {name: cast.held[name] for name in names if name in cast.held}
-        found = pictures.maps(loaded.scene, cast.fitted, shown, account.record.config.settings)
+        record = account.record
+        nuisances = Nuisances(eliminate=record.estimated)
+        found = pictures.maps(loaded.scene, cast.fitted, shown, record.config.settings, nuisances)
         stills, still_name = _stills(account, loaded, cast)
     picks = account.selection["picks"] if account.selection else []
     drawn: dict[str, str | None] = {}

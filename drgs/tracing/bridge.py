@@ -72,16 +72,16 @@ class _Reverse(torch.autograd.Function):
         ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
         ctx.call = call
         ctx.needed = ctx.needs_input_grad[1:]
-        ctx.graph = _traced(call, values, ctx.needed)
-        return tuple(x.torch() for x in ctx.graph[1])
+        ends, images = _traced(call, values, ctx.needed)
+        ctx.graph = runtime.Graph((ends, images))
+        return tuple(x.torch() for x in images)
 
     @staticmethod
     @runtime.alone
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        values, graph = ctx.saved_tensors, ctx.graph
+        values = ctx.saved_tensors
         # A traversal takes the edges of the graph with it; through what is left, another would find the old gradients.
-        ctx.graph = None
-        inputs, images = graph or _traced(ctx.call, values, ctx.needed)
+        inputs, images = ctx.graph.take() or _traced(ctx.call, values, ctx.needed)
         for image, g in zip(images, cotangents, strict=True):
             dr.set_grad(image, _plain(ctx.call.lib, g).array)
         needed = [k for k, x in enumerate(inputs) if x is not None]

@@ -1,0 +1,127 @@
+"""One model in every renderer: fits with one renderer alone and with several in turn, each seen with all of them.
+
+    python benchmarks/one_model.py [--scenes banana fern statue] [--trained fast any ...] [--seeds 1] [--page]
+
+Appends one row a fit to benchmarks/one_model.jsonl as it ends, leaves out what is there, then writes the tables of
+docs/one-model.md. One thread. What a mix costs is the average of the medians of its presets' steps over the median of
+the steps with `fast` of the same fit, so that other work on the machine takes from both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from where import DATA, ran  # noqa: E402
+
+from drgs.data import load  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
+from drgs.fitting.start import start  # noqa: E402
+from drgs.metrics import through_renderers  # noqa: E402
+from drgs.settings import PRESETS, RenderSettings  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "one_model.jsonl"
+PAGE = ROOT / "docs" / "one-model.md"
+SCENES = ("banana", "fern", "statue")
+SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
+KEY = ("scene", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
+
+
+def rows() -> list[dict]:
+    """What has been measured so far."""
+    return [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
+
+
+def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> dict:
+    """One fit, and its held-out views in each renderer."""
+    dataset = load(DATA / scene)
+    names = tuple(trained.split(","))
+    config = FitConfig.of(renderers=names, seed=seed, test_offset=offset, **size)
+    if len(names) == 1 and trained in PRESETS:
+        config = config.replace(settings=RenderSettings.preset(trained))
+    train, test = dataset.split(config.data.test_every, offset)
+    frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))
+    trainer, _ = start(dataset, train, frames, config, None, None, False, 0)
+    schedule = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
+    took: dict[RenderSettings, list[float]] = {}
+    while trainer.step_index < config.max_steps:
+        settings = schedule.settings_at(trainer.step_index)
+        began = time.perf_counter()
+        trainer.step()
+        took.setdefault(settings, []).append(time.perf_counter() - began)
+    found = through_renderers(
+        trainer.gaussians(), held_out, renderers_to_measure(names, config.settings, "all"), "test"
+    )
+    assert found is not None
+    names_of = {RenderSettings.preset(name): name for name in PRESETS}
+    step_ms = {names_of[settings]: 1000 * statistics.median(each) for settings, each in took.items()}
+    average = sum(step_ms[names_of[settings]] * len(each) for settings, each in took.items()) / config.max_steps
+    return {
+        **dict(zip(KEY, (scene, trained, seed, offset, *size.values()), strict=True)),
+        "psnr": {row["name"]: [view["psnr"] for view in row["views"]] for row in found["rows"] if row["name"] in ANY},
+        "step_ms": step_ms,
+        "over_fast": average / step_ms["fast"] if "fast" in step_ms else None,
+        **ran(),
+    }
+
+
+def tables(found: list[dict]) -> str:
+    """Mean and worst held-out PSNR by scene, and what a step of a mix costs."""
+    lines = ["| capture (held out) | trained with | " + " | ".join(f"`{name}`" for name in ANY) + " | step / `fast` |"]
+    lines += ["|---|---|" + "---|" * len(ANY) + "---|"]
+    for scene in dict.fromkeys(row["scene"] for row in found):
+        mine = [row for row in found if row["scene"] == scene]
+        for trained in dict.fromkeys(row["trained"] for row in mine):
+            group = [row for row in mine if row["trained"] == trained]
+            cells = []
+            for name in ANY:
+                means = [statistics.mean(row["psnr"][name]) for row in group]
+                worst = min(min(row["psnr"][name]) for row in group)
+                cells.append(f"{statistics.mean(means):.2f} / {worst:.2f}")
+            count = len(group[0]["psnr"][ANY[0]])
+            ratios = [row["over_fast"] for row in group if row["over_fast"]]
+            ratio = f"{statistics.mean(ratios):.2f}" if ratios else "-"
+            lines.append(f"| {scene} ({count}) | {trained} | {' | '.join(cells)} | {ratio} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--trained", nargs="+", default=[*ANY, "any"], help="as `drgs fit --for` takes them")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--offset", type=int, default=0, help="of the held-out views")
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the tables of the rows that there are")
+    args = parser.parse_args()
+    done = {tuple(row[name] for name in KEY) for row in rows()}
+    for scene in [] if args.page else args.scenes:
+        for trained in args.trained:
+            for seed in range(args.seeds):
+                if (scene, trained, seed, args.offset, *SIZE.values()) not in done:
+                    row = measured(scene, trained, seed, args.offset, SIZE)
+                    with ROWS.open("a") as file:
+                        file.write(json.dumps(row) + "\n")
+                    means = {name: round(statistics.mean(values), 2) for name, values in row["psnr"].items()}
+                    print(scene, trained, seed, means, flush=True)
+    text = tables(rows())
+    print(text)
+    fill_between(PAGE, "one_model", text)
+
+
+if __name__ == "__main__":
+    main()

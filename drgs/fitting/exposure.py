@@ -1,0 +1,238 @@
+"""Exposure and white balance of photographs: a gain a photograph and channel, estimated from points that several show.
+
+A camera that chooses its exposure, or its white balance, anew for each photograph multiplies what it sees by a number
+a channel. Where several photographs show one point, log c = log gain of the photograph + log color of the point +
+noise, on the values of the photographs as they are (sRGB), in which renderings are compared with them. Points are
+projected into all photographs: whether one is hidden there is left to robust weights, since what hides it has another
+color.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.fitting.networks import Network
+
+if TYPE_CHECKING:
+    from drgs.fitting.frames import Frame
+    from drgs.integrator import Output
+
+__all__ = ["NETWORK", "Exposure", "ExposureEstimate", "estimate_exposure", "exposure_network"]
+
+NETWORK = "exposure"
+"""Name of the gains in a checkpoint."""
+
+_DARK, _BRIGHT = 8 / 255, 250 / 255  # beyond these a tone curve, or saturation, hides the gain
+_MARGIN = 1.5  # pixels from the border, so that a patch of 3x3 is inside
+_MASKED = 0.99  # mask that the whole patch must have
+_MOST = 4_000_000  # observations that are looked at, photographs times points
+_HUBER = 1.345  # of the noise: 95 % efficient where it is normal
+_TUKEY = 4.0  # of the noise, beyond which a color is of something else
+_CONVEX, _STEPS = 6, 15  # steps with Huber's weights, which forget the start, and of all
+_LEAST_NOISE = 0.01  # of a log color: a byte's rounding at mid-gray
+_SUPPORT = 8  # points that two photographs must share to say something of each other
+_RATE = 1e-3  # of learned log gains
+_CLEAR = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
+
+
+@dataclasses.dataclass(frozen=True)
+class ExposureEstimate:
+    """What points say of the gains of V photographs.
+
+    Attributes:
+        log_gains: (V, 3) float64 natural logarithms; of zero mean over the photographs of a component, each channel.
+        errors: (V, 3) their standard errors.
+        observations: How many colors of points were compared.
+        components: Sets of photographs that share points; each is centered by itself, for nothing compares them.
+    """
+
+    log_gains: np.ndarray
+    errors: np.ndarray
+    observations: int
+    components: int
+
+    @property
+    def spread(self) -> tuple[float, float, float]:
+        """Standard deviation over the photographs of log2 of the gains of R, G and B: in stops of the sRGB values."""
+        return _three(self.log_gains.std(axis=0) / math.log(2))
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the gains differ by more than points can be wrong about: in one channel at least."""
+        return any(x**2 - e**2 > _CLEAR**2 for x, e in zip(self.spread, self.noise, strict=True))
+
+    def words(self) -> str:
+        """What was found, in one line."""
+        spread, noise = (" ".join(f"{x:.3f}" for x in values) for values in (self.spread, self.noise))
+        apart = f", in {self.components} sets that share no points" if self.components > 1 else ""
+        return (
+            f"log2 gains of R G B differ by {spread} between photographs (noise {noise}, {self.observations} colors of "
+            f"points{apart})"
+        )
+
+    def to_json(self, names: list[str]) -> dict:
+        """The estimate as config.json has it; `names` of the photographs."""
+        gains = {name: [float(x) for x in row] for name, row in zip(names, np.exp(self.log_gains), strict=True)}
+        return {
+            "spread": list(self.spread),
+            "noise": list(self.noise),
+            "observations": self.observations,
+            "components": self.components,
+            "gains": gains,
+        }
+
+    @property
+    def noise(self) -> tuple[float, float, float]:
+        """Root mean square over the photographs of the standard errors of log2 of the gains of R, G and B."""
+        return _three(np.sqrt(np.square(self.errors).mean(axis=0)) / math.log(2))
+
+
+def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) -> ExposureEstimate:
+    """Gains of photographs from points of the scene, in closed form under robust weights.
+
+    The colors of points are eliminated from the normal equations of each channel, so that V unknowns are left, whose
+    gauge is a zero mean. All channels of an observation have one weight: what hides a point changes all of them.
+
+    Args:
+        frames: V photographs with their cameras; nothing outside of masks is looked at.
+        points: (P, 3) world points, of which as many are drawn as memory has room for.
+        seed: Seed of this draw.
+    """
+    most = max(1, _MOST // max(1, len(frames)))
+    if len(points) > most:
+        points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
+    logs, there = _observed(frames, points)
+    shared = there.any(axis=2)
+    there &= (shared.sum(axis=0) >= 2)[None, :, None]  # a point that one photograph shows compares nothing
+    robust = there.any(axis=2).astype(np.float64)
+    observations = int(robust.sum())
+    label = _components(there)
+    gains = np.zeros((len(frames), 3))
+    errors = np.zeros((len(frames), 3))
+    for step in range(_STEPS if observations else 0):
+        residual = np.zeros(logs.shape)
+        inverses = []
+        for channel in range(3):
+            weights = there[..., channel] * robust
+            gains[:, channel], inverse, colors = _solved(weights, logs[..., channel], label)
+            inverses.append(inverse)
+            residual[..., channel] = there[..., channel] * (logs[..., channel] - gains[:, channel, None] - colors)
+        count = there.sum(axis=2)
+        seen = count > 0
+        size = np.sqrt(np.square(residual).sum(axis=2) / np.maximum(count, 1))  # 0 where nothing is seen
+        noise = max(1.4826 * float(np.median(size[seen])), _LEAST_NOISE)
+        errors = np.stack([noise * np.sqrt(np.maximum(np.diag(x), 0)) for x in inverses], axis=1)  # 0 but for rounding
+        if step < _CONVEX:
+            robust = seen * np.minimum(1, _HUBER * noise / np.maximum(size, 1e-12))  # a residual may be 0
+        else:
+            robust = seen * np.square(np.maximum(0, 1 - np.square(size / (_TUKEY * noise))))
+    return ExposureEstimate(gains, errors, observations, len(np.unique(label)))
+
+
+class Exposure(torch.nn.Module):
+    """Log gains of photographs, which multiply what is rendered for each before it is compared.
+
+    Attributes:
+        log_gains: (V, 3) float32 natural logarithms.
+    """
+
+    def __init__(self, names: list[str], log_gains: np.ndarray, learned: bool) -> None:
+        """
+        Args:
+            names: V names of photographs.
+            log_gains: (V, 3) first log gains.
+            learned: Whether they are fitted, too.
+        """
+        super().__init__()
+        self._rows = {name: row for row, name in enumerate(names)}
+        start = torch.tensor(log_gains, dtype=torch.float32)
+        self.log_gains = torch.nn.Parameter(start, requires_grad=learned)
+
+    def forward(self, output: Output, frame: Frame) -> Output:
+        """The output as its photograph shows it; gradients reach both."""
+        gain = self.log_gains[self._rows[frame.name]].exp().to(output.rgb.device)
+        return dataclasses.replace(output, rgb=output.rgb * gain)
+
+    def center(self) -> None:
+        """Give the log gains zero mean over the photographs: gain 1, which viewers show, is the mean exposure."""
+        with torch.no_grad():  # a gauge, no step
+            self.log_gains.sub_(self.log_gains.mean(dim=0))
+
+
+def exposure_network(frames: list[Frame], learned: bool, log_gains: np.ndarray | None = None) -> Network:
+    """The gains of photographs as a part of a fit.
+
+    Args:
+        frames: V training photographs.
+        learned: Whether they are fitted, too.
+        log_gains: (V, 3) first log gains; 0 where a checkpoint brings them.
+    """
+    start = np.zeros((len(frames), 3)) if log_gains is None else log_gains
+    module = Exposure([frame.name for frame in frames], start, learned)
+    return Network(NETWORK, module, _RATE if learned else 0.0, constraint=module.center if learned else None)
+
+
+def _observed(frames: list[Frame], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(V, P, 3) logarithms of the mean colors of 3x3 patches, and which are there, neither dark nor saturated."""
+    import cv2
+
+    logs = np.zeros((len(frames), len(points), 3))
+    there = np.zeros(logs.shape, bool)
+    square = np.ones((3, 3), np.uint8)
+    for row, frame in enumerate(frames):
+        image = frame.image().numpy()
+        height, width = image.shape[:2]
+        pixels, depth = frame.camera.project(points)
+        inside = (depth > 0) & (pixels >= _MARGIN).all(axis=1)
+        inside &= (pixels < (width - _MARGIN, height - _MARGIN)).all(axis=1)
+        index = np.flatnonzero(inside)
+        columns, rows = pixels[index].astype(int).T
+        if frame.mask is not None:
+            kept = cv2.erode(frame.mask.numpy(), square)[rows, columns] > _MASKED
+            index, columns, rows = index[kept], columns[kept], rows[kept]
+        lowest, highest = (x(image, square)[rows, columns] for x in (cv2.erode, cv2.dilate))
+        good = (lowest > _DARK) & (highest < _BRIGHT)
+        there[row, index] = good
+        logs[row, index] = np.log(np.where(good, cv2.blur(image, (3, 3))[rows, columns], 1.0))
+    return logs, there
+
+
+def _solved(weights: np.ndarray, logs: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(V,) log gains, the (V, V) inverse of their normal equations, and (P,) log colors, of (V, P) observations."""
+    of_point = weights.sum(axis=0)
+    scale = np.divide(1.0, of_point, out=np.zeros_like(of_point), where=of_point > 0)
+    halves = weights * np.sqrt(scale)
+    normal = np.diag(weights.sum(axis=1)) - halves @ halves.T
+    weighted = weights * logs
+    right = weighted.sum(axis=1) - weights @ (weighted.sum(axis=0) * scale)
+    # What shifts all photographs of a component alike is in the null space: the pseudo-inverse leaves it 0.
+    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+    gains = inverse @ right
+    for component in np.unique(label):
+        mine = label == component
+        gains[mine] -= gains[mine].mean()
+    return gains, inverse, ((weighted.sum(axis=0) - gains @ weights) * scale)
+
+
+def _components(there: np.ndarray) -> np.ndarray:
+    """(V,) label of the set of photographs that share points with each photograph, of (V, P, 3) observations."""
+    shown = np.asarray(there.any(axis=2), np.float32)
+    linked = shown @ shown.T >= _SUPPORT
+    label = np.arange(len(there))
+    for _ in range(len(there)):
+        lowest = np.where(linked, label[None, :], len(label)).min(axis=1, initial=len(label))
+        new = np.minimum(label, lowest)
+        if (new == label).all():
+            break
+        label = new
+    return label
+
+
+def _three(values: np.ndarray) -> tuple[float, float, float]:
+    red, green, blue = (float(x) for x in values)
+    return red, green, blue

@@ -1,0 +1,86 @@
+"""What of a photograph is unknown besides the scene, as one frozen record; imports nothing heavy."""
+
+from __future__ import annotations
+
+import dataclasses
+import numbers
+import typing
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+from drgs.guards.records import Record
+
+__all__ = ["NUISANCES", "Nuisance", "Nuisances"]
+
+Nuisance = Literal["exposure", "pose"]
+"""Unknowns of a photograph: three log gains of its channels, and the six numbers of its camera's pose."""
+
+NUISANCES: tuple[Nuisance, ...] = typing.get_args(Nuisance)
+
+_STD = (1e-9, 1e9)  # whose squares and their inverses are numbers by far
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Nuisances(Record):
+    """Unknowns of a view that are eliminated from its information, and how well they are known before it is seen.
+
+    A view that tells only its own exposure tells nothing about the scene. `drgs.information.elimination` has the
+    equations.
+
+    Attributes:
+        eliminate: Unknowns of every view that its information is freed of: exposure (three log gains), pose; none;
+            default those that the fit has estimated.
+        exposure_std: Standard deviation of a log gain that is known before a view is seen; default nothing is known.
+        pose_std: Standard deviations of the camera's rotation about its center (radians) and of its place (world
+            units) that are known before; default nothing is known.
+    Raises:
+        ValueError: If a name is unknown, or a standard deviation is out of range.
+    """
+
+    eliminate: tuple[Nuisance, ...] | None = None
+    exposure_std: float | None = None
+    pose_std: tuple[float, float] | None = None
+    where: ClassVar[str] = "nuisances"
+
+    def __post_init__(self) -> None:
+        if self.eliminate is not None:
+            known = ", ".join(NUISANCES)
+            if not isinstance(self.eliminate, tuple | list):
+                raise ValueError(f"nuisances: eliminate must be a tuple of {known}, got {self.eliminate!r}; correct it")
+            for name in self.eliminate:
+                if name not in NUISANCES:
+                    raise ValueError(f"nuisances: eliminate must be among {known}, or none, got {name!r}; correct it")
+            object.__setattr__(self, "eliminate", tuple(name for name in NUISANCES if name in self.eliminate))
+        if self.exposure_std is not None:
+            self._check("exposure_std", self.exposure_std)
+        if self.pose_std is not None:
+            if not isinstance(self.pose_std, tuple | list) or len(self.pose_std) != 2:
+                raise ValueError(
+                    f"nuisances: pose_std must be two numbers, radians and world units, got {self.pose_std!r}; e.g. "
+                    "(0.001, 0.01)"
+                )
+            for value in self.pose_std:
+                self._check("pose_std", value)
+            object.__setattr__(self, "pose_std", tuple(self.pose_std))  # part of a key of the cache
+
+    @staticmethod
+    def _check(name: str, value: object) -> None:
+        low, high = _STD
+        if isinstance(value, bool) or not (isinstance(value, numbers.Real) and low <= float(value) <= high):
+            raise ValueError(
+                f"nuisances: {name} must be within {low:g} and {high:g}, got {value!r}; leave it out where nothing is "
+                "known"
+            )
+
+    @property
+    def names(self) -> tuple[Nuisance, ...]:
+        """Those that are eliminated."""
+        return self.eliminate or ()
+
+    def if_any(self) -> dict[str, dict]:
+        """As files hold them, under their name; nothing where none are eliminated."""
+        return {"nuisances": self.to_json()} if self.names else {}
+
+    def over(self, fitted: Sequence[Nuisance]) -> Nuisances:
+        """With those that a fit has estimated, unless these say themselves which."""
+        return self if self.eliminate is not None else self.replace(eliminate=tuple(fitted))
