@@ -74,11 +74,15 @@ def run_to(trainer: Trainer, step: int) -> list[dict]:
 
 @pytest.mark.parametrize("settings", [FAST, GSPLAT], ids=["fast", "gsplat"])
 def test_what_one_photograph_shows_is_found(settings):
-    """Its mask covers the person but for its border, the other photographs have none."""
+    """Its mask covers the person and at most two pixels around, the other photographs have none."""
     frames, there = photographs()
     masks, shares = transient_masks(frames, wall(), settings)
     found = masks[3]
-    assert float((found & there).sum() / (found | there).sum()) > 0.75
+    assert float(found[there].float().mean()) > 0.98
+    assert not found[:8].any()
+    assert not found[42:].any()
+    assert not found[:, :16].any()
+    assert not found[:, 30:].any()
     assert shares[3] > 0.8 * float(there.float().mean())
     assert not any(mask.any() for i, mask in enumerate(masks) if i != 3)
 
@@ -88,7 +92,7 @@ def test_what_is_not_fitted_yet_is_not_found():
     frames, there = photographs()
     masks, shares = transient_masks(frames, wall(brighter=-0.3), FAST)
     assert max(share for i, share in enumerate(shares) if i != 3) < 0.025
-    assert float(masks[3][there].float().mean()) > 0.75
+    assert float(masks[3][there].float().mean()) > 0.7
 
 
 def test_exposure_is_not_found():
@@ -127,7 +131,7 @@ def test_auto_decides_by_evidence():
     assert events[0]["photographs"] == 1
     assert line_of(events[0]).startswith(f"1 of {VIEWS} photographs show")
     assert trainer.transients.summary(frames)["masked"] == 1
-    assert float(frames[3].transient[there].float().mean()) > 0.75
+    assert float(frames[3].transient[there].float().mean()) > 0.7
 
 
 def test_a_clean_fit_has_the_same_bits():

@@ -207,8 +207,8 @@ class LossConfig(Record):
         outside_weight: Weight of the opacity outside of a mask of kind object.
         opacity_weight: Weight of the mean opacity, which lets Gaussians that nobody needs fade (MCMC).
         scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
-        transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss where residuals
-            show it clearly (auto), or however little it is (mask), or fitted like everything else (keep).
+        transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss if residuals
+            show clearly that there is such a thing (auto), wherever they may show it (mask), or never (keep).
     """
 
     ssim_weight: float = 0.2

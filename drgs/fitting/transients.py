@@ -52,6 +52,7 @@ _SPREADS = 2.0  # times the neighbors' own spread that a difference must exceed
 _CLEAR, _EDGE = 0.1, 0.05  # of the remaining difference: where a mask is begun, and how far it is grown
 _GROWTH = 0.08  # the farthest that it is grown, in widths of the picture
 _SHARE = 0.025  # of a photograph that clearly differs: what decides. Clean captures: at most 0.017
+_MASKED = 0.01  # the same, from which on a photograph has a mask once that is decided; less are specks
 _ABOVE = 4.0  # times the median over photographs, which wrong poses and mirrors raise in all of them
 
 
@@ -176,7 +177,8 @@ def transient_masks(
         excess = _excess(compared[i], neighbors)
         clear = excess > _CLEAR
         shares.append(float(clear.float().mean()))
-        grown = _grown(clear, excess > _EDGE)
+        # One pixel more: the blur has drawn what is beside it into the difference at its border.
+        grown = _grown(clear, excess > _EDGE, 1) if shares[-1] > _MASKED else torch.zeros_like(clear)
         height, width = frame.pixels.shape[:2]
         masks.append(interpolate(grown.float()[None, None], (height, width), mode="nearest")[0, 0] > 0)
     return masks, shares
@@ -234,12 +236,12 @@ def _excess(one: _Compared, neighbors: list[_Compared]) -> torch.Tensor:
     return torch.where(judged, difference - _SPREADS * spread, 0.0)
 
 
-def _grown(seeds: torch.Tensor, allowed: torch.Tensor) -> torch.Tensor:
-    """(H, W) bool seeds and what is allowed and connected with them."""
+def _grown(seeds: torch.Tensor, allowed: torch.Tensor, border: int) -> torch.Tensor:
+    """(H, W) bool seeds, what is allowed and connected with them, and a border of so many pixels around."""
     grown = seeds.float()[None]
     for _ in range(max(1, round(_GROWTH * seeds.shape[1]))):
         grown = max_pool2d(grown, 3, 1, 1) * (allowed | seeds)
-    return grown[0] > 0
+    return max_pool2d(grown, 2 * border + 1, 1, border)[0] > 0
 
 
 def _reduced(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
