@@ -49,6 +49,7 @@ from drgs.fitting.stages import moving_labels
 from drgs.fitting.start import motion_of, start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
+from drgs.fitting.transients import line_of
 from drgs.guards import interrupts
 from drgs.guards.memory import is_out_of_memory
 from drgs.guards.outputs import claim
@@ -205,8 +206,10 @@ def _fit(
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     if exposure is not None:
         recorded["exposure"] = exposure.to_json(recorded["train"])
+    elif trainer.step_index and "exposure" in (before := run.config()):
+        recorded["exposure"] = before["exposure"]
     if trainer.parts.exposure is not None:
-        recorded["estimated"] = ["exposure"]  # what views tell is what is left of it
+        recorded["estimated"] = ["exposure"]
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -252,6 +255,7 @@ def _fit(
         ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
+        **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
     )
     told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **told)
@@ -360,6 +364,9 @@ class _Loop:
                 step = trainer.step()
                 self.seconds += time.perf_counter() - began
                 done = trainer.step_index
+                for event in step.events:
+                    if event["event"] == "transients" and event["found"]:
+                        bar.note(f"step {done - 1}: {line_of(event)}")
                 self._log(step)
                 if step.psnr is not None:
                     self._psnr = 0.98 * (self._psnr or step.psnr) + 0.02 * step.psnr

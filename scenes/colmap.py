@@ -50,13 +50,14 @@ def project(K, c2w, points):
     return np.stack([K[0, 0] * camera[:, 0] / safe + K[0, 2], K[1, 1] * camera[:, 1] / safe + K[1, 2]], 1), z
 
 
-def sparse_points(K, poses, views, count, seed):
+def sparse_points(K, poses, views, count, seed, pixel=_PIXEL):
     """About `count` points on surfaces, where pictures have texture, with errors.
 
     A view gives count / views pixels, drawn by the gradient of its picture plus a tenth of that gradient's mean.
     Errors: normal, 0.2 % of the distance in every direction and 0.6 % more along the ray of that view; 2 % of the
     points lie at 0.6 to 1.5 times their distance. Observations: in every view where the exact point is not hidden,
-    off by 0.5 pixels; points have at least two, where there are three views or more.
+    off by `pixel` (standard deviation of x and y, in pixels); points have at least two, where there are three views or
+    more.
 
     Args:
         K: (3, 3) intrinsics in pixels.
@@ -93,7 +94,7 @@ def sparse_points(K, poses, views, count, seed):
         ids = np.flatnonzero((z > 0.05) & (pixels > 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height))
         x, y = pixels[ids].astype(int).T
         ids = ids[np.abs(z[ids] - depth[y, x]) < _SLACK * z[ids]]
-        tracks.append((ids, pixels[ids] + _PIXEL * rng.standard_normal((len(ids), 2))))
+        tracks.append((ids, pixels[ids] + pixel * rng.standard_normal((len(ids), 2))))
         seen[ids] += 1
     keep = seen >= (2 if len(poses) > 2 else 0)
     number = np.cumsum(keep) - 1
@@ -101,7 +102,7 @@ def sparse_points(K, poses, views, count, seed):
     return SparsePoints(xyz[keep], exact[keep], rgb[keep], label[keep], outlier[keep], tracks)
 
 
-def write_model(folder, K, poses, names, width, height, points):
+def write_model(folder, K, poses, names, width, height, points, errors=None):
     """Write cameras.txt, images.txt and points3D.txt of one PINHOLE camera.
 
     Args:
@@ -111,7 +112,11 @@ def write_model(folder, K, poses, names, width, height, points):
         names: File names of the images.
         width, height: Size of the images in pixels.
         points: The `SparsePoints` that the images show.
+        errors: (n,) mean reprojection error of each point in pixels, which the file states; None: the standard
+            deviation of what is observed.
     """
+    if errors is None:
+        errors = np.full(len(points.xyz), _PIXEL)
     (folder / "cameras.txt").write_text(
         f"1 PINHOLE {width} {height} {K[0, 0]:.17g} {K[1, 1]:.17g} {K[0, 2]:.17g} {K[1, 2]:.17g}\n"
     )
@@ -126,8 +131,8 @@ def write_model(folder, K, poses, names, width, height, points):
             observed[i].append(f"{k + 1} {index}")
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     rows = [
-        f"{i + 1} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} {_PIXEL} {' '.join(observed[i])}".rstrip()
-        for i, ((x, y, z), (r, g, b)) in enumerate(zip(points.xyz, points.rgb, strict=True))
+        f"{i + 1} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} {error:.6g} {' '.join(observed[i])}".rstrip()
+        for i, ((x, y, z), (r, g, b), error) in enumerate(zip(points.xyz, points.rgb, errors, strict=True))
     ]
     (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
 

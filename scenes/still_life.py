@@ -23,7 +23,7 @@ from drgs import runtime, scenes
 from drgs.display.progress import Bar
 from drgs.scenes import box, grid, join, mix, noise, output, ramp, revolve, spline, tube, turned
 
-__all__ = ["generate", "main"]
+__all__ = ["generate", "main", "objects", "stone", "table", "wallpaper"]
 
 _VERSION = 1  # bump when the pictures change: finished folders of another version are made again
 _FOV_X = 50.0  # degrees across the image width
@@ -60,7 +60,7 @@ def _wood(rng, size=1024, planks=8):
 
 
 def _porcelain(rng, height=640, width=1024):
-    """White glaze with cobalt bands, medallions and leaves, for the vase's profile in `_objects`.
+    """White glaze with cobalt bands, medallions and leaves, for the vase's profile in `objects`.
 
     The art fills the rows that the outer side covers; base and inside stay white.
     """
@@ -134,7 +134,7 @@ def _cover(rng, color, ink, title, lines):
     return np.concatenate([np.concatenate([front, back, spine], 1), np.concatenate([pages] * 3, 1)])
 
 
-def _wallpaper(rng, height=640, width=4096):
+def wallpaper(rng, height=640, width=4096):
     """Rows of flowers above a paneled dado, with pictures hung on them; x runs once around."""
     import cv2
 
@@ -170,7 +170,7 @@ def _wallpaper(rng, height=640, width=4096):
     return out
 
 
-def _stone(rng, size=1024, tiles=14):
+def stone(rng, size=1024, tiles=14):
     """Checkered floor."""
     t = np.arange(size) * tiles // size
     vein = noise(rng, size, size, 24, 5)
@@ -184,9 +184,14 @@ def _room(rng):
     """Yield the arguments of `scenes.shape` for what stands around."""
     mesh = list(revolve(np.array([[1.9, 1.25], [1.9, -0.75]]), segments=128))
     mesh[2] = mesh[2] * (1, -1) + (0, 1)  # its profile runs downward because it is seen from inside
-    yield "wall", mesh, _MATTE, _wallpaper(rng)
+    yield "wall", mesh, _MATTE, wallpaper(rng)
     plane = np.stack(np.meshgrid((-1.95, 1.95), (-1.95, 1.95), -0.75), -1)[:, :, 0]
-    yield "floor", grid(plane), _MATTE, _stone(rng)
+    yield "floor", grid(plane), _MATTE, stone(rng)
+    yield from table(rng)
+
+
+def table(rng):
+    """Yield the arguments of `scenes.shape` for the round table."""
     profile = [(0.26, -0.76), (0.25, -0.74), (0.07, -0.6), (0.05, -0.3), (0.07, -0.1)]
     profile += [(0.12, -0.032), (0.6, -0.03), (0.612, -0.026), (0.618, -0.014), (0.612, -0.004)]
     profile = np.array([*profile, (0.6, 0), (0, 0)])
@@ -196,7 +201,7 @@ def _room(rng):
     yield "table", mesh, _SATIN, _wood(rng)
 
 
-def _objects(rng):
+def objects(rng):
     """Yield the arguments of `scenes.shape` for what stands on the table."""
     t = np.linspace(-0.5, 0.5, 90)
     x, y = np.meshgrid(t * 0.62, t * 0.5)
@@ -229,7 +234,7 @@ def _objects(rng):
 
 
 def _fruits(rng):
-    """Two apples, an orange, a pear and a lemon; yields as `_objects`."""
+    """Two apples, an orange, a pear and a lemon; yields as `objects`."""
     phi = np.linspace(-np.pi / 2, np.pi / 2, 60)
     r, h = np.cos(phi), np.sin(phi)
     top = np.exp(-((r / 0.3) ** 2)) * (h > 0)
@@ -268,7 +273,7 @@ def _fruits(rng):
 
 
 def _bouquet(rng, mouth):
-    """Stems, leaves and flowers that rise from the vase's mouth; yields as `_objects`."""
+    """Stems, leaves and flowers that rise from the vase's mouth; yields as `objects`."""
     stems, leaves = [], []
     angle = np.linspace(0, 2 * np.pi, 145)[None]
     out = np.linspace(0, 1, 16)[:, None]
@@ -310,7 +315,7 @@ def _scene(seed):
     mi = runtime.mitsuba()
     rng = np.random.default_rng(seed)
     scene = {"type": "scene"}
-    for part in (*_room(rng), *_objects(rng)):
+    for part in (*_room(rng), *objects(rng)):
         scene[part[0]] = scenes.shape(*part)
     # A warm lamp from the left and a cool skylight; a faint sky gives the rest of the open roof.
     # Their sampling weights follow their share of the light, which lowers the noise by a tenth.

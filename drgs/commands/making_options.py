@@ -64,16 +64,16 @@ class Demo(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene(Common):
-    """Make a data set by path tracing: a room or a kitchen in motion, with labels and a teacher, or a still life."""
+    """Make a data set by path tracing: a room or a kitchen in motion, a still life, or one as a phone captures it."""
 
-    name: Positional[Literal["room", "kitchen", "still_life"]]
-    """What to make. Room and kitchen have classes, points and a simulated teacher; in the kitchen, things move."""
+    name: Positional[Literal["room", "kitchen", "still_life", "capture"]]
+    """Room and kitchen have classes, points and a teacher, the kitchen moves; capture has what real captures have."""
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str | None = None
-    """WIDTHxHEIGHT of the images in pixels; default 320x240, of the kitchen 240x180 (even numbers)."""
+    """WIDTHxHEIGHT of the images in pixels; default 320x240, 240x180 of capture and kitchen (even numbers)."""
     views: int | None = None
-    """How many images; default 75 (room) or 32 (still_life)."""
+    """How many images; default 75 (room), 32 (still_life) or 28 (capture)."""
     cameras: int | None = None
     """How many cameras film (kitchen); default 15. cam00, in the middle of their arc, is the test view."""
     times: int | None = None
@@ -81,11 +81,21 @@ class Scene(Common):
     seed: int = 0
     """Of shapes, textures, motions, cameras, light paths and all errors that are made on purpose."""
     spp: int | None = None
-    """Light paths a pixel; default 25 (room), 16 (kitchen), 30 (still_life)."""
+    """Light paths a pixel; default 25 (room), 16 (kitchen), 30 (still_life), 25 (capture)."""
     teacher_size: str | None = None
     """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
     test_every: int | None = None
     """One in how many views is for testing (room); default 5, which is 15 of 75 views."""
+    exposure: Literal["auto", "fixed"] | None = None
+    """Gains of each photograph (capture): auto exposure and white balance that drifts (default), or one for all."""
+    wall: Literal["white", "paper"] | None = None
+    """Behind the table (capture): white without texture (default), or papered."""
+    shadow: bool = True
+    """The photographer's shadow in some photographs (capture), unless --no-shadow is given."""
+    passer_by: bool = True
+    """Somebody passes by in some photographs (capture), unless --no-passer-by is given."""
+    pose_error: str | None = None
+    """DEGREES,METERS by which poses of training views are stated wrong (capture); default 0.4,0.006; 0,0 for none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

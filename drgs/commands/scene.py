@@ -7,7 +7,7 @@ import json
 import shlex
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drgs.commands.overrides import parsed_size
 from drgs.display.progress import Bar
@@ -18,11 +18,16 @@ if TYPE_CHECKING:
 __all__ = ["maker_of", "run"]
 
 _ONLY = {  # options that not every scene has
-    "--views": ("room", "still_life"),
+    "--views": ("capture", "room", "still_life"),
     "--cameras": ("kitchen",),
     "--times": ("kitchen",),
     "--teacher-size": ("room", "kitchen"),
     "--test-every": ("room",),
+    "--exposure": ("capture",),
+    "--wall": ("capture",),
+    "--no-shadow": ("capture",),
+    "--no-passer-by": ("capture",),
+    "--pose-error": ("capture",),
 }
 
 
@@ -34,13 +39,24 @@ def run(args: Scene) -> None:
         "--times": args.times,
         "--teacher-size": args.teacher_size,
         "--test-every": args.test_every,
+        "--exposure": args.exposure,
+        "--wall": args.wall,
+        "--no-shadow": None if args.shadow else False,
+        "--no-passer-by": None if args.passer_by else False,
+        "--pose-error": args.pose_error,
     }
     for option, value in given.items():
         if value is not None and args.name not in _ONLY[option]:
             scenes = " and ".join(f"`drgs scene {name}`" for name in _ONLY[option])
             raise ValueError(f"{option}: is for {scenes}, not for {args.name}; leave it out")
-    names = ("views", "cameras", "times", "spp", "test_every")
-    numbers = {"seed": args.seed} | {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    names = ("views", "cameras", "times", "spp", "test_every", "exposure", "wall")
+    numbers: dict[str, Any] = {"seed": args.seed} | {
+        name: getattr(args, name) for name in names if getattr(args, name) is not None
+    }
+    if args.name == "capture":
+        numbers |= {"shadow": args.shadow, "passer_by": args.passer_by}
+    if args.pose_error is not None:
+        numbers["pose_error"] = _pose_error(args.pose_error)
     if args.size is not None:
         numbers |= _pair("--size", args.size, "width", "height")
     if args.teacher_size is not None:
@@ -67,10 +83,26 @@ def maker_of(name: str) -> ModuleType:
         ) from None
 
 
-def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, int]) -> None:
+def _pose_error(text: str) -> tuple[float, float]:
+    """Degrees and meters of --pose-error."""
+    try:
+        degrees, meters = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--pose-error: must be DEGREES,METERS, got {text!r}; write 0.4,0.006") from None
+    return degrees, meters
+
+
+def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, Any]) -> None:
     """What was made, and what to do next."""
     every = ""
-    if name != "still_life":
+    if name == "capture":
+        truth = json.loads((folder / "truth.json").read_text())
+        images = len(truth["log_gains"])
+        print(
+            f"{images} photographs, {len(truth['held_out'])} held out; {len(truth['shadow'])} with a shadow, "
+            f"{len(truth['passer_by'])} with a passer-by; the truth is in truth.json"
+        )
+    elif name != "still_life":
         right = json.loads((folder / "teacher.json").read_text())["pixel_accuracy"]
         if name == "room":
             held_out = f"{len((folder / 'test_views.txt').read_text().split())} test views"

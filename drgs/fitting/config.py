@@ -46,6 +46,7 @@ __all__ = [
     "SelectionConfig",
     "SemanticUse",
     "Start",
+    "TransientUse",
     "recorded_config",
 ]
 
@@ -56,6 +57,7 @@ PickPoints = Literal["auto", "uncovered", "none"]
 Restart = Literal["auto", "always", "never"]
 Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
+TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
 FeatureSize = Literal["image", "teacher"]
@@ -210,12 +212,15 @@ class LossConfig(Record):
         outside_weight: Weight of the opacity outside of a mask of kind object.
         opacity_weight: Weight of the mean opacity, which lets Gaussians that nobody needs fade (MCMC).
         scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
+        transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss if residuals
+            show clearly that there is such a thing (auto), wherever they may show it (mask), or never (keep).
     """
 
     ssim_weight: float = 0.2
     outside_weight: float = 1.0
     opacity_weight: float = 0.01
     scale_weight: float = 0.01
+    transients: TransientUse = "auto"
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:

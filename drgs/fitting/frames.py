@@ -38,6 +38,7 @@ class Frame:
         pixels: (H, W, 3) float32 in [0, 1], or uint8.
         mask: (H, W) float32 in [0, 1], or None.
         is_object: Whether nothing but background is outside the mask.
+        transient: (H, W) bool, what no other photograph shows, and the photometric term leaves out; None: nothing.
         teacher: Reads the (C, h, w) map of a teacher, which covers the view at a size of its own; None: there is none.
         labels: Reads the (H, W) int64 labels of the pixels, 0 for none; None: there are none.
     """
@@ -47,6 +48,7 @@ class Frame:
     pixels: torch.Tensor
     mask: torch.Tensor | None = None
     is_object: bool = False
+    transient: torch.Tensor | None = None
     teacher: _Map | None = None
     labels: _Labels | None = None
 

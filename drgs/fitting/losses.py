@@ -63,7 +63,10 @@ def terms_of(config: FitConfig, extent: float) -> list[LossTerm]:
 
 @dataclasses.dataclass(frozen=True)
 class Photometric:
-    """(1 - w) L1 + w (1 - SSIM), a mean over all pixels; both images are black outside the mask, if there is one."""
+    """(1 - w) L1 + w (1 - SSIM), a mean over all pixels; both images are black outside the mask, if there is one.
+
+    Where the photograph shows what no other does, both images are the rendering, without a gradient.
+    """
 
     ssim_weight: float
     name: ClassVar[str] = "photometric"
@@ -75,6 +78,11 @@ class Photometric:
         target = frame.target()
         if frame.mask is not None:
             rgb = rgb * frame.mask[..., None]
+        if frame.transient is not None:
+            here = frame.transient[..., None]
+            shown = rgb.detach()  # nothing is learned of these pixels; windows of SSIM at their border see no edge
+            rgb = torch.where(here, shown, rgb)
+            target = torch.where(here, shown, target)
         loss = (1 - self.ssim_weight) * (rgb - target).abs().mean()
         return loss + self.ssim_weight * (1 - padded_ssim(rgb, target)) if self.ssim_weight else loss
 

@@ -20,6 +20,7 @@ from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
+from drgs.fitting.transients import TENSOR as TRANSIENT
 from drgs.guards.json_files import check_json, parse_json, read_json
 from drgs.information.nuisances import NUISANCES, Nuisance
 
@@ -356,6 +357,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     kind = _HEADER | ({"active": _ACTIVE} if header.get("active") is not None else {})
     kind |= {"networks": [str]} if "networks" in header else {}
     kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
+    kind |= {"transients": bool} if "transients" in header else {}
     check_json(str(path), header, kind, advice)
     active = (header.get("active") or {}).get("config")  # of versions that wrote it there
     check_json(str(path), {"active": active}, {"active": (None, dict)}, advice)
@@ -406,6 +408,9 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     state = torch.Generator().get_state()
     generators = ("rng",) if header.get("active") is None else ("rng", "policy_rng")
     expected |= {name: (state.dtype, tuple(state.shape)) for name in generators}
+    for name in tensors:
+        if name.startswith(TRANSIENT):
+            expected[name] = torch.uint8, (length(name, 0), length(name, 1))
     return expected | {"queue": (torch.int64, (length("queue", 0),))}
 
 

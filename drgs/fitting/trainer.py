@@ -21,6 +21,7 @@ from drgs.fitting.parts import Parts, means_rate, parts_of
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
+from drgs.fitting.transients import Transients
 from drgs.integrator import render
 
 if TYPE_CHECKING:
@@ -32,7 +33,14 @@ if TYPE_CHECKING:
 __all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10
-_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}  # parts of names in a checkpoint, not of networks
+_RESERVED = {
+    "parameter",
+    "adam",
+    "rng",
+    "queue",
+    "policy_rng",
+    "transient",
+}  # parts of names in a checkpoint, not of networks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +73,7 @@ class Trainer:
         parts: Terms of the loss, learning rates, networks, and what is rendered.
         motion: The stages of a fit to what moves; None of what stands still.
         renderers: What each step is rendered with.
+        transients: What single photographs alone show; nothing is looked for in a fit of what moves.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
@@ -99,6 +108,7 @@ class Trainer:
         self.motion = motion
         self._check_parts()
         self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
+        self.transients = Transients("keep" if motion is not None else config.loss.transients)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -150,6 +160,8 @@ class Trainer:
         config, rows, done = self.config, self.rows, self.step_index
         events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
         events += self._prepare(done)
+        if self.transients.is_due(done, config.max_steps, len(self.frames)):
+            events.append(self.transients.look(self.frames, self.gaussians(), config.settings))
         frame = self.frames[self._next_view()]
         gaussians = self._fitted_scene().at(frame.camera.time)
         out = self._shown(gaussians, frame)
@@ -211,6 +223,8 @@ class Trainer:
         tensors = {**self.rows.state(), "rng": self._generator.get_state(), "queue": self._queue}
         for network in self.parts.networks:
             tensors |= network.state()
+        masks, found = self.transients.state(self.frames)
+        tensors |= masks
         header = {
             "step": self.step_index,
             "bad_steps": self.bad_steps,
@@ -220,6 +234,7 @@ class Trainer:
             "config": self.config.to_json(),
             **({"networks": [network.name for network in self.parts.networks]} if self.parts.networks else {}),
             **(self.motion.header() if self.motion is not None else {}),
+            **found,
         }
         return tensors, header
 
@@ -274,6 +289,7 @@ class Trainer:
             )
         for network in trainer.parts.networks:
             network.restore(tensors, where)
+        trainer.transients.restore(frames, tensors, header, where)
         trainer.step_index = header["step"]
         trainer.bad_steps = header["bad_steps"]
         trainer._start_count = header["start_count"]

@@ -1,0 +1,249 @@
+"""What was there for one photograph only, a shadow or a passer-by: found in residuals, and left out of the loss.
+
+A residual alone does not tell it from what is merely not fitted yet: on captures where nothing moves the largest
+residuals are as far above the others. But where several photographs see one place, what is not fitted yet leaves them
+the same residual, and what one of them shows alone leaves it to that one. So every photograph's residual is compared
+with the median of those of its neighbors, at the places where they see the same surface: the ray is followed to the
+distance that is rendered, and projected into them. Robust losses of radiance fields look at one photograph at a time
+[1, 2] and pay for it with details of clean captures. A mask is made anew at each look, so that nothing is left out for
+ever that the others come to agree with.
+
+Reference:
+    [1] Sabour et al., "RobustNeRF: Ignoring Distractors with Robust Losses", CVPR 2023.
+    [2] Sabour et al., "SpotLessSplats: Ignoring Distractors in 3D Gaussian Splatting", ACM TOG 2025.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
+
+from drgs.ellipsoids import colors_only
+from drgs.integrator import render
+from drgs.sizes import reduced_size
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.config import TransientUse
+    from drgs.fitting.frames import Frame
+    from drgs.settings import RenderSettings
+
+__all__ = ["TENSOR", "Transients", "line_of", "transient_masks"]
+
+TENSOR = "transient."
+"""What names of masks in a checkpoint begin with; the number of the photograph follows."""
+
+_LOOKS = (3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8)  # of the steps: before the first, everything counts
+_VISITS = 4  # steps that a photograph must have had in the mean; fewer leave residuals of what is not fitted yet
+_FEWEST = 4  # photographs: one, and three that it is compared with
+_PIXELS = 6_000  # of the pictures that are compared: 20,000 find the same in twice the time
+_BLUR = 0.02  # radius of the mean that is compared, in widths of the picture
+_NEIGHBORS = 8  # photographs that each one is compared with, the nearest
+_AGREEING = 3  # of them that must see the same place
+_SAME = 0.1  # relative difference of two distances to one surface
+_SOLID = 0.5  # opacity below which a ray ends in nothing
+_DARK = 0.05  # below it the ratio of two colors is noise
+_SPREADS = 2.0  # times the neighbors' own spread that a difference must exceed
+_CLEAR, _EDGE = 0.1, 0.05  # of the remaining difference: where a mask is begun, and how far it is grown
+_GROWTH = 0.08  # the farthest that it is grown, in widths of the picture
+_SHARE = 0.025  # of a photograph that clearly differs: what decides. Clean captures: at most 0.017
+_MASKED = 0.01  # the same, from which on a photograph has a mask once that is decided; less are specks
+_ABOVE = 4.0  # times the median over photographs, which wrong poses and mirrors raise in all of them
+
+
+class Transients:
+    """Which pixels of the photographs of a fit are left out of its photometric term.
+
+    Attributes:
+        found: Whether there is something to be left out; None until that has been looked at.
+    """
+
+    def __init__(self, use: TransientUse) -> None:
+        """As `LossConfig.transients` says."""
+        decided: dict[str, bool | None] = {"auto": None, "mask": True, "keep": False}
+        self.found = decided[use]
+
+    def is_due(self, done: int, max_steps: int, photographs: int) -> bool:
+        """Whether to look before step `done`."""
+        if self.found is False or photographs < _FEWEST or done < _VISITS * photographs:
+            return False
+        return done in {round(part * max_steps) for part in _LOOKS}
+
+    def look(self, frames: list[Frame], gaussians: Gaussians, settings: RenderSettings) -> dict:
+        """Decide, where that is open, whether there is something to be left out, and renew the masks of all frames.
+
+        Args:
+            frames: Photographs; their `transient` is set if there is something.
+            gaussians: What has been fitted to them so far.
+            settings: What it is rendered with.
+        Returns:
+            The evidence, for the log.
+        """
+        masks, shares = transient_masks(frames, gaussians, settings)
+        worst, median = max(shares), float(np.median(shares))
+        if self.found is None:
+            self.found = worst > max(_SHARE, _ABOVE * median)
+        if self.found:
+            for frame, mask in zip(frames, masks, strict=True):
+                frame.transient = mask if mask.any() else None
+        return {
+            "event": "transients",
+            "found": self.found,
+            "worst": worst,
+            "median": median,
+            "photographs": sum(share > _SHARE for share in shares),
+            "of": len(frames),
+            **self.summary(frames),
+        }
+
+    def summary(self, frames: list[Frame]) -> dict:
+        """How many photographs have a mask, and its mean share of all their pixels."""
+        masks = [frame.transient for frame in frames if frame.transient is not None]
+        total = sum(float(mask.float().mean()) for mask in masks)
+        return {"masked": len(masks), "share": total / len(frames)}
+
+    def state(self, frames: list[Frame]) -> tuple[dict[str, torch.Tensor], dict]:
+        """Tensors and header for a checkpoint."""
+        masks = {f"{TENSOR}{i}": x.transient.to(torch.uint8) for i, x in enumerate(frames) if x.transient is not None}
+        return masks, {} if self.found is None else {"transients": self.found}
+
+    def restore(self, frames: list[Frame], tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
+        """Continue from `state`; `where` names the checkpoint.
+
+        Raises:
+            ValueError: If a mask has not the size of its photograph.
+        """
+        self.found = header.get("transients", self.found)
+        for i, frame in enumerate(frames):
+            mask = tensors.get(f"{TENSOR}{i}")
+            size = tuple(frame.pixels.shape[:2])
+            if mask is not None and tuple(mask.shape) != size:
+                raise ValueError(
+                    f"{where}: {TENSOR}{i} must have the size {size} of its photograph, got {tuple(mask.shape)}; "
+                    "choose another run folder"
+                )
+            frame.transient = None if mask is None else mask.bool()
+
+
+def line_of(event: dict) -> str:
+    """What `Transients.look` has found, in one line."""
+    return (
+        f"{event['photographs']} of {event['of']} photographs show over {100 * _SHARE:g} % of what their neighbors do "
+        f"not, up to {100 * event['worst']:.1f} % (median {100 * event['median']:.1f} %): left out of the loss, "
+        f"{100 * event['share']:.1f} % of all pixels; --transients keep fits it"
+    )
+
+
+@dataclasses.dataclass
+class _Compared:
+    """A photograph beside its rendering, at the size at which photographs are compared.
+
+    Attributes:
+        camera: Pinhole of that size.
+        residual: (3, H, W) photograph without its gain, less rendering, blurred.
+        distance: (H, W) to what is rendered.
+        valid: (H, W) whether the ray ends on something, inside the mask.
+    """
+
+    camera: Camera
+    residual: torch.Tensor
+    distance: torch.Tensor
+    valid: torch.Tensor
+
+
+def transient_masks(
+    frames: list[Frame], gaussians: Gaussians, settings: RenderSettings
+) -> tuple[list[torch.Tensor], list[float]]:
+    """Where photographs differ from their neighbors.
+
+    Args:
+        frames: V photographs.
+        gaussians: What has been fitted to them so far.
+        settings: What it is rendered with.
+    Returns:
+        V masks (H, W), bool, and V shares of pixels that clearly differ, in [0, 1].
+    """
+    compared = [_compared(frame, gaussians, settings) for frame in frames]
+    centers = np.stack([x.camera.center for x in compared])
+    masks, shares = [], []
+    for i, frame in enumerate(frames):
+        order = np.argsort(np.linalg.norm(centers - centers[i], axis=1), kind="stable")
+        neighbors = [compared[j] for j in order if j != i][:_NEIGHBORS]
+        excess = _excess(compared[i], neighbors)
+        clear = excess > _CLEAR
+        shares.append(float(clear.float().mean()))
+        # One pixel more: the blur has drawn what is beside it into the difference at its border.
+        grown = _grown(clear, excess > _EDGE, 1) if shares[-1] > _MASKED else torch.zeros_like(clear)
+        height, width = frame.pixels.shape[:2]
+        masks.append(interpolate(grown.float()[None, None], (height, width), mode="nearest")[0, 0] > 0)
+    return masks, shares
+
+
+def _compared(frame: Frame, gaussians: Gaussians, settings: RenderSettings) -> _Compared:
+    """A photograph beside its rendering."""
+    width, height = reduced_size(frame.camera, _PIXELS)
+    camera = frame.camera.resized(width, height)
+    with torch.no_grad():  # looked at
+        out = render(colors_only(gaussians, camera.time), camera, settings, outputs=("depth",))
+    rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
+    image = _reduced(frame.image().permute(2, 0, 1), height, width)
+    valid = out.alpha.cpu() > _SOLID
+    if frame.mask is not None:
+        valid &= _reduced(frame.mask[None], height, width)[0] > 0.5
+    distance = out.depth.cpu()
+    if settings.planar and settings.depth_key == "z":
+        # Depths are along the axis of the camera, rays are followed along themselves.
+        distance = distance / torch.from_numpy(camera.pixel_directions() @ camera.c2w[:3, 2]).float()
+    # Exposure and white balance of a photograph are everywhere in it, and no object.
+    gains = []
+    for shown, fitted in zip(image, rgb, strict=True):
+        bright = valid & (fitted > _DARK) & (shown > _DARK)
+        gains.append((shown[bright] / fitted[bright]).median() if bright.any() else torch.ones(()))
+    difference = (image / torch.stack(gains)[:, None, None] - rgb) * valid
+    radius = max(1, round(_BLUR * width))
+    residual = avg_pool2d(pad(difference[None], (radius,) * 4, mode="replicate"), 2 * radius + 1, 1)[0]
+    return _Compared(camera, residual, distance, valid)
+
+
+def _excess(one: _Compared, neighbors: list[_Compared]) -> torch.Tensor:
+    """(H, W) by how much a residual differs from its neighbors' more than these from each other; 0 where few see it."""
+    points = one.camera.center + one.camera.pixel_directions() * one.distance.double().numpy()[..., None]
+    height, width = one.distance.shape
+    seen = []
+    for other in neighbors:
+        pixels, depth = other.camera.project(points.reshape(-1, 3))
+        size = np.array([other.camera.width, other.camera.height])
+        where = torch.from_numpy(2 * pixels / size - 1).float().reshape(height, width, 2)
+        distance = torch.from_numpy(np.linalg.norm(points - other.camera.center, axis=-1)).float()
+        front = torch.from_numpy(depth > 0).reshape(height, width)
+        maps = torch.cat([other.residual, other.distance[None], other.valid[None].float()])[None]
+        found = grid_sample(maps, where.nan_to_num(2.0)[None], align_corners=False)[0]
+        same = front & (where.abs() < 1).all(-1) & (found[4] > 0.5)
+        same &= (found[3] - distance).abs() < _SAME * distance
+        seen.append(torch.where(same, found[:3], torch.nan))
+    stack = torch.stack(seen)
+    median = stack.nanmedian(0).values
+    spread = (stack - median).abs().nanmedian(0).values.mean(0)
+    count = (~stack[:, 0].isnan()).sum(0)
+    # What the others' residual explains is no object of this one; nor is what this one's own rendering shows already.
+    difference = torch.minimum((one.residual - median).abs().mean(0), one.residual.abs().mean(0))
+    judged = one.valid & (count >= _AGREEING)
+    return torch.where(judged, difference - _SPREADS * spread, 0.0)
+
+
+def _grown(seeds: torch.Tensor, allowed: torch.Tensor, border: int) -> torch.Tensor:
+    """(H, W) bool seeds, what is allowed and connected with them, and a border of so many pixels around."""
+    grown = seeds.float()[None]
+    for _ in range(max(1, round(_GROWTH * seeds.shape[1]))):
+        grown = max_pool2d(grown, 3, 1, 1) * (allowed | seeds)
+    return max_pool2d(grown, 2 * border + 1, 1, border)[0] > 0
+
+
+def _reduced(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """(C, height, width) mean of areas of (C, H, W)."""
+    return interpolate(planes[None], (height, width), mode="area")[0]
