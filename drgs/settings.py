@@ -39,6 +39,55 @@ without loading Dr.Jit.
 # `Response.planar` of this package's own, for the same reason.
 _PLANAR = {"peak": False, "integral": False, "ewa": True}
 
+# Of each preset, what differs from the defaults of `RenderSettings`.
+_TABLE: dict[str, dict[str, Any]] = {
+    "exact": {"order": "ray"},
+    "fast": {"extent": 3.0, "transmittance_min": 0.01, "alpha_max": 0.9999},
+    "mitsuba": {
+        "order": "entry",
+        "traversal": "bvh",
+        "extent": 3.0,
+        "transmittance_min": 0.01,
+        "alpha_max": 0.9999,
+        "max_hits": 64,
+        "sh_direction": "ray",
+    },
+    "inria": {
+        "response": "ewa",
+        "depth_key": "z",
+        "alpha_min": 1 / 255,
+        "alpha_max": 0.99,
+        "alpha_max_gradient": "pass",
+        "transmittance_min": 1e-4,
+        "stop": "before",
+        "dilation": 0.3,
+        "near": 0.2,
+        "fov_clamp": "inria",
+        "culling": "inria",
+    },
+    "gsplat": {
+        "response": "ewa",
+        "depth_key": "z",
+        "alpha_min": 1 / 255,
+        "alpha_max": 0.999,
+        "transmittance_min": 1e-4,
+        "stop": "before_eq",
+        "dilation": 0.3,
+        "near": 0.01,
+        "fov_clamp": "gsplat",
+        "culling": "gsplat",
+    },
+    "3dgut": {
+        "depth_key": "z",
+        "extent": 3.33,
+        "alpha_min": 1 / 255,
+        "alpha_max": 0.999,
+        "transmittance_min": 1e-4,
+        "stop": "before_eq",
+        "near": 0.01,
+    },
+}
+
 _RANGES = {
     "extent": (0.0, 1e3),
     "alpha_min": (0.0, 1.0),
@@ -137,68 +186,21 @@ class RenderSettings:
         Raises:
             ValueError: If the name or a field is unknown.
         """
-        table: dict[str, dict[str, Any]] = {
-            "exact": {"order": "ray"},
-            "fast": {"extent": 3.0, "transmittance_min": 0.01, "alpha_max": 0.9999},
-            "mitsuba": {
-                "order": "entry",
-                "traversal": "bvh",
-                "extent": 3.0,
-                "transmittance_min": 0.01,
-                "alpha_max": 0.9999,
-                "max_hits": 64,
-                "sh_direction": "ray",
-            },
-            "inria": {
-                "response": "ewa",
-                "depth_key": "z",
-                "alpha_min": 1 / 255,
-                "alpha_max": 0.99,
-                "alpha_max_gradient": "pass",
-                "transmittance_min": 1e-4,
-                "stop": "before",
-                "dilation": 0.3,
-                "near": 0.2,
-                "fov_clamp": "inria",
-                "culling": "inria",
-            },
-            "gsplat": {
-                "response": "ewa",
-                "depth_key": "z",
-                "alpha_min": 1 / 255,
-                "alpha_max": 0.999,
-                "transmittance_min": 1e-4,
-                "stop": "before_eq",
-                "dilation": 0.3,
-                "near": 0.01,
-                "fov_clamp": "gsplat",
-                "culling": "gsplat",
-            },
-            "3dgut": {
-                "depth_key": "z",
-                "extent": 3.33,
-                "alpha_min": 1 / 255,
-                "alpha_max": 0.999,
-                "transmittance_min": 1e-4,
-                "stop": "before_eq",
-                "near": 0.01,
-            },
-        }
         must_be("RenderSettings.preset", "name", name, str, 'e.g. RenderSettings.preset("fast", extent=4.0)')
-        if name not in table:
+        if name not in _TABLE:
             raise ValueError(f"RenderSettings.preset: name must be one of {', '.join(PRESETS)}, got {name!r}")
         _refuse_unknown(overrides)
-        return cls(**{**table[name], **overrides})
+        return cls(**{**_TABLE[name], **overrides})
 
     def nearest_preset(self) -> tuple[str, dict[str, Any]]:
         """Name of the preset from which, whatever the background, the fewest fields differ, `fast` among equals, and
         these fields.
         """
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
         differences = {}
         for name in ("fast", *PRESETS):
-            preset = self.preset(name, background=self.background)
-            fields = [field.name for field in dataclasses.fields(self)]
-            differences[name] = {x: getattr(self, x) for x in fields if getattr(self, x) != getattr(preset, x)}
+            preset = {**defaults, **_TABLE[name], "background": self.background}
+            differences[name] = {x: getattr(self, x) for x in defaults if getattr(self, x) != preset[x]}
         return min(differences.items(), key=lambda found: len(found[1]))
 
     def replace(self, **fields: Any) -> RenderSettings:

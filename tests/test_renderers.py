@@ -243,9 +243,9 @@ def test_what_older_versions_measured_is_shown():
     """One renderer beside the run's own, without views."""
     viewers = {"preset": "gsplat", "psnr": 20.0, "own_psnr": 24.5, "split": "test", "views": ["a"]}
     title, head, rows = renderers_table({"viewers": viewers | {"width": 4, "height": 3}})
-    assert rows == [("the run's own", "24.50", "-", "-"), ("gsplat", "20.00", "-", "-")]
+    assert rows == [("the run's own", "24.50", "-", "-", "-"), ("gsplat", "20.00", "-", "-", "-")]
     assert "1 test views of 4x3" in title
-    assert len(head) == 4
+    assert len(head) == 5
     assert renderers_table({"viewers": None})[2] == renderers_table({"renderers": None})[2] == []
 
 

@@ -59,6 +59,7 @@ def photographs(person: bool = True) -> tuple[list[Frame], torch.Tensor]:
 def trainer_of(frames: list[Frame], **fields) -> Trainer:
     """A fit whose first Gaussians are gray and on the wall."""
     short = {"max_steps": 88, "max_gaussians": 400, "sh_degree": 0, "renderers": ("fast",), "dc_rate": 0.03}
+    short["transients"] = "auto"
     points = wall().means
     rows = GaussianRows.from_points(points, torch.full((len(points), 3), 0.5), 0.8)
     return Trainer(FitConfig.of(**short | fields), frames, rows, 3.0)
@@ -197,6 +198,7 @@ def test_a_run_says_what_was_left_out(tmp_path):
         "renderers": ("fast",),
         "dc_rate": 0.03,
         "test_every": 0,
+        "transients": "auto",
     }
     result = fit(data, tmp_path / "run", FitConfig.of(**fields, initial_opacity=0.8), progress=False)
     looks = [event for event in result.run.events() if event["event"] == "transients"]

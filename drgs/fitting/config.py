@@ -212,15 +212,15 @@ class LossConfig(Record):
         outside_weight: Weight of the opacity outside of a mask of kind object.
         opacity_weight: Weight of the mean opacity, which lets Gaussians that nobody needs fade (MCMC).
         scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
-        transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss if residuals
-            show clearly that there is such a thing (auto), wherever they may show it (mask), or never (keep).
+        transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss never (keep), if
+            residuals show clearly that there is such a thing (auto), or wherever they may show it (mask).
     """
 
     ssim_weight: float = 0.2
     outside_weight: float = 1.0
     opacity_weight: float = 0.01
     scale_weight: float = 0.01
-    transients: TransientUse = "auto"
+    transients: TransientUse = "keep"
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:

@@ -72,7 +72,7 @@ def named_renderers(names: Sequence[str], settings: RenderSettings) -> tuple[str
     """The names that a fit's `renderers` and settings mean: without `auto`, and of a single renderer the nearest
     preset's.
     """
-    if tuple(names) == AUTO and settings == RenderSettings.preset("fast", background=settings.background):
+    if tuple(names) == AUTO and settings.nearest_preset() == ("fast", {}):
         return ("any",)
     if tuple(names) == AUTO or _is_single(names):
         return (settings.nearest_preset()[0],)

@@ -195,6 +195,7 @@ def _compared(frame: Frame, gaussians: Gaussians, settings: RenderSettings) -> _
     valid = out.alpha.cpu() > _SOLID
     if frame.mask is not None:
         valid &= _reduced(frame.mask[None], height, width)[0] > 0.5
+    assert out.depth is not None  # asked for
     distance = out.depth.cpu()
     if settings.planar and settings.depth_key == "z":
         # Depths are along the axis of the camera, rays are followed along themselves.
