@@ -16,9 +16,10 @@ from test_network_information import dense as network_jacobian
 
 from drgs import cli, fisher, reference
 from drgs.data.camera_lists import save_cameras_json
-from drgs.files import load_state, save_ply
+from drgs.files import CONFIG_SCHEMA, Run, load_state, save_ply
 from drgs.fisher import Nuisances
-from drgs.fitting.config import SelectionConfig, selection_of_flat
+from drgs.fitting.config import FitConfig, SelectionConfig, selection_of_flat
+from drgs.fitting.records import fit_record
 from drgs.gain import block_gain
 from drgs.information.complement import Eliminated, left
 from drgs.information.scoring import Scoring
@@ -393,3 +394,16 @@ def test_fisherrf_has_none(rng):
         fisher.diagonal(g, cam, method="fisherrf", nuisances=Nuisances(eliminate=("pose",)))
     with pytest.raises(ValueError, match="eliminate must be none with method fisherrf, got pose"):
         Scoring(method="fisherrf", nuisances=Nuisances(eliminate=("pose",)))
+
+
+def test_runs_say_what_they_have_estimated(tmp_path):
+    """`estimated` of config.json is what `drgs select RUN` eliminates; older runs have none, other words fail."""
+    config = {"schema": CONFIG_SCHEMA, "command": "fit", "data": "x", "train": ["a"], "test": []}
+    config |= {"fit": FitConfig().to_json()}
+    for said, names in (({}, ()), ({"estimated": ["pose"]}, ("pose",))):
+        (tmp_path / "config.json").write_text(json.dumps(config | said))
+        record = fit_record(Run(tmp_path))
+        assert Scoring().over(record.estimated).nuisances.names == names
+    (tmp_path / "config.json").write_text(json.dumps(config | {"estimated": ["weather"]}))
+    with pytest.raises(ValueError, match="estimated must be among exposure, pose, got 'weather'"):
+        fit_record(Run(tmp_path))
