@@ -206,8 +206,8 @@ def _fit(
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     if exposure is not None:
         recorded["exposure"] = exposure.to_json(recorded["train"])
-    elif trainer.parts.exposure is not None and (run.path / "config.json").is_file():
-        recorded["exposure"] = run.config()["exposure"]
+    elif config.data.exposure != "off" and (run.path / "config.json").is_file():
+        recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
     if trainer.parts.exposure is not None:
         recorded["estimated"] = ["exposure"]
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
