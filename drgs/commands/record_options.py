@@ -19,47 +19,36 @@ OF_RECORD = "record"
 HIDDEN = "hidden"
 """Metadata of a field that no option sets, but a file of --config does."""
 
-# One text, `geometry,semantic`; what is none of the names is refused where the blocks are used.
-BLOCKS_TEXT: Any = PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="BLOCK,BLOCK",
-    instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
-    is_instance=lambda x: x is None or isinstance(x, tuple),
-    str_from_instance=lambda x: ["all there is" if x is None else ",".join(x)],
-)
-# One text, `cam00,cam05`; `none` is the empty tuple.
-CAMERAS_TEXT: Any = PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="CAMERA,CAMERA|none",
-    instance_from_str=lambda texts: () if texts[0] == "none" else tuple(name.strip() for name in texts[0].split(",")),
-    is_instance=lambda x: x is None or isinstance(x, tuple),
-    str_from_instance=lambda x: ["the first" if x is None else ",".join(x) or "none"],
-)
-# One text, `exposure,pose`; `none` is the empty tuple.
-NUISANCES_TEXT: Any = PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="UNKNOWN,UNKNOWN|none",
-    instance_from_str=lambda texts: () if texts[0] == "none" else tuple(name.strip() for name in texts[0].split(",")),
-    is_instance=lambda x: x is None or isinstance(x, tuple),
-    str_from_instance=lambda x: ["as the fit" if x is None else ",".join(x) or "none"],
-)
+
+def _names(metavar: str, unset: str = "", empty: str | None = None) -> Any:
+    """How an option takes several names, as one text with commas.
+
+    Args:
+        metavar: What help shows for it.
+        unset: What help shows where nothing is chosen; names are checked where they are used.
+        empty: Word for no name at all; None: there is none.
+    """
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda texts: (
+            () if texts[0] == empty else tuple(name.strip() for name in texts[0].split(","))
+        ),
+        is_instance=lambda x: x is None or isinstance(x, tuple),
+        str_from_instance=lambda x: [unset if x is None else ",".join(x) or empty or ""],
+    )
+
+
+BLOCKS_TEXT: Any = _names("BLOCK,BLOCK", unset="all there is")
+CAMERAS_TEXT: Any = _names("CAMERA,CAMERA|none", unset="the first", empty="none")
 CARRIED: Any = Suppress[Fixed[Any]]
 """Type of a field that no option sets."""
-
-# One text, `gsplat,fast`; what is none of the names is refused by the configuration of the fit.
-_RENDERERS_TEXT: Any = PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="any|drgs|viewers|PRESET,PRESET",
-    instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",")),
-    is_instance=lambda x: isinstance(x, tuple),
-    str_from_instance=lambda x: [",".join(x)],
-)
 
 _SPECS = {
     "blocks": BLOCKS_TEXT,
     "test_cameras": CAMERAS_TEXT,
-    "eliminate": NUISANCES_TEXT,
-    "renderers": _RENDERERS_TEXT,
+    "eliminate": _names("UNKNOWN,UNKNOWN|none", unset="as the fit", empty="none"),
+    "renderers": _names("any|drgs|viewers|PRESET,PRESET"),
 }
 _SPELLINGS = {"renderers": "for"}  # where an option has another name than its field
 # Help shows the names; a function of one's own has another.
