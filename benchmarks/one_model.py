@@ -55,7 +55,7 @@ def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> di
         config = config.replace(settings=RenderSettings.preset(trained))
     train, test = dataset.split(config.data.test_every, offset)
     frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))
-    trainer, _ = start(dataset, train, frames, config, None, None, False, 0)
+    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
     schedule = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
     took: dict[RenderSettings, list[float]] = {}
     while trainer.step_index < config.max_steps:
