@@ -173,7 +173,7 @@ class RenderSettings:
         """Settings of a named system.
 
         `exact` is the claim of this package: within 1e-5 of the float64 oracle. `fast` has the cut-offs of Mitsuba's
-        `volprim_rf_basic` and is the default for training; `mitsuba` is that integrator's model: its acceleration
+        `volprim_rf_basic` and draws the previews of fits; `mitsuba` is that integrator's model: its acceleration
         structure, order of entry points, SH along each ray, 64 hits a ray, without the hits that it loses. `inria` and
         `gsplat` are those rasterizers' models. `3dgut` is what gsplat composites with `with_ut` and `with_eval3d`: the
         peak on each ray, with the rasterizer's cut-offs. It does not model 3DGUT's projection: neither the unscented
