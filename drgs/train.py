@@ -59,6 +59,7 @@ from drgs.machine import peak_memory
 if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
+    from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
     from drgs.information.pool import Workers
 
@@ -170,11 +171,7 @@ def _fit(
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
-    if config.data.exposure != "off" and (selection or motion):
-        raise NotImplementedError(
-            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
-            "leave --exposure out"
-        )
+    _check_photographs(config, motion is not None)
     plan = ActiveViews(train, config, motion is not None, workers) if selection else None
     if selection and selection.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
@@ -204,12 +201,7 @@ def _fit(
         trainer, source, exposure = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
-    if exposure is not None:
-        recorded["exposure"] = exposure.to_json(recorded["train"])
-    elif config.data.exposure != "off" and (run.path / "config.json").is_file():
-        recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
-    if trainer.parts.exposure is not None:
-        recorded["estimated"] = ["exposure"]
+    recorded |= _exposure_record(run, trainer, exposure)
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -260,6 +252,43 @@ def _fit(
     told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **told)
     return FitResult(g, written, run, loop.seconds)
+
+
+def _check_photographs(config: FitConfig, moves: bool) -> None:
+    """Refuse what is modeled of single photographs where that is not built.
+
+    Raises:
+        NotImplementedError: With exposure where views are chosen on the way or things move, and with transients where
+            things move: these are found by what neighbors show of the same surface at rest.
+    """
+    if config.data.exposure != "off" and (config.selection or moves):
+        raise NotImplementedError(
+            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
+            "leave --exposure out"
+        )
+    if config.loss.transients != "keep" and moves:
+        raise NotImplementedError(
+            f"fit: transients must be keep where things move, got {config.loss.transients}; leave --transients out, or "
+            "fit to what stands still (--dynamics ignore)"
+        )
+
+
+def _exposure_record(run: Run, trainer: Trainer, found: ExposureEstimate | None) -> dict[str, Any]:
+    """What config.json is to say of exposure.
+
+    Args:
+        run: The run folder; a fit that goes on keeps what was found at its start.
+        trainer: The fit.
+        found: What points said of it just now; None if they were not asked.
+    """
+    recorded: dict[str, Any] = {}
+    if found is not None:
+        recorded["exposure"] = found.to_json([frame.name for frame in trainer.frames])
+    elif trainer.config.data.exposure != "off" and (run.path / "config.json").is_file():
+        recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
+    if trainer.parts.exposure is not None:
+        recorded["estimated"] = ["exposure"]
+    return recorded
 
 
 def _checkpoint(

@@ -33,14 +33,8 @@ if TYPE_CHECKING:
 __all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10
-_RESERVED = {
-    "parameter",
-    "adam",
-    "rng",
-    "queue",
-    "policy_rng",
-    "transient",
-}  # parts of names in a checkpoint, not of networks
+# Parts of names in a checkpoint, not of networks.
+_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng", "transient"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +67,7 @@ class Trainer:
         parts: Terms of the loss, learning rates, networks, and what is rendered.
         motion: The stages of a fit to what moves; None of what stands still.
         renderers: What each step is rendered with.
-        transients: What single photographs alone show; nothing is looked for in a fit of what moves.
+        transients: What single photographs alone show.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
@@ -108,7 +102,7 @@ class Trainer:
         self.motion = motion
         self._check_parts()
         self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
-        self.transients = Transients("keep" if motion is not None else config.loss.transients)
+        self.transients = Transients(config.loss.transients)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
         self._generator = torch.Generator().manual_seed(config.seed)

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
 
+from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.integrator import render
 from drgs.sizes import reduced_size
@@ -39,7 +40,7 @@ TENSOR = "transient."
 """What names of masks in a checkpoint begin with; the number of the photograph follows."""
 
 _LOOKS = (3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8)  # of the steps: before the first, everything counts
-_VISITS = 4  # steps that a photograph must have had in the mean; fewer leave residuals of what is not fitted yet
+_VISITS = 4  # steps that a photograph must have had on average; fewer leave residuals of what is not fitted yet
 _FEWEST = 4  # photographs: one, and three that it is compared with
 _PIXELS = 6_000  # of the pictures that are compared: 20,000 find the same in twice the time
 _BLUR = 0.02  # radius of the mean that is compared, in widths of the picture
@@ -168,19 +169,24 @@ def transient_masks(
     Returns:
         V masks (H, W), bool, and V shares of pixels that clearly differ, in [0, 1].
     """
-    compared = [_compared(frame, gaussians, settings) for frame in frames]
-    centers = np.stack([x.camera.center for x in compared])
     masks, shares = [], []
-    for i, frame in enumerate(frames):
-        order = np.argsort(np.linalg.norm(centers - centers[i], axis=1), kind="stable")
-        neighbors = [compared[j] for j in order if j != i][:_NEIGHBORS]
-        excess = _excess(compared[i], neighbors)
-        clear = excess > _CLEAR
-        shares.append(float(clear.float().mean()))
-        # One pixel more: the blur has drawn what is beside it into the difference at its border.
-        grown = _grown(clear, excess > _EDGE, 1) if shares[-1] > _MASKED else torch.zeros_like(clear)
-        height, width = frame.pixels.shape[:2]
-        masks.append(interpolate(grown.float()[None, None], (height, width), mode="nearest")[0, 0] > 0)
+    with Bar("comparing photographs", 2 * len(frames)) as bar:
+        compared = []
+        for frame in frames:
+            compared.append(_compared(frame, gaussians, settings))
+            bar.advance()
+        centers = np.stack([x.camera.center for x in compared])
+        for i, frame in enumerate(frames):
+            order = np.argsort(np.linalg.norm(centers - centers[i], axis=1), kind="stable")
+            neighbors = [compared[j] for j in order if j != i][:_NEIGHBORS]
+            excess = _excess(compared[i], neighbors)
+            clear = excess > _CLEAR
+            shares.append(float(clear.float().mean()))
+            # One pixel more: the blur has drawn what is beside it into the difference at its border.
+            grown = _grown(clear, excess > _EDGE, 1) if shares[-1] > _MASKED else torch.zeros_like(clear)
+            height, width = frame.pixels.shape[:2]
+            masks.append(interpolate(grown.float()[None, None], (height, width), mode="nearest")[0, 0] > 0)
+            bar.advance()
     return masks, shares
 
 
