@@ -7,6 +7,8 @@ import re
 from doc_pages import ROOT
 
 PAGE = (ROOT / "docs" / "run-files.md").read_text(encoding="utf-8")
+OF_CAPTURE = ("exposure", "wall", "shadow", "passer_by", "pose_error")
+"""Fields of params.json that only `drgs scene capture` writes."""
 _ELSEWHERE = ("settings", "camera", "env")
 """Fields whose content is told elsewhere: of `RenderSettings`, of selection.json, of env.json."""
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from json_page import check
 
 import drgs
 from drgs import cli
@@ -39,6 +40,13 @@ def calm(stage, tmp_path_factory):
 
 def truth_of(folder):
     return json.loads((folder / "truth.json").read_text())
+
+
+def test_files_are_what_the_page_says(made):
+    """params.json and truth.json have the fields of docs/run-files.md, and no others."""
+    others = ("cameras", "times", "test_every", "depth_unit", "teacher_width", "teacher_height")
+    check("params.json", json.loads((made / "params.json").read_text()), absent=others)
+    check("truth.json", truth_of(made), maps=("log_gains", "shadow", "passer_by", "camera_to_world"))
 
 
 def picture(path):

@@ -8,7 +8,7 @@ import json
 
 import numpy as np
 import pytest
-from json_page import check
+from json_page import OF_CAPTURE, check
 
 from drgs import cli, scenes
 from drgs.scenes import kitchen, moving, tabletop, teacher, videos
@@ -97,7 +97,8 @@ def test_files(made):
         "params.json", "poses_bounds.npy", "rgb_feature_langseg", "semantic_class", "teacher.json",
         "text_embeddings.npy",
     }  # fmt: skip
-    check("params.json", json.loads((made / "params.json").read_text()), absent=("depth_unit", "test_every", "views"))
+    absent = ("depth_unit", "test_every", "views", *OF_CAPTURE)
+    check("params.json", json.loads((made / "params.json").read_text()), absent=absent)
     assert not [path for path in made.rglob("*") if ".part" in path.name]
     maps = sorted(path.name for path in (made / "rgb_feature_langseg").iterdir())
     assert maps == [f"cam{c:02d}_{k:04d}_fmap_CxHxW.pt" for c in range(CAMERAS) for k in range(TIMES)]
@@ -327,7 +328,10 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
         (["--times", "0"], "times must be an integer from 1"),
         (["--seed", "-1"], "--seed must be in [0, 2147483647]"),
         (["--teacher-size", "0x1"], "teacher_width must be an integer from 1"),
-        (["--views", "3"], "--views: is for `drgs scene room` and `drgs scene still_life`, not for kitchen"),
+        (
+            ["--views", "3"],
+            "--views: is for `drgs scene capture` and `drgs scene room` and `drgs scene still_life`, not for kitchen",
+        ),
         (["--test-every", "3"], "--test-every: is for `drgs scene room`, not for kitchen"),
     ],
 )

@@ -68,6 +68,7 @@ class Transients:
         """As `LossConfig.transients` says."""
         decided: dict[str, bool | None] = {"auto": None, "mask": True, "keep": False}
         self.found = decided[use]
+        self._is_asked = use != "keep"
 
     def is_due(self, done: int, max_steps: int, photographs: int) -> bool:
         """Whether to look before step `done`."""
@@ -111,7 +112,7 @@ class Transients:
     def state(self, frames: list[Frame]) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header for a checkpoint."""
         masks = {f"{TENSOR}{i}": x.transient.to(torch.uint8) for i, x in enumerate(frames) if x.transient is not None}
-        return masks, {} if self.found is None else {"transients": self.found}
+        return masks, {"transients": self.found} if self._is_asked and self.found is not None else {}
 
     def restore(self, frames: list[Frame], tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
         """Continue from `state`; `where` names the checkpoint.
