@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from drgs.display.pictures import file_names
@@ -10,9 +11,10 @@ from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
 from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
+from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
-    from drgs.data import Dataset
+    from drgs.data import Dataset, View
     from drgs.deform import DynamicGaussians
     from drgs.files import Run
     from drgs.fitting.frames import Frame
@@ -30,6 +32,7 @@ def evaluate_run(
     lpips: Lpips | None = None,
     strict: bool = False,
     renderer: str | None = None,
+    scale: float = 1.0,
 ) -> dict[str, Any]:
     """Measure a run and write its metrics.json and the pictures of its views.
 
@@ -41,10 +44,12 @@ def evaluate_run(
         strict: Refuse a data set some of whose images are missing.
         renderer: Preset to measure with beside the run's own settings, or `all`; None: those that it was fitted for,
             and what viewers draw with.
+        scale: Width and height of what is measured, in those of the fit's images; up to the photographs' own.
     Returns:
         What metrics.json holds.
     Raises:
-        ValueError: If there is no such view, or the run or its data set is damaged.
+        ValueError: If there is no such view, a photograph is not as large as `scale` asks for, or the run or its data
+            set is damaged.
     """
     recorded = fit_record(run)
     loaded = load_run(run)
@@ -67,7 +72,7 @@ def evaluate_run(
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
-    frames = load_frames(views, config.data.max_pixels, config.data.mask)
+    frames = load_frames(views, _most_pixels(views, config.data.max_pixels, scale), config.data.mask)
     names = file_names([frame.name for frame in frames])
     kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
     claimed.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
@@ -92,9 +97,30 @@ def evaluate_run(
         gaussians=len(g),
         **{name: getattr(loaded, name) for name in ("step", "seconds", "bad_steps")},
         renderers=renderers,
+        **({} if scale == 1 else {"scale": scale}),
         **chosen,
         **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
     )
+
+
+def _most_pixels(views: list[View], max_pixels: int, scale: float) -> int:
+    """Pixels of a photograph, at most, where each is measured at `scale` times the width and height of the fit's.
+
+    Raises:
+        ValueError: If `scale` is below 1, or a photograph has fewer.
+    """
+    if not 1 <= scale < math.inf:
+        raise ValueError(f"eval: scale must be at least 1, got {scale}; say 2 for twice the width and height")
+    for view in views if scale > 1 else ():
+        camera = view.checked().camera
+        width, height = reduced_size(camera, max_pixels)
+        if scale * width > camera.width or scale * height > camera.height:
+            most = min(camera.width / width, camera.height / height)
+            raise ValueError(
+                f"eval: scale must be at most {most:.3g}, since photograph {view.name} has {camera.width}x"
+                f"{camera.height} pixels, got {scale:g}; lower it, or fit with fewer --max-pixels"
+            )
+    return round(max_pixels * scale**2)
 
 
 def _segmentation(loaded: LoadedRun, dataset: Dataset, frames: list[Frame]) -> Segmentation | str | None:

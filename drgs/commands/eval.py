@@ -23,7 +23,7 @@ def run(args: Eval) -> None:
     recorded = fit_record(run)
     recorded.check_data(run.path)
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
-    written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict, args.preset)
+    written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict, args.preset, args.scale)
     if not args.quiet:
         print_table(written, lpips=lpips is not None)
 
@@ -37,9 +37,11 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
     """
     digits = {"psnr": ".2f", "cc_psnr": ".2f", "psnr_moving": ".2f"}
     names = [name for name in (*METRICS, *MOVING) if metrics["mean"].get(name) is not None]
+    scale = metrics.get("scale")
     rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
     tables.show(
-        f"{metrics['count']} {metrics['split']} views",
+        f"{metrics['count']} {metrics['split']} views"
+        + (f", {scale:g} times as wide and high as fitted" if scale else ""),
         ("view", *names),
         [(row["name"], *(_shown(row[name], digits.get(name, ".4f")) for name in names)) for row in rows],
     )

@@ -319,6 +319,8 @@ class Eval(Common, Data):
     """Which views."""
     preset: Literal["all", Preset] | None = None
     """Renderers to measure with, beside the run's own settings; default those that it was fitted for, and gsplat."""
+    scale: float = 1.0
+    """Measure pictures this many times as wide and high as those of the fit, up to the photographs' own size."""
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
 

@@ -33,6 +33,7 @@ __all__ = [
     "FeatureConfig",
     "FeatureSize",
     "FieldPreset",
+    "Filter3DUse",
     "FitConfig",
     "InitPoints",
     "LossConfig",
@@ -51,6 +52,7 @@ __all__ = [
 ]
 
 InitPoints = Literal["auto", "views", "all"]
+Filter3DUse = Literal["off", "on"]
 ExposureUse = Literal["off", "auto", "points", "learned"]
 MaskUse = Literal["auto", "object", "valid", "ignore"]
 PickPoints = Literal["auto", "uncovered", "none"]
@@ -449,6 +451,8 @@ class FitConfig(Record):
         settings: What `drgs.render` computes.
         renderers: Renderers that the fit must look right in, taken in turn: any (exact, fast, inria, gsplat, 3dgut),
             drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone where it is given.
+        filter_3d: Render, and save, no Gaussian narrower than the photographs sample it (on), for pictures larger than
+            those of the fit; the 3D smoothing filter of Mip-Splatting.
         max_steps: Optimizer steps.
         seed: Seed of everything random.
         sh_degree: Highest degree of the view-dependent color.
@@ -468,6 +472,7 @@ class FitConfig(Record):
 
     settings: RenderSettings = _FAST
     renderers: tuple[str, ...] = AUTO
+    filter_3d: Filter3DUse = "off"
     max_steps: int = 3000
     seed: int = 0
     sh_degree: Degree = 3

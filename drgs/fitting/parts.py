@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
+from drgs.fitting.filter_3d import Filter3D
 from drgs.fitting.losses import LossTerm, terms_of
 from drgs.fitting.networks import Network, Rate
 from drgs.fitting.rows import GaussianRows
@@ -32,6 +33,7 @@ class Parts:
         shows_features: Whether the features, if there are any, are rendered with the colors of a photograph; default
             always. Terms get the Gaussians with their features either way.
         couple_features: Whether gradients of the features that are rendered reach the geometry.
+        filter_3d: The low-pass filter that is in `scene` already; None: there is none.
         exposure: What a photograph shows of a rendering, before terms of the loss see it; None: the rendering.
     """
 
@@ -41,6 +43,7 @@ class Parts:
     scene: Callable[[GaussianRows], Scene] = GaussianRows.gaussians
     shows_features: Callable[[Frame], bool] | None = None
     couple_features: bool = True
+    filter_3d: Filter3D | None = None
     exposure: Callable[[Output, Frame], Output] | None = None
 
 
@@ -61,6 +64,9 @@ def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> P
         "sh_rest": config.rates.rest_rate,
     }
     parts = Parts(terms_of(config, extent), rates)
+    if config.filter_3d == "on":
+        filter_3d = Filter3D()
+        parts = dataclasses.replace(parts, scene=lambda rows: filter_3d(rows.gaussians()), filter_3d=filter_3d)
     if channels is None:
         return parts
     from drgs.fitting.semantics import features_of

@@ -17,6 +17,8 @@ import torch
 
 from drgs.files import CONFIG_SCHEMA, Run, load_ply, load_state
 from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.filter_3d import TENSOR as FILTER_3D
+from drgs.fitting.filter_3d import filtered
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
@@ -159,6 +161,8 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
         gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # to be looked at, not to be fitted
+        if FILTER_3D in tensors:
+            gaussians = filtered(gaussians, tensors[FILTER_3D])
         gaussians.validate(str(run.state))
         networks = saved_networks(tensors, header)
         if known is not None:
@@ -408,6 +412,8 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     state = torch.Generator().get_state()
     generators = ("rng",) if header.get("active") is None else ("rng", "policy_rng")
     expected |= {name: (state.dtype, tuple(state.shape)) for name in generators}
+    if FILTER_3D in tensors or header["config"].get("filter_3d") == "on":
+        expected[FILTER_3D] = torch.float32, (count,)
     for name in tensors:
         if name.startswith(TRANSIENT):
             expected[name] = torch.uint8, (length(name, 0), length(name, 1))

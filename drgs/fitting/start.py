@@ -37,9 +37,15 @@ def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion 
         test: Held-out views, whose times the field covers, too.
     Raises:
         ValueError: If some views have a time and others do not.
+        NotImplementedError: With a 3D filter, whose rates are those of what stands still.
     """
     if config.motion.dynamics == "ignore" or not times_of(train):
         return None
+    if config.filter_3d == "on":
+        raise NotImplementedError(
+            "fit: filter_3d must be off where things move, got on; leave --filter-3d out, or fit to what stands still "
+            "(--dynamics ignore)"
+        )
     from drgs.fitting.dynamics import Motion
 
     return Motion(config, times_of([*train, *test]))

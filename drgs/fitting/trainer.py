@@ -15,6 +15,7 @@ import torch
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.density import add_gaussians, explore, relocate
+from drgs.fitting.filter_3d import TENSOR as FILTER_3D
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
@@ -34,7 +35,7 @@ __all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10
 # Parts of names in a checkpoint, not of networks.
-_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng", "transient"}
+_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng", "transient", FILTER_3D}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,6 +110,7 @@ class Trainer:
         self._queue = torch.zeros(0, dtype=torch.int64)
         self._start_count = len(rows)
         self.reserved = 0
+        self._sample()
 
     def _check_parts(self) -> None:
         """Raise ValueError if a tensor has no rate, or two networks have one name."""
@@ -129,6 +131,7 @@ class Trainer:
         if self.motion is not None:
             new |= self.motion.new_gates(len(points), self.rows)
         self.rows.append(new)
+        self._sample()
 
     def restart(self, points: torch.Tensor, colors: torch.Tensor) -> None:
         """Begin again with Gaussians at other points; schedules, networks and photographs stay as they are."""
@@ -139,11 +142,13 @@ class Trainer:
         while self.rows.sh_degree < degree:
             self.rows.raise_sh_degree()
         self._start_count = len(self.rows)
+        self._sample()
 
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
         self.frames = [*self.frames, frame]
         self._queue = self._queue[:0]
+        self._sample()
 
     def step(self) -> StepResult:
         """One view, one optimizer step, and what is due at it.
@@ -204,8 +209,11 @@ class Trainer:
         return not self._bad_in_a_row
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians of the rows as they are, without a graph: those of a scene that moves are at rest."""
-        return self.rows.gaussians().detach()
+        """The Gaussians that the rows are shown as, without a graph: those of a scene that moves are at rest."""
+        gaussians = self.rows.gaussians()
+        if self.parts.filter_3d is not None:
+            gaussians = self.parts.filter_3d(gaussians)
+        return gaussians.detach()
 
     def scene(self) -> Scene:
         """What a step renders, to be looked at: `gaussians`, or the scene that the parts make of the rows."""
@@ -217,6 +225,8 @@ class Trainer:
         tensors = {**self.rows.state(), "rng": self._generator.get_state(), "queue": self._queue}
         for network in self.parts.networks:
             tensors |= network.state()
+        if self.parts.filter_3d is not None:
+            tensors[FILTER_3D] = self.parts.filter_3d.variances
         masks, found = self.transients.state(self.frames)
         tensors |= masks
         header = {
@@ -283,6 +293,8 @@ class Trainer:
             )
         for network in trainer.parts.networks:
             network.restore(tensors, where)
+        if parts.filter_3d is not None:
+            parts.filter_3d.variances = tensors[FILTER_3D]
         trainer.transients.restore(frames, tensors, header, where)
         trainer.step_index = header["step"]
         trainer.bad_steps = header["bad_steps"]
@@ -330,7 +342,13 @@ class Trainer:
         wanted = round(self._start_count * (budget / self._start_count) ** part) if self._start_count < budget else 0
         missing = min(wanted, budget) - len(rows)
         added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self._generator)
+        self._sample()
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
+
+    def _sample(self) -> None:
+        """How finely the photographs sample the Gaussians, after one or the other has changed."""
+        if self.parts.filter_3d is not None:
+            self.parts.filter_3d.sample(self.rows.tensors["means"], [frame.camera for frame in self.frames])
 
     def _stage(self) -> Stage:
         """The steps that density control runs over now."""

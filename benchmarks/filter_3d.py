@@ -1,0 +1,128 @@
+"""Pictures larger than those of a fit: with the 3D filter and without, by renderer and size.
+
+    python benchmarks/filter_3d.py [--scenes head ...] [--trained any gsplat] [--seeds 1]
+
+Appends one row a fit to benchmarks/filter_3d.jsonl as it ends, leaves out what is there, then prints the table. The
+same held-out photographs are rendered at one, two and four times the width and height at which the others were fitted.
+Scenes are captures by name. One thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from where import DATA, ran  # noqa: E402
+
+from drgs.data import load  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.renderers import own_preset  # noqa: E402
+from drgs.fitting.start import start  # noqa: E402
+from drgs.metrics import through_renderers  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "filter_3d.jsonl"
+SCENES = ("banana", "fern", "statue", "head", "lego")
+PIXELS = {"lego": 10_000}  # whose photographs have 400x400; of others 12,000
+SIZE = {"max_steps": 400, "max_gaussians": 8_000}
+SCALES = (1, 2, 4)
+SEEN = ("exact", "fast", "gsplat", "3dgut")
+MOST = 6  # held-out views, evenly spaced
+KEY = ("scene", "trained", "filter", "seed", "max_pixels")
+
+
+def rows() -> list[dict]:
+    """What has been measured so far."""
+    return [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
+
+
+def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
+    """One fit, and its held-out views in each renderer at each size."""
+    dataset = load(DATA / scene)
+    pixels = PIXELS.get(scene, 12_000)
+    config = FitConfig.of(
+        settings=RenderSettings.preset(own_preset((trained,))),
+        renderers=(trained,),
+        filter_3d=filter_3d,
+        seed=seed,
+        max_pixels=pixels,
+        **SIZE,
+    )
+    train, test = dataset.split(config.data.test_every)
+    trainer, *_ = start(dataset, train, load_frames(train, pixels), config, None, None, False, 0)
+    began = time.perf_counter()
+    while trainer.step_index < config.max_steps:
+        trainer.step()
+    seconds = time.perf_counter() - began
+    renderers = {name: RenderSettings.preset(name) for name in SEEN}
+    psnr = {}
+    for scale in SCALES:
+        frames = load_frames(test, pixels * scale**2)
+        found = through_renderers(trainer.gaussians(), frames, renderers, "test", MOST)
+        assert found is not None
+        psnr[scale] = {row["name"]: [view["psnr"] for view in row["views"]] for row in found["rows"]}
+    return {
+        **dict(zip(KEY, (scene, trained, filter_3d, seed, pixels), strict=True)),
+        "psnr": psnr,
+        "seconds": seconds,
+        **ran(),
+    }
+
+
+def table(found: list[dict]) -> str:
+    """Mean held-out PSNR without the filter, and what the filter adds, by scene, renderer and size; mean over seeds."""
+    heads = [f"{name} {scale}x" for name in SEEN for scale in SCALES]
+    lines = ["| capture | fitted for | filter | " + " | ".join(heads) + " |", "|---" * (3 + len(heads)) + "|"]
+    for scene, trained in dict.fromkeys((row["scene"], row["trained"]) for row in found):
+        means = {}
+        for use in ("off", "on"):
+            mine = [row for row in found if (row["scene"], row["trained"], row["filter"]) == (scene, trained, use)]
+            for scale in SCALES if mine else ():
+                for name in SEEN:
+                    values = [statistics.mean(row["psnr"][str(scale)][name]) for row in mine]
+                    means[use, name, scale] = statistics.mean(values)
+        for use in ("off", "on"):
+            cells = []
+            for name in SEEN:
+                for scale in SCALES:
+                    value = means.get((use, name, scale))
+                    base = means.get(("off", name, scale), 0.0) if use == "on" else 0.0
+                    cells.append("-" if value is None else f"{value - base:{'+' if use == 'on' else ''}.2f}")
+            lines.append(f"| {scene} | {trained} | {use} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
+    parser.add_argument("--trained", nargs="+", default=["any", "gsplat"], help="as `drgs fit --for` takes them")
+    parser.add_argument("--seeds", type=int, default=1)
+    args = parser.parse_args()
+    done = {tuple(row[name] for name in KEY) for row in rows()}
+    for scene in args.scenes:
+        for trained in args.trained:
+            for seed in range(args.seeds):
+                for use in ("off", "on"):
+                    if (scene, trained, use, seed, PIXELS.get(scene, 12_000)) not in done:
+                        row = measured(scene, trained, use, seed)
+                        with ROWS.open("a") as file:
+                            file.write(json.dumps(row) + "\n")
+                        print(scene, trained, use, seed, f"{row['seconds']:.0f} s", flush=True)
+    print(table(rows()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""A low-pass filter of the Gaussians themselves: none is smaller than what the photographs could have shown of it.
+
+Photographs sample the scene. Of detail that is finer than their pixels they tell nothing, and what is fitted there
+shows as needles, or as holes between Gaussians, in pictures that sample it more finely: in larger ones, and nearer by.
+So each Gaussian of covariance S and opacity o is rendered as its convolution with an isotropic one, as wide as the
+pixels of the photograph that samples it most finely [1, eq. 7 to 9]:
+
+    S' = S + s / nu^2 I,   o' = o sqrt(|S| / |S'|),   nu = max over the cameras that see its mean of f / z.
+
+What is fitted are S and o; whatever a fit shows, saves and measures are S' and o', so that viewers know of no filter.
+The 2D filter of [1] is not here: what is rendered on the screen is the renderer's business.
+
+Reference:
+    [1] Yu et al., "Mip-Splatting: Alias-free 3D Gaussian Splatting", CVPR 2024, and its code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["TENSOR", "Filter3D", "filtered", "sampling_rates"]
+
+TENSOR = "filter_3d"
+"""Name of the filter's variances in a checkpoint, one a Gaussian."""
+
+_STRENGTH = 0.2  # s of [1]: the variance in squared intervals between samples
+_MARGIN = 0.15  # of an image's sides, beyond which a mean is not seen [1, code]: its Gaussian may reach in
+
+
+class Filter3D(torch.nn.Module):
+    """What makes the Gaussians that are shown of those that are fitted.
+
+    Attributes:
+        variances: (N,) float32 s / nu^2, in squared world units; before the first `sample` there is none.
+    """
+
+    variances: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("variances", torch.zeros(0))
+
+    def sample(self, means: torch.Tensor, cameras: Sequence[Camera]) -> None:
+        """Take the sampling rates anew, after Gaussians have come or gone.
+
+        Args:
+            means: (N, 3) world; nothing is differentiated through them.
+            cameras: Those of the photographs, of the size at which these are fitted.
+        """
+        # A rate is a maximum over cameras of what changes little from step to step: constant in between, as in [1].
+        rates = sampling_rates(means.detach().double().cpu().numpy(), cameras)
+        seen = rates[rates > 0]
+        # Nothing shows what no camera sees: it gets the filter of the most coarsely sampled of the others [1, code].
+        lowest = seen.min() if len(seen) else np.inf
+        variances = _STRENGTH / np.square(np.where(rates > 0, rates, lowest))
+        self.variances = torch.from_numpy(variances).float()
+
+    def forward(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians under the filter.
+
+        Args:
+            gaussians: N Gaussians, as many as at the last `sample`.
+        Gradients:
+            Reach log scales and opacities; a filtered opacity depends on both.
+        """
+        return filtered(gaussians, self.variances)
+
+
+def filtered(gaussians: Gaussians, variances: torch.Tensor) -> Gaussians:
+    """Gaussians convolved with isotropic ones, with opacities that keep the integral of each.
+
+    Args:
+        gaussians: N Gaussians.
+        variances: (N,) variances of the filter, >= 0, in squared world units.
+    """
+    # In float64, then rounded once: logit(o') = log o' - log(1 - o') cancels where o' is near 1, and a checkpoint and
+    # the PLY beside it have the same bits wherever they are compared.
+    log_scales = gaussians.log_scales.double()
+    log_variances = variances.double().log().to(log_scales.device)
+    wider = torch.logaddexp(2 * log_scales, log_variances[:, None]) / 2
+    log_opacities = torch.nn.functional.logsigmoid(gaussians.logit_opacities.double()) + (log_scales - wider).sum(1)
+    logits = log_opacities - torch.log(-torch.expm1(log_opacities))
+    kind = gaussians.log_scales.dtype
+    return gaussians.replace(log_scales=wider.to(kind), logit_opacities=logits.to(gaussians.logit_opacities.dtype))
+
+
+def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """(N,) pixels per world unit, in the image plane of the camera that samples a mean most finely; 0 where none does.
+
+    Args:
+        means: (N, 3) world.
+        cameras: Pinhole cameras.
+    Reference:
+        [1], eq. 7.
+    """
+    rates = np.zeros(len(means))
+    for camera in cameras:
+        pixels, depth = camera.project(means)
+        sides = np.array([camera.width, camera.height])
+        inside = (depth > 0) & ((pixels >= -_MARGIN * sides) & (pixels <= (1 + _MARGIN) * sides)).all(1)
+        focal = max(camera.K[0, 0], camera.K[1, 1])
+        rates[inside] = np.maximum(rates[inside], focal / depth[inside])
+    return rates
