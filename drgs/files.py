@@ -22,7 +22,7 @@ from drgs.guards import outputs
 from drgs.guards.arguments import ArgumentError
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
-from drgs.guards.ply_headers import EXTRA, extra_kind, ply_source, read_ply_header
+from drgs.guards.ply_headers import EXTRA, extra_kind, is_antialiased, ply_source, read_ply_header
 from drgs.guards.writing import append_line
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ __all__ = [
     "atomic_write",
     "load_ply",
     "load_state",
+    "note_antialiased",
     "save_ply",
     "save_state",
     "state_header",
@@ -102,6 +103,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     if extra:
         shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
         _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
+    if is_antialiased(path):
+        note_antialiased(path)
     try:
         vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
         arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in columns.items()}
@@ -121,6 +124,15 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     made = Gaussians(**arrays, sh=sh.contiguous())
     made.validate(str(path))
     return made
+
+
+def note_antialiased(path: Path) -> None:
+    """Say in the log that a file is meant for antialiased rasterization, which `Gaussians` have no room for."""
+    _log.warning(
+        "%s: was fitted by antialiased rasterization, which no preset is: what is below a pixel is too opaque in "
+        "gsplat and inria; files that are written of it do not say what it was",
+        path,
+    )
 
 
 def _finite_logits(path: Path, logits: torch.Tensor) -> torch.Tensor:

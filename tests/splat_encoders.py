@@ -27,12 +27,14 @@ def spz_file(version: int, degree: int, body: bytes, count: int, bits: int = 12,
     return gzip.compress(data, mtime=0) if packed else data
 
 
-def spz_file_4(degree: int, parts: list[bytes], count: int, bits: int = 12, extensions: bytes = b"") -> bytes:
+def spz_file_4(
+    degree: int, parts: list[bytes], count: int, bits: int = 12, extensions: bytes = b"", flags: int = 0
+) -> bytes:
     """Version 4: a Zstandard frame for each array."""
     import zstandard
 
     frames = [zstandard.ZstdCompressor().compress(part) for part in parts]
-    flags = 2 if extensions else 0
+    flags |= 2 if extensions else 0
     head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags, len(parts), 32 + len(extensions))
     table = b"".join(struct.pack("<QQ", len(f), len(p)) for f, p in zip(frames, parts, strict=True))
     return head + extensions + table + b"".join(frames)

@@ -15,7 +15,8 @@ import numpy as np
 
 from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
-from drgs.guards.ply_headers import ply_source, read_ply_header
+from drgs.files import note_antialiased
+from drgs.guards.ply_headers import is_antialiased, ply_source, read_ply_header
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -40,6 +41,8 @@ def load_packed_ply(path: Path) -> Gaussians:
     elements = {element.name: element for element in read_ply_header(path)}
     count, coefficients = _check(path, elements)
     check_count(path, count, coefficients)
+    if is_antialiased(path):
+        note_antialiased(path)
     try:
         ply = plyfile.PlyData.read(ply_source(path))
     except (plyfile.PlyParseError, ValueError, OSError) as error:

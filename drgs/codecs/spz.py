@@ -29,6 +29,7 @@ import numpy as np
 from drgs.codecs.bounded import GzipReader, unzstd
 from drgs.codecs.codec import Codec
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest
+from drgs.files import note_antialiased
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -37,7 +38,7 @@ __all__ = ["SPZ", "encode_spz", "load_spz"]
 
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
 _COLOR = 0.15
-_EXTENDED = 2  # flag
+_ANTIALIASED, _EXTENDED = 1, 2  # flags
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
 _BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more
 _SMALLEST = 511 * 2**0.5  # a component of at most sqrt(1/2), in 9 bits
@@ -127,6 +128,8 @@ def _sequence(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]]
         _check_extensions(path, rest)
     elif rest:
         raise ValueError(f"{path}: must end where its header says, holds {len(rest)} bytes more; export it again")
+    if flags & _ANTIALIASED:
+        note_antialiased(path)
     ends = np.cumsum([0, *sizes]).tolist()
     return version, count, degree, bits, [body[a:b] for a, b in zip(ends, ends[1:], strict=False)]
 
@@ -156,6 +159,8 @@ def _streams(path: Path, data: bytes) -> tuple[int, int, int, list[bytes]]:
         at += packed
     check_count(path, count, SH_COUNTS[min(degree, 3)])
     parts = [unzstd(path, data[begin:end], size) for begin, end, size in spans]
+    if flags & _ANTIALIASED:
+        note_antialiased(path)
     return count, degree, bits, [*parts, b""][:6]
 
 

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-__all__ = ["EXTRA", "PlyElement", "extra_kind", "ply_source", "read_ply_header"]
+__all__ = ["EXTRA", "PlyElement", "extra_kind", "is_antialiased", "ply_source", "read_ply_header"]
 
 EXTRA = ("uncertainty_", "label")
 """Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
@@ -91,6 +91,21 @@ def read_ply_header(path: Path) -> list[PlyElement]:
             "it is truncated or damaged, copy it again"
         )
     return elements
+
+
+def is_antialiased(path: Path) -> bool:
+    """Whether a PLY, whose header has been read, says that its Gaussians were fitted by antialiased rasterization.
+
+    Brush and gsplat write `comment SplatRenderMode: mip`, Postshot `comment antialiased 1`; the last such line counts.
+    """
+    with path.open("rb") as file:
+        head = file.read(_MAX_HEADER)
+    said = re.findall(
+        rb"^comment[ \t]+(?:SplatRenderMode:[ \t]*(mip|default)|antialiased[ \t]+([01]))[ \t]*$",
+        head[: head.find(b"\nend_header")].replace(b"\r", b"\n"),
+        re.IGNORECASE | re.MULTILINE,
+    )
+    return bool(said) and (said[-1][0].lower(), said[-1][1]) in ((b"mip", b""), (b"", b"1"))
 
 
 def extra_kind(name: str, values: np.ndarray, count: int) -> str:
