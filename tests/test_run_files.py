@@ -33,11 +33,11 @@ from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
     "config.json": {"frames", "absent", "semantics", "times", "exposure", "estimated"},
-    "metrics.json": {"segmentation", "motion", "transients"},
+    "metrics.json": {"segmentation", "motion", "transients", "scale"},
     "fisher.json": {"nuisances"},
 }
 """Fields of data sets that the tests here do not make, videos, missing images, a teacher, several times; and of what is
-not asked for: exposure, transients, eliminated unknowns.
+not asked for: exposure, transients, larger pictures, eliminated unknowns.
 """
 
 

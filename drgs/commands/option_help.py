@@ -49,9 +49,9 @@ _HEADING_OF_NAME = {
     **dict.fromkeys(("times", "test_cameras", "strict", "lpips_weights"), "Data"),
     **dict.fromkeys(("cameras", "candidates", "train", "selection", "views", "split", "limit", "count"), "Views"),
     **dict.fromkeys(("orbit", "time", "view", "frames", "prior", "relative_prior", "k"), "Views"),
-    **dict.fromkeys(("renderers", "preset", "overrides", "background", "width", "height"), "Rendering"),
+    **dict.fromkeys(("renderers", "preset", "overrides", "background", "width", "height", "scale"), "Rendering"),
     **dict.fromkeys(("variant", "threads", "deterministic", "scheduler", "workers", "quiet", "debug"), "Machine"),
-    **dict.fromkeys(("sh_degree",), "Quality"),
+    **dict.fromkeys(("sh_degree", "filter_3d"), "Quality"),
 }
 """Option -> its heading, where it is not its record's; of others it is the first."""
 
