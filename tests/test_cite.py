@@ -34,9 +34,15 @@ def keys(text: str) -> set[str]:
 def run(tmp_path):
     """Writes the record of a fit; what it does not say is as a plain fit of a transforms.json has it."""
 
-    def write(preset: str = "fast", active: SelectionConfig | None = None, lpips: float | None = None, **fields):
+    def write(
+        preset: str = "fast",
+        active: SelectionConfig | None = None,
+        lpips: float | None = None,
+        filter_3d: str = "off",
+        **fields,
+    ):
         settings = RenderSettings.preset("fast" if preset == "any" else preset)
-        config = FitConfig(settings=settings, renderers=(preset,), selection=active)
+        config = FitConfig(settings=settings, renderers=(preset,), selection=active, filter_3d=filter_3d)
         record = {"schema": SCHEMA, "command": "fit", "data": "scene", "format": "transforms", "train": ["a"]}
         record |= {"test": ["b"], "fit": config.to_json(), **fields}
         if active is not None:
@@ -66,6 +72,7 @@ def test_a_plain_fit(run, capsys):
         ({"preset": "any"}, {"moenneloccoz2024raytracing", "zwicker2001ewa", "ye2025gsplat", "wu2025threedgut"}),
         ({"preset": "inria"}, {"zwicker2001ewa"}),
         ({"preset": "exact"}, {"moenneloccoz2024raytracing"}),
+        ({"filter_3d": "on"}, {"moenneloccoz2024raytracing", "yu2024mipsplatting"}),
         ({"format": "colmap"}, {"moenneloccoz2024raytracing", "schoenberger2016sfm"}),
         ({"lpips": 0.0}, {"moenneloccoz2024raytracing", "zhang2018lpips"}),
         ({"times": [0.0, 1.0]}, {"moenneloccoz2024raytracing", "wu2024fourd"}),

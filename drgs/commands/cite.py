@@ -69,6 +69,7 @@ _RUNS: dict[str, _Test] = {
     "zwicker2001ewa": lambda used: any(s.response == "ewa" for s in used.rendered()),
     "ye2025gsplat": lambda used: any("gsplat" in (s.fov_clamp, s.culling) for s in used.rendered()),
     "wu2025threedgut": lambda used: any(s.nearest_preset()[0] == "3dgut" for s in used.rendered()),
+    "yu2024mipsplatting": lambda used: used.record.config.filter_3d == "on",
     "schoenberger2016sfm": lambda used: used.format == "colmap",
     "zhou2024feature3dgs": lambda used: used.record.semantics is not None,
     "wu2024fourd": lambda used: bool(used.record.times),
