@@ -7,8 +7,8 @@ pixels of the photograph that samples it most finely [1, eq. 7 to 9]:
 
     S' = S + s / nu^2 I,   o' = o sqrt(|S| / |S'|),   nu = max over the cameras that see its mean of f / z.
 
-What is fitted are S and o; whatever a fit shows, saves and measures are S' and o', so that viewers know of no filter.
-The 2D filter of [1] is not here: what is rendered on the screen is the renderer's business.
+What is fitted, and what density control divides, are S and o; whatever a fit shows, saves and measures are S' and o',
+so that viewers know of no filter. The 2D filter of [1] is not here: the screen is the renderer's business.
 
 Reference:
     [1] Yu et al., "Mip-Splatting: Alias-free 3D Gaussian Splatting", CVPR 2024, and its code.
