@@ -15,9 +15,10 @@ from drgs.fitting.rows import GaussianRows
 if TYPE_CHECKING:
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.frames import Frame
+    from drgs.fitting.poses import Poses
     from drgs.integrator import Output
 
-__all__ = ["Parts", "means_rate", "parts_of", "with_exposure"]
+__all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Parts:
             always. Terms get the Gaussians with their features either way.
         couple_features: Whether gradients of the features that are rendered reach the geometry.
         exposure: What a photograph shows of a rendering, before terms of the loss see it; None: the rendering.
+        poses: Cameras of photographs as they are fitted, one of `networks`; None: they stay where the data set says.
     """
 
     terms: Sequence[LossTerm]
@@ -42,6 +44,7 @@ class Parts:
     shows_features: Callable[[Frame], bool] | None = None
     couple_features: bool = True
     exposure: Callable[[Output, Frame], Output] | None = None
+    poses: Poses | None = None
 
 
 def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> Parts:
@@ -99,3 +102,18 @@ def with_exposure(
         frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
     )
     return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
+
+
+def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float) -> Parts:
+    """The parts with poses of photographs, as stated until they are fitted.
+
+    Args:
+        parts: Parts of a fit without.
+        frames: Its training photographs.
+        config: Its configuration.
+        extent: Extent of the scene, its unit of length.
+    """
+    from drgs.fitting.poses import Poses, pose_network
+
+    poses = Poses([frame.camera for frame in frames], extent, config.settings)
+    return dataclasses.replace(parts, networks=[*parts.networks, pose_network(poses)], poses=poses)

@@ -18,6 +18,7 @@ from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
+from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
@@ -155,9 +156,11 @@ class Trainer:
         events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
         events += self._prepare(done)
         if self.transients.is_due(done, config.max_steps, len(self.frames)):
-            events.append(self.transients.look(self.frames, self.gaussians(), config.settings))
+            events.append(self.transients.look(self.photographs(), self.gaussians(), config.settings))
         frame = self.frames[self._next_view()]
         gaussians = self._fitted_scene().at(frame.camera.time)
+        if self.parts.poses is not None:
+            frame = self._posed(frame)
         out = self._shown(gaussians, frame)
         if self.parts.exposure is not None:
             out = self.parts.exposure(out, frame)
@@ -193,6 +196,13 @@ class Trainer:
         self.step_index += 1
         psnr = psnr_of(mse) if math.isfinite(mse) else None
         return StepResult(float(loss.detach()), terms, psnr, frame.name, events)  # told, not optimized
+
+    def photographs(self) -> list[Frame]:
+        """The training photographs, their cameras where they are now."""
+        if self.parts.poses is not None:
+            for frame in self.frames:
+                frame.camera = self.parts.poses.camera(frame.name)
+        return self.frames
 
     def network(self, name: str) -> torch.nn.Module | None:
         """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
@@ -359,6 +369,16 @@ class Trainer:
         view = int(self._queue[0])
         self._queue = self._queue[1:].clone()
         return view
+
+    def _posed(self, frame: Frame) -> Frame:
+        """A photograph with its camera as it is now; gradients reach the pose while poses are fitted."""
+        poses = self.parts.poses
+        assert poses is not None
+        if is_due(self._part()):
+            if not poses.has_begun:
+                poses.begin(self.gaussians())
+            return poses(frame)
+        return dataclasses.replace(frame, camera=poses.camera(frame.name))
 
     def _shown(self, gaussians: Gaussians, frame: Frame) -> Output:
         """What the terms need to see of the Gaussians in a photograph's view."""
