@@ -51,7 +51,9 @@ POSE_NETWORK = "poses"
 CAMERAS = "refined_cameras.json"
 """File of a run with the cameras of its training photographs, as refined."""
 
-_CLEAR = 0.25  # pixels of the fit: median reprojection error from which on poses are refined
+# Pixels of the fit: median reprojection error from which on poses are refined. Measured: in a capture with 0.13 px
+# refining costs 0.9 dB of held-out PSNR (400 steps); in a made one whose poses are 1.2 px off it gains 2.3 dB (600).
+_CLEAR = 0.5
 _BEGIN, _END = 0.15, 0.9  # fractions of the fit between which poses are fitted: geometry first, and last alone
 _RATE = 5e-3  # of z at the begin, in changes of values (root mean square) a step; falls to 0
 _DAMPING = 1e-2  # of the mean eigenvalue of H, so that W exists where a picture says nothing about a direction
