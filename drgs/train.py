@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
+    from drgs.fitting.poses import PoseEvidence
     from drgs.information.pool import Workers
 
 __all__ = [
