@@ -81,7 +81,7 @@ def test_motion_is_the_exponential():
 def test_poses_are_found_by_the_optimizer(photographs):
     """With the scene as it is, 40 steps a view leave a tenth of the errors, in what pictures show of them."""
     g, frames, true = photographs
-    poses = Poses([frame.camera for frame in frames], 3.0, FAST)
+    poses = Poses([frame.camera for frame in frames], 3.0, FAST, 2.0)
     poses.begin(g)
     network = pose_network(poses)  # its gauge is left alone: the scene stands still here, and holds it
     before, after = [], []
@@ -105,7 +105,7 @@ def test_poses_are_found_by_the_optimizer(photographs):
 def test_the_gauge_is_held(photographs):
     """A step of all cameras together is taken back whole; what they do not have in common stays as it is."""
     g, frames, _ = photographs
-    poses = Poses([frame.camera for frame in frames], 3.0, FAST)
+    poses = Poses([frame.camera for frame in frames], 3.0, FAST, 2.0)
     poses.begin(g)
     centers = np.stack([frame.camera.c2w[:3, 3] for frame in frames])
     middle = centers.mean(0)
@@ -131,6 +131,22 @@ def test_the_gauge_is_held(photographs):
         assert torch.allclose(x, was, atol=1e-9)
 
 
+def test_no_camera_goes_further_than_its_reach(photographs):
+    """What a pose is moved too far by is taken back until points in its picture move by the reach, root mean square."""
+    g, frames, _ = photographs
+    poses = Poses([frame.camera for frame in frames], 3.0, FAST, 0.5)
+    poses.begin(g)
+    means = g.means.detach().numpy()
+    with torch.no_grad():
+        for row, z in enumerate(poses.coordinates):
+            u = torch.randn(6, generator=torch.Generator().manual_seed(row), dtype=torch.float64) * 0.02
+            z += torch.linalg.solve(poses.whitening[row], u)
+    poses.hold_reach()
+    for frame, now in zip(frames, poses.cameras(), strict=True):
+        apart_by = np.linalg.norm(now.project(means)[0] - frame.camera.project(means)[0], axis=1)
+        assert np.sqrt(np.square(apart_by).mean()) == pytest.approx(0.5, rel=0.05)
+
+
 def test_a_camera_is_refined_against_its_photograph(photographs):
     """With the scene as it is, a photograph gives its own pose back; the true one stays where it is."""
     g, frames, true = photographs
@@ -146,7 +162,7 @@ def test_a_camera_is_refined_against_its_photograph(photographs):
 def test_stated_poses_until_it_begins(photographs):
     """Before the refinement, cameras are the data set's to the last bit but for rounding, and a gauge changes none."""
     _, frames, _ = photographs
-    poses = Poses([frame.camera for frame in frames], 3.0, FAST)
+    poses = Poses([frame.camera for frame in frames], 3.0, FAST, 2.0)
     poses.hold_gauge()
     assert not poses.has_begun
     assert poses.displacement() == {"cameras": 6, "degrees": 0.0, "moved": 0.0}
@@ -158,6 +174,7 @@ def test_evidence(photographs, angle, clear):
     _, frames, _ = photographs
     found = PoseEvidence.of(angle, frames)
     assert found.is_clear is clear
+    assert found.reach == (2.0 if angle is None else 3 * found.pixels)
     if angle is not None:
         assert found.pixels == pytest.approx(angle * frames[0].camera.K[0, 0])
 

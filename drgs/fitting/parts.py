@@ -104,7 +104,7 @@ def with_exposure(
     return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
 
 
-def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float) -> Parts:
+def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float, reach: float) -> Parts:
     """The parts with poses of photographs, as stated until they are fitted.
 
     Args:
@@ -112,8 +112,9 @@ def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: flo
         frames: Its training photographs.
         config: Its configuration.
         extent: Extent of the scene, its unit of length.
+        reach: How far a pose may move what its picture shows, root mean square in pixels.
     """
     from drgs.fitting.poses import Poses, pose_network
 
-    poses = Poses([frame.camera for frame in frames], extent, config.settings)
+    poses = Poses([frame.camera for frame in frames], extent, config.settings, reach)
     return dataclasses.replace(parts, networks=[*parts.networks, pose_network(poses)], poses=poses)

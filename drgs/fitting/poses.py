@@ -12,6 +12,11 @@ pixels and channels, from forward-mode derivatives of a small picture: a unit st
 **Gauge.** What all cameras do together (turn, move, grow about their middle: 7 numbers) the scene can undo: photographs
 say nothing about it, and held-out cameras would no longer fit. After every step, u of all photographs is projected to
 the complement of the 7 tangents of this group: held exactly in u, for motions of first order.
+
+**Reach.** A few photographs can be fitted better by cameras that are far off and Gaussians that suit them. So no camera
+may go further than the data set's own residual says it can be wrong: what its pose moves the Gaussians in its picture
+by, root mean square, is at most `_REACH` times the median reprojection error. Where the data set brings none, it is
+`_UNKNOWN` pixels.
 """
 
 from __future__ import annotations
@@ -58,6 +63,8 @@ _BEGIN, _END = 0.15, 0.9  # fractions of the fit between which poses are fitted:
 _RATE = 5e-3  # of z at the begin, in changes of values (root mean square) a step; falls to 0
 _DAMPING = 1e-2  # of the mean eigenvalue of H, so that W exists where a picture says nothing about a direction
 _PIXELS = 4096  # of the picture that H is of, a preconditioner
+_REACH = 3.0  # times the reprojection error: bundle adjustment has hidden some of a pose's error in its points
+_UNKNOWN = 2.0  # pixels of the fit, where a data set says nothing about its poses
 _AGAINST = 12  # steps at most of a camera that is refined against one photograph
 
 
@@ -84,6 +91,11 @@ class PoseEvidence:
         return cls(angle * float(np.median([float(frame.camera.K[0, 0]) for frame in frames])))
 
     @property
+    def reach(self) -> float:
+        """How far a refined pose may move what its picture shows, root mean square in pixels of the fit."""
+        return _UNKNOWN if self.pixels is None else _REACH * self.pixels
+
+    @property
     def is_clear(self) -> bool:
         """Whether poses are worth refining."""
         return self.pixels is not None and self.pixels > _CLEAR
@@ -106,24 +118,30 @@ class Poses(torch.nn.Module):
         names: V names of photographs.
         coordinates: V times z (6,), float64; 0 is the pose that the data set states.
         whitening: (V, 6, 6) float64, the matrices W; 0 before the refinement has begun.
+        shifts: (V, 6, 6) float64, mean over the Gaussians in a picture of D^T D, D (2, 6) what u moves them by, pixels;
+            0 before the refinement has begun.
     """
 
     whitening: torch.Tensor
+    shifts: torch.Tensor
 
-    def __init__(self, cameras: Sequence[Camera], extent: float, settings: RenderSettings) -> None:
+    def __init__(self, cameras: Sequence[Camera], extent: float, settings: RenderSettings, reach: float) -> None:
         """
         Args:
             cameras: V pinhole cameras of the photographs, named as these, as the data set states them.
             extent: Extent of the scene, its unit of length.
             settings: What information is computed with.
+            reach: How far a pose may move what its picture shows, root mean square in pixels.
         """
         super().__init__()
         self.names = [camera.name for camera in cameras]
         self._rows = {name: row for row, name in enumerate(self.names)}
         self._cameras = list(cameras)
         self._settings = settings
+        self._reach = reach
         self.coordinates = torch.nn.ParameterList(torch.zeros(6, dtype=torch.float64) for _ in cameras)
         self.register_buffer("whitening", torch.zeros(len(cameras), 6, 6, dtype=torch.float64))
+        self.register_buffer("shifts", torch.zeros(len(cameras), 6, 6, dtype=torch.float64))
         centers = torch.tensor(np.stack([camera.c2w[:3, 3] for camera in cameras]))
         self._twist_of = torch.stack([_twist_of_u(center, extent) for center in centers])
         self._common = _common_motions(centers, extent)
@@ -134,7 +152,8 @@ class Poses(torch.nn.Module):
         return bool(self.whitening.any())
 
     def begin(self, gaussians: Gaussians) -> None:
-        """Compute W of every photograph, from what the Gaussians are now."""
+        """Compute W of every photograph, and what its pose moves its picture by, from what the Gaussians are now."""
+        means = gaussians.means.detach().cpu().double()  # a metric of steps, not part of the loss
         for row, camera in enumerate(self._cameras):
             small = at_most(camera, _PIXELS)
             changes = (
@@ -147,6 +166,8 @@ class Poses(torch.nn.Module):
             damping = _DAMPING * information.trace() / 6 + 1e-12
             lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
             self.whitening[row] = torch.linalg.inv(lower).T
+            moved = _moved(means, camera) @ self._twist_of[row]
+            self.shifts[row] = torch.einsum("nki,nkj->ij", moved, moved) / max(1, len(moved))
 
     def forward(self, frame: Frame) -> Frame:
         """The photograph with its camera as it is now; gradients reach its pose."""
@@ -169,6 +190,20 @@ class Poses(torch.nn.Module):
     def cameras(self) -> list[Camera]:
         """All cameras of the photographs, as `camera` has them."""
         return [self.camera(name) for name in self.names]
+
+    def hold(self) -> None:
+        """Keep the poses within their reach, then hold the gauge, which may move a camera a little past it."""
+        self.hold_reach()
+        self.hold_gauge()
+
+    def hold_reach(self) -> None:
+        """Take every pose back towards the stated one, until its picture moves by the reach at most."""
+        with torch.no_grad():  # a bound, no step
+            for row, z in enumerate(self.coordinates):
+                u = self.whitening[row] @ z
+                pixels = float((u @ self.shifts[row] @ u).clamp_min(0).sqrt())  # 0 but for rounding
+                if pixels > self._reach:
+                    z *= self._reach / pixels
 
     def hold_gauge(self) -> None:
         """Take out of all poses what moves, turns or scales all cameras together."""
@@ -209,8 +244,8 @@ def displacement(stated: Sequence[Camera], now: Sequence[Camera]) -> dict:
 
 
 def pose_network(poses: Poses) -> Network:
-    """Poses of photographs as a part of a fit: their optimizer, rate and gauge."""
-    return Network(POSE_NETWORK, poses, _rate, constraint=poses.hold_gauge)
+    """Poses of photographs as a part of a fit: their optimizer, rate, reach and gauge."""
+    return Network(POSE_NETWORK, poses, _rate, constraint=poses.hold)
 
 
 def is_due(part: float) -> bool:
@@ -276,6 +311,31 @@ def _twist_of_u(center: torch.Tensor, extent: float) -> torch.Tensor:
     out[3:, :3] = _cross(center)  # v = extent u_move + c x w
     out[3:, 3:] *= extent
     return out
+
+
+def _moved(points: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """(N, 2, 6) what a twist of the camera moves points by, in pixels, for the N of `points` (P, 3) in its picture."""
+    w2c = torch.tensor(camera.w2c)
+    K = torch.tensor(camera.K)
+    inside = points @ w2c[:3, :3].T + w2c[:3, 3]
+    ahead = inside[:, 2] > 0
+    inside = inside[ahead]
+    pixels = inside[:, :2] / inside[:, 2:] * K.diagonal()[:2] + K[:2, 2]
+    seen = ((pixels > 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
+    inside = inside[seen]
+    depth = inside[:, 2]
+    zero = torch.zeros_like(depth)
+    projection = torch.stack(
+        [
+            torch.stack([K[0, 0] / depth, zero, -K[0, 0] * inside[:, 0] / depth**2], 1),
+            torch.stack([zero, K[1, 1] / depth, -K[1, 1] * inside[:, 1] / depth**2], 1),
+        ],
+        1,
+    )
+    # The camera's twist (w, v) moves a point against it, seen from the camera: by -(w x p + v), in world axes.
+    arms = torch.stack([_cross(point) for point in points[ahead][seen]]) if len(inside) else points.new_zeros(0, 3, 3)
+    against = torch.cat([arms, -torch.eye(3, dtype=points.dtype).expand(len(inside), 3, 3)], 2)
+    return projection @ w2c[:3, :3] @ against
 
 
 def _common_motions(centers: torch.Tensor, extent: float) -> torch.Tensor:

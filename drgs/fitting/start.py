@@ -98,5 +98,5 @@ def start(
             is_on = config.data.poses == "refined" or evidence.is_clear
             bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
         if is_on:
-            made = with_poses(made, frames, config, extent)
+            made = with_poses(made, frames, config, extent, evidence.reach)
     return Trainer(config, frames, model, extent, made, motion), source, found, evidence
