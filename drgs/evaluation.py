@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.display.pictures import file_names
 from drgs.fitting.frames import load_dataset, load_frames
+from drgs.fitting.poses import displacement
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
-from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
+from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, refined_scores, through_renderers, write_metrics
 from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ def evaluate_run(
         strict=strict,
         semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
     )
-    train, test = dataset.split()
+    stated = [view.camera for view in dataset.split()[0]]
+    train, test = recorded.with_refined_poses(dataset).split()
     chosen: dict[str, Any] = {}
     if recorded.is_active:  # the rest of the training split was never seen
         chosen = {"fitted": fitted_views(run), "pool_leak": run.config().get("pool_leak")}
@@ -86,6 +88,11 @@ def evaluate_run(
         segmentation=segmentation,
         moving=moving_labels(dataset) if recorded.times else frozenset(),
     )
+    refined: dict[str, Any] = {}
+    if recorded.refined:
+        held_out = frames if split == "test" else load_frames(test, config.data.max_pixels, config.data.mask)
+        found = [view.camera for view in train]
+        refined = {"poses": {**displacement(stated, found), **refined_scores(scene, held_out, config.settings)}}
     wanted = renderers_to_measure(config.renderers, config.settings, renderer)
     renderers = through_renderers(scene, frames, wanted, split)
     return write_metrics(
@@ -99,6 +106,7 @@ def evaluate_run(
         renderers=renderers,
         **({} if scale == 1 else {"scale": scale}),
         **chosen,
+        **refined,
         **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
     )
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from drgs import metrics, runtime
+from drgs.data.camera_lists import save_cameras_json
 from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
@@ -40,7 +41,8 @@ from drgs.fitting.config import (
 )
 from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, load_frames
-from drgs.fitting.parts import parts_of, with_exposure
+from drgs.fitting.parts import parts_of, with_exposure, with_poses
+from drgs.fitting.poses import CAMERAS, POSE_NETWORK, PoseEvidence
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
@@ -191,17 +193,27 @@ def _fit(
         made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
         if parts is None and EXPOSURE in header.get("networks", ()):
             made = with_exposure(made, frames, config)
+        if parts is None and POSE_NETWORK in header.get("networks", ()):
+            known = PoseEvidence.of(dataset.reprojection, frames)
+            made = with_poses(made, frames, config, header["extent"], known.reach)
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds = seconds_of(run, header) or 0.0
-        exposure = None
+        exposure = evidence = None
         source = header["point_source"]
         config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source, exposure = start(dataset, views, frames, config, parts, taught, plan is not None, room, motion)
+        trainer, source, exposure, evidence = start(
+            dataset, views, frames, config, parts, taught, plan is not None, room, motion
+        )
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= _exposure_record(run, trainer, exposure)
+    recorded |= _poses_record(run, trainer, evidence)
+    poses = trainer.parts.poses
+    estimated = [*(["exposure"] if trainer.parts.exposure else []), *(["pose"] if poses else [])]
+    if estimated:
+        recorded["estimated"] = estimated
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -227,6 +239,11 @@ def _fit(
     if motion is not None:
         with Bar("timing the deformation") as bar:
             moved = motion.report(trainer.rows, bar.update)
+    refined: dict[str, Any] = {}
+    if poses is not None:
+        with Bar("poses") as bar:
+            bar.note(poses.words())
+        refined = {"poses": {**poses.displacement(), **metrics.refined_scores(scene, held_out, config.settings)}}
     result = measured(run.renders / "test")
     written = metrics.write_metrics(
         run,
@@ -240,13 +257,14 @@ def _fit(
         bad_steps=trainer.bad_steps,
         renderers=metrics.through_renderers(
             scene,
-            held_out or trainer.frames,
+            held_out or trainer.photographs(),
             renderers_to_measure(config.renderers, config.settings),
             "test" if held_out else "train",
             metrics.RENDERERS_VIEWS,
         ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
+        **refined,
         **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
     )
     told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
@@ -258,13 +276,18 @@ def _check_photographs(config: FitConfig, moves: bool) -> None:
     """Refuse what is modeled of single photographs where that is not built.
 
     Raises:
-        NotImplementedError: With exposure where views are chosen on the way or things move, and with transients where
-            things move: these are found by what neighbors show of the same surface at rest.
+        NotImplementedError: With exposure or poses where views are chosen on the way or things move, and with
+            transients where things move: these are found by what neighbors show of the same surface at rest.
     """
     if config.data.exposure != "off" and (config.selection or moves):
         raise NotImplementedError(
             f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
             "leave --exposure out"
+        )
+    if config.data.poses != "fixed" and (config.selection or moves):
+        raise NotImplementedError(
+            f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
+            "leave --poses out"
         )
     if config.loss.transients != "keep" and moves:
         raise NotImplementedError(
@@ -286,9 +309,19 @@ def _exposure_record(run: Run, trainer: Trainer, found: ExposureEstimate | None)
         recorded["exposure"] = found.to_json([frame.name for frame in trainer.frames])
     elif trainer.config.data.exposure != "off" and (run.path / "config.json").is_file():
         recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
-    if trainer.parts.exposure is not None:
-        recorded["estimated"] = ["exposure"]
     return recorded
+
+
+def _poses_record(run: Run, trainer: Trainer, found: PoseEvidence | None) -> dict[str, Any]:
+    """What config.json is to say of poses; arguments as of `_exposure_record`."""
+    refined = trainer.parts.poses is not None
+    if found is not None:
+        return {"poses": found.to_json(refined)}
+    if trainer.config.data.poses == "fixed":
+        return {}
+    # A fit that goes on, whose config.json may have been moved away.
+    before = run.config() if (run.path / "config.json").is_file() else {}
+    return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
 
 
 def _checkpoint(
@@ -417,6 +450,8 @@ class _Loop:
             return
         tensors, header = self.trainer.state()
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
+        if self.trainer.parts.poses is not None:
+            save_cameras_json(self.run_folder.path / CAMERAS, self.trainer.parts.poses.cameras())
         header |= {"point_source": self.source}
         header |= {"semantics": self.taught.to_json()} if self.taught else {}
         if self.plan:
@@ -482,7 +517,7 @@ class _Loop:
     def _preview(self, bar: Bar, is_interrupted: Callable[[], bool]) -> None:
         """One picture, and the PSNR of all held-out views, unless the fit is interrupted."""
         trainer, done = self.trainer, self.trainer.step_index
-        frames = self.held_out or trainer.frames[:1]
+        frames = self.held_out or trainer.photographs()[:1]
         values = []
         for i, frame in enumerate(frames):
             if is_interrupted():

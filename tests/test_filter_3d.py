@@ -15,7 +15,7 @@ from drgs.commands.eval import run as run_eval
 from drgs.commands.options import Eval
 from drgs.ellipsoids import semi_axes
 from drgs.files import load_state, save_state
-from drgs.fitting.filter_3d import TENSOR, Filter3D, filtered, sampling_rates
+from drgs.fitting.filter_3d import VARIANCES, Filter3D, filtered, sampling_rates
 from drgs.fitting.records import check_checkpoint, load_run
 from drgs.fitting.start import motion_of
 from drgs.train import Trainer, fit
@@ -102,9 +102,9 @@ def test_a_run_shows_and_saves_the_filtered_ones(dataset, tmp_path):  # noqa: F8
     tensors, _ = load_state(run.run.state)
     rates = 1 / torch.from_numpy(sampling_rates(shown.means.numpy(), [v.camera for v in dataset.split()[0]]))
     narrowest = shown.scales.amin(1)
-    assert bool((narrowest.square() >= tensors[TENSOR] * (1 - 1e-6)).all())
+    assert bool((narrowest.square() >= tensors[VARIANCES] * (1 - 1e-6)).all())
     # Rates are of the last density control, since when Gaussians have moved a little.
-    assert torch.allclose(tensors[TENSOR].double(), 0.2 * rates.square(), rtol=0.1)
+    assert torch.allclose(tensors[VARIANCES].double(), 0.2 * rates.square(), rtol=0.1)
     assert bool((tensors["parameter.log_scales"].exp() < shown.scales).all())
     assert run.run.config()["fit"]["filter_3d"] == "on"
 
@@ -141,7 +141,7 @@ def test_a_resumed_fit_keeps_its_rates(dataset, tmp_path):  # noqa: F811
     one, two = whole.state()[0], again.state()[0]
     assert all(torch.equal(one[name], two[name]) for name in one)
     with pytest.raises(ValueError, match="filter_3d must be torch.float32 of shape"):
-        check_checkpoint(path, {name: x for name, x in tensors.items() if name != TENSOR}, header)
+        check_checkpoint(path, {name: x for name, x in tensors.items() if name != VARIANCES}, header)
     with pytest.raises(ValueError, match="filter_3d was 'on' and is 'off'"):
         Trainer.from_state(config(), whole.frames, tensors, header, "here")
 
@@ -150,7 +150,7 @@ def test_without_it_there_is_nothing_of_it(dataset):  # noqa: F811
     """The Gaussians are the rows themselves, and a checkpoint has no rates."""
     trainer = trainer_of(dataset, config())
     assert trainer.parts.filter_3d is None
-    assert TENSOR not in trainer.state()[0]
+    assert VARIANCES not in trainer.state()[0]
     assert torch.equal(trainer.gaussians().log_scales, trainer.rows.tensors["log_scales"])
 
 

@@ -9,6 +9,7 @@ from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
 from drgs.files import Run
 from drgs.fitting.frames import load_dataset
+from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
 from drgs.report.write import FILE
 from drgs.train import fit
@@ -37,7 +38,7 @@ def run(args: Fit) -> None:
         result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet, workers=workers)
     page = result.run.path / FILE
     if args.report:
-        report_of(result.run, page, dataset)
+        report_of(result.run, page, fit_record(result.run).with_refined_poses(dataset))
     if args.quiet:
         return
     print_table(result.metrics)

@@ -38,6 +38,7 @@ def run(args: Report) -> None:
         check_file(path, "report", [folder.path / "config.json"], is_report)
     try:
         dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
+        dataset = record.with_refined_poses(dataset)
     except (OSError, ValueError) as error:
         _log.warning("%s; the report goes without the data set's cameras", str(error).partition(";")[0])
         dataset = None

@@ -127,7 +127,7 @@ class Source:
             self.record.check_data(place, f"name cameras with {self.option}")
             place = self.record.data
         config = record.config if (record := self.record or given.record) else FitConfig()
-        return data.load(
+        dataset = data.load(
             place,
             lazy=lazy,
             points=False,
@@ -136,6 +136,7 @@ class Source:
             times=config.data.times if args.times is None else args.times,
             test_cameras=config.data.test_cameras if args.test_cameras is None else args.test_cameras,
         )
+        return dataset if self.record is None else self.record.with_refined_poses(dataset)
 
     def split(self, dataset: Dataset, part: str, given: SceneInput) -> list[View]:
         """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of
@@ -231,7 +232,8 @@ def _captured(given: SceneInput) -> list[Camera]:
         dataset = load_dataset(given.record.data, given.record.config, lazy=True, points=False, semantics=False)
     except (ValueError, OSError, KeyError):
         return []
-    return [view.camera.undistorted() for view in dataset.views if view.name in names]
+    views = given.record.with_refined_poses(dataset).views
+    return [view.camera.undistorted() for view in views if view.name in names]
 
 
 def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:

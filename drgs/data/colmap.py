@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,10 +104,22 @@ def load_colmap(
         colors=colors if len(xyz) else None,
         point_source=source,
         absent=absent,
+        reprojection=_reprojection(reconstruction),
     )
 
 
 COLMAP = Format(lambda path: find_model(path) is not None, load_colmap, MODEL_FOLDERS)
+
+
+def _reprojection(reconstruction: Any) -> float | None:
+    """Median over the points of their mean reprojection error, as an angle at the middle of an image."""
+    errors = [point.error for point in reconstruction.points3D.values() if math.isfinite(point.error)]
+    errors = [error for error in errors if error > 0]  # of points that were never adjusted it is -1 or 0
+    if not errors:
+        return None
+    return float(
+        np.median(errors) / np.median([camera.mean_focal_length() for camera in reconstruction.cameras.values()])
+    )
 
 
 def _image_folder(path: Path, model: Path) -> Path:

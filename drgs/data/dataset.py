@@ -38,6 +38,8 @@ class Dataset:
             empty: the other rules hold.
         frames: Numbers of the frames that were used, the same of each video or camera, one for each of `times`; empty
             where there are no synchronous cameras.
+        reprojection: Median angle in radians between observations of the data set's points and where its cameras see
+            these points; None where it states none.
     """
 
     path: Path
@@ -52,6 +54,7 @@ class Dataset:
     semantics: Semantics | None = None
     test_cameras: tuple[str, ...] | None = None
     frames: tuple[int, ...] = ()
+    reprojection: float | None = None
 
     @property
     def times(self) -> tuple[float, ...]:

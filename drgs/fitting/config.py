@@ -40,6 +40,7 @@ __all__ = [
     "MaskUse",
     "MotionConfig",
     "PickPoints",
+    "PoseUse",
     "RateConfig",
     "Restart",
     "SavingConfig",
@@ -59,6 +60,7 @@ PickPoints = Literal["auto", "uncovered", "none"]
 Restart = Literal["auto", "always", "never"]
 Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
+PoseUse = Literal["fixed", "auto", "refined"]
 TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
@@ -98,6 +100,8 @@ class DataConfig(Record):
             valid where undistorted photographs have empty corners; ignore reads none.
         exposure: Multiply what is rendered for a photograph by its own gain of R, G and B: none (off), those that
             initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
+        poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
+            fitted, where observations of a COLMAP model are clearly off.
     """
 
     max_pixels: int = 130_000
@@ -108,6 +112,7 @@ class DataConfig(Record):
     times: int = 40
     mask: MaskUse = "auto"
     exposure: ExposureUse = "off"
+    poses: PoseUse = "fixed"
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:

@@ -10,6 +10,9 @@ pixels of the photograph that samples it most finely [1, eq. 7 to 9]:
 What is fitted, and what density control divides, are S and o; whatever a fit shows, saves and measures are S' and o',
 so that viewers know of no filter. The 2D filter of [1] is not here: the screen is the renderer's business.
 
+It helps where all renderers of a fit widen Gaussians on the screen, as `gsplat` does, which leaves them too narrow for
+others and for larger pictures. A fit for all renderers gains nothing by it, and may lose (benchmarks/filter_3d.py).
+
 Reference:
     [1] Yu et al., "Mip-Splatting: Alias-free 3D Gaussian Splatting", CVPR 2024, and its code.
 """
@@ -26,9 +29,9 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["TENSOR", "Filter3D", "filtered", "sampling_rates"]
+__all__ = ["VARIANCES", "Filter3D", "filtered", "sampling_rates"]
 
-TENSOR = "filter_3d"
+VARIANCES = "filter_3d"
 """Name of the filter's variances in a checkpoint, one a Gaussian."""
 
 _STRENGTH = 0.2  # s of [1]: the variance in squared intervals between samples

@@ -16,9 +16,10 @@ from drgs.fitting.rows import GaussianRows
 if TYPE_CHECKING:
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.frames import Frame
+    from drgs.fitting.poses import Poses
     from drgs.integrator import Output
 
-__all__ = ["Parts", "means_rate", "parts_of", "with_exposure"]
+__all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Parts:
         couple_features: Whether gradients of the features that are rendered reach the geometry.
         filter_3d: The low-pass filter that is in `scene` already; None: there is none.
         exposure: What a photograph shows of a rendering, before terms of the loss see it; None: the rendering.
+        poses: Cameras of photographs as they are fitted, one of `networks`; None: they stay where the data set says.
     """
 
     terms: Sequence[LossTerm]
@@ -45,6 +47,7 @@ class Parts:
     couple_features: bool = True
     filter_3d: Filter3D | None = None
     exposure: Callable[[Output, Frame], Output] | None = None
+    poses: Poses | None = None
 
 
 def parts_of(config: FitConfig, extent: float, channels: int | None = None) -> Parts:
@@ -105,3 +108,19 @@ def with_exposure(
         frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
     )
     return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
+
+
+def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float, reach: float) -> Parts:
+    """The parts with poses of photographs, as stated until they are fitted.
+
+    Args:
+        parts: Parts of a fit without.
+        frames: Its training photographs.
+        config: Its configuration.
+        extent: Extent of the scene, its unit of length.
+        reach: How far a pose may move what its picture shows, root mean square in pixels.
+    """
+    from drgs.fitting.poses import Poses, pose_network
+
+    poses = Poses([frame.camera for frame in frames], extent, config.settings, reach)
+    return dataclasses.replace(parts, networks=[*parts.networks, pose_network(poses)], poses=poses)

@@ -10,16 +10,19 @@ import dataclasses
 import logging
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
+from drgs.data.camera_lists import load_cameras_json
 from drgs.files import CONFIG_SCHEMA, Run, load_ply, load_state
 from drgs.fitting.config import FitConfig, recorded_config
-from drgs.fitting.filter_3d import TENSOR as FILTER_3D
-from drgs.fitting.filter_3d import filtered
+from drgs.fitting.filter_3d import VARIANCES, filtered
 from drgs.fitting.networks import saved_networks
+from drgs.fitting.poses import CAMERAS
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
 from drgs.fitting.transients import TENSOR as TRANSIENT
@@ -53,7 +56,7 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _CONFIG = {"data": str, "train": [str], "test": [str], "fit": {"settings": dict}}
-_OPTIONAL = {"times": [float], "estimated": [str]}
+_OPTIONAL = {"times": [float], "estimated": [str], "poses": {"refined": bool}}
 _VIEW = {"index": int, "name": str}
 _HEADER = {
     "step": int,
@@ -81,6 +84,8 @@ class FitRecord:
         times: Times of the views, sorted, where it was fitted to what moves; else none.
         estimated: Unknowns of the photographs that were estimated beside the scene: information about the scene is
             what is left when they are eliminated.
+        refined: Photograph -> world-to-camera pose (4, 4) as refined beside the scene, which the data set states
+            otherwise; empty where poses were fixed, or before the first checkpoint.
     """
 
     data: Path
@@ -90,6 +95,17 @@ class FitRecord:
     semantics: SemanticRecord | None = None
     times: tuple[float, ...] = ()
     estimated: tuple[Nuisance, ...] = ()
+    refined: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    def with_refined_poses(self, dataset: Dataset) -> Dataset:
+        """The data set with the cameras of the photographs where the fit has found them.
+
+        Whoever compares photographs with a run, or asks what known views tell, has to load them so.
+        """
+        for view in dataset.views:
+            if view.name in self.refined:
+                view.camera = dataclasses.replace(view.camera, w2c=self.refined[view.name])
+        return dataset
 
     @property
     def is_active(self) -> bool:
@@ -161,8 +177,8 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
         gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # to be looked at, not to be fitted
-        if FILTER_3D in tensors:
-            gaussians = filtered(gaussians, tensors[FILTER_3D])
+        if VARIANCES in tensors:
+            gaussians = filtered(gaussians, tensors[VARIANCES])
         gaussians.validate(str(run.state))
         networks = saved_networks(tensors, header)
         if known is not None:
@@ -324,7 +340,28 @@ def fit_record(run: Run) -> FitRecord:
         SemanticRecord.from_json(config.get("semantics"), f"{where}: semantics"),
         tuple(config.get("times", ())),
         estimated,
+        _refined_poses(run, config, advice),
     )
+
+
+def _refined_poses(run: Run, config: dict, advice: str) -> dict[str, np.ndarray]:
+    """The poses that a fit has refined, by photograph.
+
+    Raises:
+        FileNotFoundError: If there is a checkpoint of such a fit, but not the file with its cameras.
+        ValueError: If that is damaged, or has other photographs.
+    """
+    if not config.get("poses", {"refined": False})["refined"]:
+        return {}
+    path = run.path / CAMERAS
+    if not path.is_file():
+        if run.state.is_file():
+            raise FileNotFoundError(f"{path}: must hold the cameras that the fit has refined, found none; {advice}")
+        return {}
+    poses = {camera.name: camera.w2c for camera in load_cameras_json(path)}
+    if set(poses) != set(config["train"]):
+        raise ValueError(f"{path}: must hold the {len(config['train'])} training photographs, does not; {advice}")
+    return poses
 
 
 def fitted_views(run: Run, record: FitRecord | None = None) -> list[str]:
@@ -412,8 +449,8 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     state = torch.Generator().get_state()
     generators = ("rng",) if header.get("active") is None else ("rng", "policy_rng")
     expected |= {name: (state.dtype, tuple(state.shape)) for name in generators}
-    if FILTER_3D in tensors or header["config"].get("filter_3d") == "on":
-        expected[FILTER_3D] = torch.float32, (count,)
+    if VARIANCES in tensors or header["config"].get("filter_3d") == "on":
+        expected[VARIANCES] = torch.float32, (count,)
     for name in tensors:
         if name.startswith(TRANSIENT):
             expected[name] = torch.uint8, (length(name, 0), length(name, 1))

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from drgs.files import load_state
+from drgs.fitting.poses import CAMERAS
 from drgs.fitting.records import check_checkpoint, is_fit_config
 from drgs.fitting.semantic_record import EMBEDDINGS
 from drgs.guards.outputs import claim, replacing
@@ -30,6 +31,7 @@ FILES = (
     "metrics.json",
     "selection.json",
     EMBEDDINGS,
+    CAMERAS,
     "point_cloud.ply",
     "report.html",
     *_CHECKPOINTS,

@@ -9,7 +9,7 @@ import torch
 
 from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
-from drgs.fitting.parts import parts_of, with_exposure
+from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.frames import Frame
     from drgs.fitting.parts import Parts
+    from drgs.fitting.poses import PoseEvidence
     from drgs.fitting.semantic_record import SemanticRecord
 
 __all__ = ["motion_of", "start"]
@@ -61,8 +62,8 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
-) -> tuple[Trainer, str, ExposureEstimate | None]:
-    """A trainer at step 0, where its points come from, and what they say of exposure, where that is asked for.
+) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None]:
+    """A trainer at step 0, where its points come from, and what is known of exposure and poses, where asked for.
 
     Points come, by default, if `strict`, only from `views`.
     """
@@ -94,4 +95,14 @@ def start(
             bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else 'off, all have the same'}")
         if is_on:
             made = with_exposure(made, frames, config, found)
-    return Trainer(config, frames, model, extent, made, motion), source, found
+    evidence = None
+    if parts is None and config.data.poses != "fixed":
+        from drgs.fitting.poses import PoseEvidence
+
+        with Bar("poses") as bar:
+            evidence = PoseEvidence.of(dataset.reprojection, frames)
+            is_on = config.data.poses == "refined" or evidence.is_clear
+            bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
+        if is_on:
+            made = with_poses(made, frames, config, extent, evidence.reach)
+    return Trainer(config, frames, model, extent, made, motion), source, found, evidence

@@ -15,10 +15,11 @@ import torch
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.density import add_gaussians, explore, relocate
-from drgs.fitting.filter_3d import TENSOR as FILTER_3D
+from drgs.fitting.filter_3d import VARIANCES
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
+from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
@@ -35,7 +36,7 @@ __all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10
 # Parts of names in a checkpoint, not of networks.
-_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng", "transient", FILTER_3D}
+_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng", "transient", VARIANCES}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,9 +161,11 @@ class Trainer:
         events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
         events += self._prepare(done)
         if self.transients.is_due(done, config.max_steps, len(self.frames)):
-            events.append(self.transients.look(self.frames, self.gaussians(), config.settings))
+            events.append(self.transients.look(self.photographs(), self.gaussians(), config.settings))
         frame = self.frames[self._next_view()]
         gaussians = self._fitted_scene().at(frame.camera.time)
+        if self.parts.poses is not None:
+            frame = self._posed(frame)
         out = self._shown(gaussians, frame)
         if self.parts.exposure is not None:
             out = self.parts.exposure(out, frame)
@@ -199,6 +202,13 @@ class Trainer:
         psnr = psnr_of(mse) if math.isfinite(mse) else None
         return StepResult(float(loss.detach()), terms, psnr, frame.name, events)  # told, not optimized
 
+    def photographs(self) -> list[Frame]:
+        """The training photographs, their cameras where they are now."""
+        if self.parts.poses is not None:
+            for frame in self.frames:
+                frame.camera = self.parts.poses.camera(frame.name)
+        return self.frames
+
     def network(self, name: str) -> torch.nn.Module | None:
         """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
         return next((network.module for network in self.parts.networks if network.name == name), None)
@@ -226,7 +236,7 @@ class Trainer:
         for network in self.parts.networks:
             tensors |= network.state()
         if self.parts.filter_3d is not None:
-            tensors[FILTER_3D] = self.parts.filter_3d.variances
+            tensors[VARIANCES] = self.parts.filter_3d.variances
         masks, found = self.transients.state(self.frames)
         tensors |= masks
         header = {
@@ -294,7 +304,7 @@ class Trainer:
         for network in trainer.parts.networks:
             network.restore(tensors, where)
         if parts.filter_3d is not None:
-            parts.filter_3d.variances = tensors[FILTER_3D]
+            parts.filter_3d.variances = tensors[VARIANCES]
         trainer.transients.restore(frames, tensors, header, where)
         trainer.step_index = header["step"]
         trainer.bad_steps = header["bad_steps"]
@@ -348,7 +358,7 @@ class Trainer:
     def _sample(self) -> None:
         """How finely the photographs sample the Gaussians, after one or the other has changed."""
         if self.parts.filter_3d is not None:
-            self.parts.filter_3d.sample(self.rows.tensors["means"], [frame.camera for frame in self.frames])
+            self.parts.filter_3d.sample(self.rows.tensors["means"], [frame.camera for frame in self.photographs()])
 
     def _stage(self) -> Stage:
         """The steps that density control runs over now."""
@@ -377,6 +387,16 @@ class Trainer:
         view = int(self._queue[0])
         self._queue = self._queue[1:].clone()
         return view
+
+    def _posed(self, frame: Frame) -> Frame:
+        """A photograph with its camera as it is now; gradients reach the pose while poses are fitted."""
+        poses = self.parts.poses
+        assert poses is not None
+        if is_due(self._part()):
+            if not poses.has_begun:
+                poses.begin(self.gaussians())
+            return poses(frame)
+        return dataclasses.replace(frame, camera=poses.camera(frame.name))
 
     def _shown(self, gaussians: Gaussians, frame: Frame) -> Output:
         """What the terms need to see of the Gaussians in a photograph's view."""
