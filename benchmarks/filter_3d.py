@@ -1,10 +1,10 @@
 """Pictures larger than those of a fit: with the 3D filter and without, by renderer and size.
 
-    python benchmarks/filter_3d.py [--scenes head ...] [--trained any gsplat] [--seeds 1]
+    python benchmarks/filter_3d.py [--scenes head ...] [--trained any gsplat] [--seeds 1] [--page]
 
-Appends one row a fit to benchmarks/filter_3d.jsonl as it ends, leaves out what is there, then prints the table. The
-same held-out photographs are rendered at one, two and four times the width and height at which the others were fitted.
-Scenes are captures by name. One thread.
+Appends one row a fit to benchmarks/filter_3d.jsonl as it ends, leaves out what is there, then writes the table of
+docs/one-model.md. The same held-out photographs are rendered at one, two and four times the width and height at which
+the others were fitted. Scenes are captures by name. One thread.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.fitting.start import start  # noqa: E402
 from drgs.metrics import through_renderers  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "filter_3d.jsonl"
+PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("banana", "fern", "statue", "head", "lego")
 PIXELS = {"lego": 10_000}  # whose photographs have 400x400; of others 12,000
 SIZE = {"max_steps": 400, "max_gaussians": 8_000}
@@ -82,25 +84,25 @@ def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
 
 
 def table(found: list[dict]) -> str:
-    """Mean held-out PSNR without the filter, and what the filter adds, by scene, renderer and size; mean over seeds."""
-    heads = [f"{name} {scale}x" for name in SEEN for scale in SCALES]
-    lines = ["| capture | fitted for | filter | " + " | ".join(heads) + " |", "|---" * (3 + len(heads)) + "|"]
-    for scene, trained in dict.fromkeys((row["scene"], row["trained"]) for row in found):
-        means = {}
-        for use in ("off", "on"):
-            mine = [row for row in found if (row["scene"], row["trained"], row["filter"]) == (scene, trained, use)]
-            for scale in SCALES if mine else ():
-                for name in SEEN:
-                    values = [statistics.mean(row["psnr"][str(scale)][name]) for row in mine]
-                    means[use, name, scale] = statistics.mean(values)
-        for use in ("off", "on"):
+    """Held-out PSNR without the filter and what the filter adds, on average, least and most."""
+    lines = ["| fitted for | size | " + " | ".join(f"`{name}`" for name in SEEN) + " |", "|---" * (2 + len(SEEN)) + "|"]
+    for trained in dict.fromkeys(row["trained"] for row in found):
+        mine = {row["scene"]: {} for row in found if row["trained"] == trained}
+        for row in found:
+            if row["trained"] == trained:
+                mine[row["scene"]].setdefault(row["filter"], []).append(row["psnr"])
+        pairs = [uses for uses in mine.values() if len(uses) == 2]
+        for scale in SCALES if pairs else ():
             cells = []
             for name in SEEN:
-                for scale in SCALES:
-                    value = means.get((use, name, scale))
-                    base = means.get(("off", name, scale), 0.0) if use == "on" else 0.0
-                    cells.append("-" if value is None else f"{value - base:{'+' if use == 'on' else ''}.2f}")
-            lines.append(f"| {scene} | {trained} | {use} | {' | '.join(cells)} |")
+                off, on = (
+                    [statistics.mean(statistics.mean(psnr[str(scale)][name]) for psnr in uses[use]) for uses in pairs]
+                    for use in ("off", "on")
+                )
+                added = [y - x for x, y in zip(off, on, strict=True)]
+                span = f"{min(added):+.2f} to {max(added):+.2f}"
+                cells.append(f"{statistics.mean(off):.2f}, {statistics.mean(added):+.2f} ({span})")
+            lines.append(f"| {trained} | {scale}x | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -110,9 +112,10 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
     parser.add_argument("--trained", nargs="+", default=["any", "gsplat"], help="as `drgs fit --for` takes them")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
     done = {tuple(row[name] for name in KEY) for row in rows()}
-    for scene in args.scenes:
+    for scene in [] if args.page else args.scenes:
         for trained in args.trained:
             for seed in range(args.seeds):
                 for use in ("off", "on"):
@@ -121,7 +124,9 @@ def main() -> None:
                         with ROWS.open("a") as file:
                             file.write(json.dumps(row) + "\n")
                         print(scene, trained, use, seed, f"{row['seconds']:.0f} s", flush=True)
-    print(table(rows()))
+    text = table(rows())
+    print(text)
+    fill_between(PAGE, "filter_3d", text)
 
 
 if __name__ == "__main__":
