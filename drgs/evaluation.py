@@ -90,9 +90,8 @@ def evaluate_run(
     )
     refined: dict[str, Any] = {}
     if recorded.refined:
-        held_out = frames if split == "test" else load_frames(test, config.data.max_pixels, config.data.mask)
-        found = [view.camera for view in train]
-        refined = {"poses": {**displacement(stated, found), **refined_scores(scene, held_out, config.settings)}}
+        told = refined_scores(scene, frames, config.settings) if split == "test" and scale == 1 else {}
+        refined = {"poses": {**displacement(stated, [view.camera for view in train]), **told}}
     wanted = renderers_to_measure(config.renderers, config.settings, renderer)
     renderers = through_renderers(scene, frames, wanted, split)
     return write_metrics(
@@ -123,9 +122,9 @@ def _most_pixels(views: list[View], max_pixels: int, scale: float) -> int:
         camera = view.checked().camera
         width, height = reduced_size(camera, max_pixels)
         if scale * width > camera.width or scale * height > camera.height:
-            most = min(camera.width / width, camera.height / height)
+            most = math.floor(100 * min(camera.width / width, camera.height / height)) / 100  # never more than it has
             raise ValueError(
-                f"eval: scale must be at most {most:.3g}, since photograph {view.name} has {camera.width}x"
+                f"eval: scale must be at most {most:g}, since photograph {view.name} has {camera.width}x"
                 f"{camera.height} pixels, got {scale:g}; lower it, or fit with fewer --max-pixels"
             )
     return round(max_pixels * scale**2)

@@ -42,7 +42,7 @@ from drgs.fitting.config import (
 from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
-from drgs.fitting.poses import CAMERAS, POSE_NETWORK, PoseEvidence
+from drgs.fitting.poses import CAMERAS, POSE_NETWORK
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
+    from drgs.fitting.poses import PoseEvidence
     from drgs.information.pool import Workers
 
 __all__ = [
@@ -194,8 +195,7 @@ def _fit(
         if parts is None and EXPOSURE in header.get("networks", ()):
             made = with_exposure(made, frames, config)
         if parts is None and POSE_NETWORK in header.get("networks", ()):
-            known = PoseEvidence.of(dataset.reprojection, frames)
-            made = with_poses(made, frames, config, header["extent"], known.reach)
+            made = with_poses(made, frames, config, header["extent"])
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds = seconds_of(run, header) or 0.0
         exposure = evidence = None

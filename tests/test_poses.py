@@ -137,14 +137,31 @@ def test_no_camera_goes_further_than_its_reach(photographs):
     poses = Poses([frame.camera for frame in frames], 3.0, FAST, 0.5)
     poses.begin(g)
     means = g.means.detach().numpy()
+    weights = np.append(g.logit_opacities.detach().sigmoid().numpy(), 1.0)
     with torch.no_grad():
         for row, z in enumerate(poses.coordinates):
             u = torch.randn(6, generator=torch.Generator().manual_seed(row), dtype=torch.float64) * 0.02
             z += torch.linalg.solve(poses.whitening[row], u)
     poses.hold_reach()
     for frame, now in zip(frames, poses.cameras(), strict=True):
-        apart_by = np.linalg.norm(now.project(means)[0] - frame.camera.project(means)[0], axis=1)
-        assert np.sqrt(np.square(apart_by).mean()) == pytest.approx(0.5, rel=0.05)
+        middle = frame.camera.c2w[:3, 3] + 3.0 * frame.camera.c2w[:3, 2]
+        points = np.concatenate([means, middle[None]])
+        apart_by = np.linalg.norm(now.project(points)[0] - frame.camera.project(points)[0], axis=1)
+        assert np.sqrt(np.average(np.square(apart_by), weights=weights)) == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_camera_that_sees_nothing_has_a_reach(photographs):
+    """Where the picture is empty when refinement begins, a step is bounded like any other."""
+    g, frames, _ = photographs
+    away = dataclasses.replace(frames[0].camera, w2c=np.diag([-1.0, 1, -1, 1]) @ frames[0].camera.w2c)
+    poses = Poses([away, *(frame.camera for frame in frames[1:])], 3.0, FAST, 0.5)
+    poses.begin(g)
+    with torch.no_grad():
+        poses.coordinates[0] += 5e-3  # a first step of Adam
+    poses.hold_reach()
+    middle = (away.c2w[:3, 3] + 3.0 * away.c2w[:3, 2])[None]
+    moved = poses.cameras()[0].project(middle)[0] - away.project(middle)[0]
+    assert 0 < np.linalg.norm(moved) < 0.6
 
 
 def test_a_camera_is_refined_against_its_photograph(photographs):

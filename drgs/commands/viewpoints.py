@@ -136,7 +136,9 @@ class Source:
             times=config.data.times if args.times is None else args.times,
             test_cameras=config.data.test_cameras if args.test_cameras is None else args.test_cameras,
         )
-        return dataset if self.record is None else self.record.with_refined_poses(dataset)
+        if record is None or record.data.resolve() != place.resolve():
+            return dataset
+        return record.with_refined_poses(dataset)
 
     def split(self, dataset: Dataset, part: str, given: SceneInput) -> list[View]:
         """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of

@@ -58,7 +58,8 @@ class Filter3D(torch.nn.Module):
             means: (N, 3) world; nothing is differentiated through them.
             cameras: Those of the photographs, of the size at which these are fitted.
         """
-        # A rate is a maximum over cameras of what changes little from step to step: constant in between, as in [1].
+        # A rate is a maximum over cameras of what changes little from step to step: constant in between, and after the
+        # last density control.
         rates = sampling_rates(means.detach().double().cpu().numpy(), cameras)
         seen = rates[rates > 0]
         # Nothing shows what no camera sees: it gets the filter of the most coarsely sampled of the others [1, code].

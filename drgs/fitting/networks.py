@@ -27,7 +27,7 @@ class Network:
         module: What losses, or the scene, call.
         rate: Its learning rate.
         factors: Factors of the learning rate of some parameters, by name, e.g. of those that have a unit of length.
-        constraint: Called after every step, to restore what must hold exactly; None: nothing must.
+        constraint: Called after every step that changes the module, to restore what must hold; None: nothing must.
         fused: One pass of the optimizer over the memory of a parameter, for large ones; rounds in other places.
         optimizer: Adam, with torch's defaults.
     """
@@ -58,6 +58,11 @@ class Network:
         """The learning rate for a step after the fraction `part` of the fit."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate_at(self.rate, part) * group["factor"]
+
+    def hold(self) -> None:
+        """Restore what must hold after a step, unless its rate was 0."""
+        if self.constraint is not None and any(group["lr"] for group in self.optimizer.param_groups):
+            self.constraint()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that a checkpoint needs, by name; a tensor that has several names is copied under each of them."""

@@ -110,7 +110,7 @@ def with_exposure(
     return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
 
 
-def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float, reach: float) -> Parts:
+def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float, reach: float = 0.0) -> Parts:
     """The parts with poses of photographs, as stated until they are fitted.
 
     Args:
@@ -118,7 +118,8 @@ def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: flo
         frames: Its training photographs.
         config: Its configuration.
         extent: Extent of the scene, its unit of length.
-        reach: How far a pose may move what its picture shows, root mean square in pixels.
+        reach: How far a pose may move what its picture shows, root mean square in pixels; of a fit that goes on it is
+            the checkpoint's.
     """
     from drgs.fitting.poses import Poses, pose_network
 

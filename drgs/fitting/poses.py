@@ -15,8 +15,8 @@ the complement of the 7 tangents of this group: held exactly in u, for motions o
 
 **Reach.** A few photographs can be fitted better by cameras that are far off and Gaussians that suit them. So no camera
 may go further than the data set's own residual says it can be wrong: what its pose moves the Gaussians in its picture
-by, root mean square, is at most `_REACH` times the median reprojection error. Where the data set brings none, it is
-`_UNKNOWN` pixels.
+by, root mean square, is at most `_REACH` times the median reprojection error, but for what the gauge then adds. Where
+the data set brings none, it is `_UNKNOWN` pixels.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ POSE_NETWORK = "poses"
 CAMERAS = "refined_cameras.json"
 """File of a run with the cameras of its training photographs, as refined."""
 
-# Pixels of the fit: median reprojection error from which on poses are refined. Measured: in a capture with 0.13 px
-# refining costs 0.9 dB of held-out PSNR (400 steps); in a made one whose poses are 1.2 px off it gains 2.3 dB (600).
-_CLEAR = 0.5
+_CLEAR = 0.5  # pixels of the fit: median reprojection error from which on refining pays (docs/one-model.md)
 _BEGIN, _END = 0.15, 0.9  # fractions of the fit between which poses are fitted: geometry first, and last alone
 _RATE = 5e-3  # of z at the begin, in changes of values (root mean square) a step; falls to 0
 _DAMPING = 1e-2  # of the mean eigenvalue of H, so that W exists where a picture says nothing about a direction
 _PIXELS = 4096  # of the picture that H is of, a preconditioner
 _REACH = 3.0  # times the reprojection error: bundle adjustment has hidden some of a pose's error in its points
+_NEAR = 0.25  # of the median depth: what is nearer may be a floater, whose shift would stand for the picture's
+_LEAST = 1e-4  # of H: a picture of nothing has no information, and its first step would be without measure
 _UNKNOWN = 2.0  # pixels of the fit, where a data set says nothing about its poses
 _AGAINST = 12  # steps at most of a camera that is refined against one photograph
 
@@ -118,30 +118,33 @@ class Poses(torch.nn.Module):
         names: V names of photographs.
         coordinates: V times z (6,), float64; 0 is the pose that the data set states.
         whitening: (V, 6, 6) float64, the matrices W; 0 before the refinement has begun.
-        shifts: (V, 6, 6) float64, mean over the Gaussians in a picture of D^T D, D (2, 6) what u moves them by, pixels;
-            0 before the refinement has begun.
+        shifts: (V, 6, 6) float64, mean over the Gaussians in a picture, by opacity, of D^T D, where D (2, 6) is what u
+            moves them by in pixels; 0 before the refinement has begun.
+        reach: Float64 scalar, how far a pose may move what its picture shows, root mean square in pixels.
     """
 
     whitening: torch.Tensor
     shifts: torch.Tensor
+    reach: torch.Tensor
 
-    def __init__(self, cameras: Sequence[Camera], extent: float, settings: RenderSettings, reach: float) -> None:
+    def __init__(self, cameras: Sequence[Camera], extent: float, settings: RenderSettings, reach: float = 0.0) -> None:
         """
         Args:
             cameras: V pinhole cameras of the photographs, named as these, as the data set states them.
             extent: Extent of the scene, its unit of length.
             settings: What information is computed with.
-            reach: How far a pose may move what its picture shows, root mean square in pixels.
+            reach: The reach; of a fit that goes on it is the checkpoint's.
         """
         super().__init__()
         self.names = [camera.name for camera in cameras]
         self._rows = {name: row for row, name in enumerate(self.names)}
         self._cameras = list(cameras)
         self._settings = settings
-        self._reach = reach
+        self._extent = extent
         self.coordinates = torch.nn.ParameterList(torch.zeros(6, dtype=torch.float64) for _ in cameras)
         self.register_buffer("whitening", torch.zeros(len(cameras), 6, 6, dtype=torch.float64))
         self.register_buffer("shifts", torch.zeros(len(cameras), 6, 6, dtype=torch.float64))
+        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
         centers = torch.tensor(np.stack([camera.c2w[:3, 3] for camera in cameras]))
         self._twist_of = torch.stack([_twist_of_u(center, extent) for center in centers])
         self._common = _common_motions(centers, extent)
@@ -153,7 +156,9 @@ class Poses(torch.nn.Module):
 
     def begin(self, gaussians: Gaussians) -> None:
         """Compute W of every photograph, and what its pose moves its picture by, from what the Gaussians are now."""
-        means = gaussians.means.detach().cpu().double()  # a metric of steps, not part of the loss
+        # A metric of steps, not part of the loss.
+        means = gaussians.means.detach().cpu().double()
+        opacities = gaussians.logit_opacities.detach().cpu().double().sigmoid()
         for row, camera in enumerate(self._cameras):
             small = at_most(camera, _PIXELS)
             changes = (
@@ -162,29 +167,30 @@ class Poses(torch.nn.Module):
                 .reshape(6, -1)
             )
             information = changes @ changes.T / changes.shape[1]
-            # The least that a float64 can add to 0: a picture of nothing has no information at all.
-            damping = _DAMPING * information.trace() / 6 + 1e-12
+            damping = _DAMPING * information.trace() / 6 + _LEAST
             lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
             self.whitening[row] = torch.linalg.inv(lower).T
-            moved = _moved(means, camera) @ self._twist_of[row]
-            self.shifts[row] = torch.einsum("nki,nkj->ij", moved, moved) / max(1, len(moved))
+            moved, weights = _moved(means, opacities, camera, self._extent)
+            moved = moved @ self._twist_of[row]
+            self.shifts[row] = torch.einsum("n,nki,nkj->ij", weights, moved, moved) / weights.sum()
 
     def forward(self, frame: Frame) -> Frame:
         """The photograph with its camera as it is now; gradients reach its pose."""
-        row = self._rows[frame.name]
-        twist = self._twist_of[row] @ self.whitening[row] @ self.coordinates[row]
-        w2c = torch.tensor(self._cameras[row].w2c) @ motion(-twist)
+        w2c = self._w2c(self._rows[frame.name])
         return dataclasses.replace(frame, camera=dataclasses.replace(frame.camera, w2c=w2c))
+
+    def _w2c(self, row: int) -> torch.Tensor:
+        """(4, 4) float64 pose of a photograph as it is now; differentiated."""
+        twist = self._twist_of[row] @ self.whitening[row] @ self.coordinates[row]
+        return torch.tensor(self._cameras[row].w2c) @ motion(-twist)
 
     def camera(self, name: str) -> Camera:
         """A photograph's camera at the size of the fit, with the pose as it is now, without a graph."""
         stated = self._cameras[self._rows[name]]
         if not self.has_begun:
             return stated
-        row = self._rows[name]
         with torch.no_grad():  # a number to be read
-            twist = self._twist_of[row] @ self.whitening[row] @ self.coordinates[row]
-            w2c = torch.tensor(stated.w2c) @ motion(-twist)
+            w2c = self._w2c(self._rows[name])
         return dataclasses.replace(stated, w2c=w2c.numpy())
 
     def cameras(self) -> list[Camera]:
@@ -198,12 +204,16 @@ class Poses(torch.nn.Module):
 
     def hold_reach(self) -> None:
         """Take every pose back towards the stated one, until its picture moves by the reach at most."""
+        if not self.has_begun:
+            return
         with torch.no_grad():  # a bound, no step
-            for row, z in enumerate(self.coordinates):
-                u = self.whitening[row] @ z
-                pixels = float((u @ self.shifts[row] @ u).clamp_min(0).sqrt())  # 0 but for rounding
-                if pixels > self._reach:
-                    z *= self._reach / pixels
+            z = torch.stack(list(self.coordinates))
+            u = (self.whitening @ z[..., None])[..., 0]
+            square = torch.einsum("vi,vij,vj->v", u, self.shifts, u).clamp_min(0)  # 0 but for rounding
+            # A pose that is as stated moves nothing, and 0 / 0 would be no number.
+            factors = (self.reach / square.sqrt().clamp_min(1e-300)).clamp_max(1)
+            for x, factor in zip(self.coordinates, factors, strict=True):
+                x *= factor
 
     def hold_gauge(self) -> None:
         """Take out of all poses what moves, turns or scales all cameras together."""
@@ -313,29 +323,43 @@ def _twist_of_u(center: torch.Tensor, extent: float) -> torch.Tensor:
     return out
 
 
-def _moved(points: torch.Tensor, camera: Camera) -> torch.Tensor:
-    """(N, 2, 6) what a twist of the camera moves points by, in pixels, for the N of `points` (P, 3) in its picture."""
+def _moved(
+    means: torch.Tensor, opacities: torch.Tensor, camera: Camera, extent: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What a twist of a camera moves its picture by.
+
+    Returns:
+        (N, 2, 6) pixels by which the N of `means` (P, 3) in the picture move, and their weights (N,), which are
+        opacities (P,). The last of them is a point in the middle of the picture at the distance `extent`, of weight 1:
+        a pose has a reach where the picture shows nothing, too.
+    """
     w2c = torch.tensor(camera.w2c)
     K = torch.tensor(camera.K)
-    inside = points @ w2c[:3, :3].T + w2c[:3, 3]
-    ahead = inside[:, 2] > 0
-    inside = inside[ahead]
-    pixels = inside[:, :2] / inside[:, 2:] * K.diagonal()[:2] + K[:2, 2]
-    seen = ((pixels > 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
+    middle = torch.tensor([[0.0, 0.0, extent]], dtype=torch.float64)
+    inside = torch.cat([means @ w2c[:3, :3].T + w2c[:3, 3], middle])
+    weights = torch.cat([opacities, torch.ones(1, dtype=torch.float64)])
+    depth = inside[:, 2].clamp_min(1e-12)  # those behind are left out below
+    pixels = inside[:, :2] / depth[:, None] * K.diagonal()[:2] + K[:2, 2]
+    sides = torch.tensor([camera.width, camera.height])
+    seen = (inside[:, 2] > 0) & ((pixels > 0) & (pixels < sides)).all(1)
+    seen &= depth >= _NEAR * depth[seen].median() if seen.any() else seen
+    seen[-1] = True  # an off-center principal point may have put it outside
     inside = inside[seen]
-    depth = inside[:, 2]
+    x, y, depth = inside.unbind(1)
     zero = torch.zeros_like(depth)
     projection = torch.stack(
         [
-            torch.stack([K[0, 0] / depth, zero, -K[0, 0] * inside[:, 0] / depth**2], 1),
-            torch.stack([zero, K[1, 1] / depth, -K[1, 1] * inside[:, 1] / depth**2], 1),
+            torch.stack([K[0, 0] / depth, zero, -K[0, 0] * x / depth**2], 1),
+            torch.stack([zero, K[1, 1] / depth, -K[1, 1] * y / depth**2], 1),
         ],
         1,
     )
-    # The camera's twist (w, v) moves a point against it, seen from the camera: by -(w x p + v), in world axes.
-    arms = torch.stack([_cross(point) for point in points[ahead][seen]]) if len(inside) else points.new_zeros(0, 3, 3)
-    against = torch.cat([arms, -torch.eye(3, dtype=points.dtype).expand(len(inside), 3, 3)], 2)
-    return projection @ w2c[:3, :3] @ against
+    # The camera's twist (w, v) moves a point p of the world against it, by -(w x p + v): p x w - v.
+    points = (inside - w2c[:3, 3]) @ w2c[:3, :3]
+    axes = torch.eye(3, dtype=torch.float64).expand(len(points), 3, 3)
+    arms = torch.linalg.cross(points[:, None].expand_as(axes), axes).transpose(1, 2)
+    against = torch.cat([arms, -axes], 2)
+    return projection @ w2c[:3, :3] @ against, weights[seen]
 
 
 def _common_motions(centers: torch.Tensor, extent: float) -> torch.Tensor:

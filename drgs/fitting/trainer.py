@@ -182,8 +182,7 @@ class Trainer:
             for optimizer in optimizers:
                 optimizer.step()
             for network in self.parts.networks:
-                if network.constraint is not None:
-                    network.constraint()
+                network.hold()
             stage = self._stage()
             density = config.density
             if density.noise and done - stage.begin < density.refine_stop * stage.length:
@@ -203,7 +202,7 @@ class Trainer:
         return StepResult(float(loss.detach()), terms, psnr, frame.name, events)  # told, not optimized
 
     def photographs(self) -> list[Frame]:
-        """The training photographs, their cameras where they are now."""
+        """The training photographs, whose cameras are put where they are now."""
         if self.parts.poses is not None:
             for frame in self.frames:
                 frame.camera = self.parts.poses.camera(frame.name)
