@@ -191,3 +191,26 @@ def test_cameras_are_taken_of_a_data_set_whose_maps_are_bad(place, tmp_path):
     (tmp_path / "data/rgb_feature_langseg/another_fmap_CxHxW.pt").write_bytes(b"damaged")
     args, shown = given(place, Tradeoff, cameras=str(tmp_path / "data"), limit=2)
     assert len(seen_views(args, shown)[0]) == 2
+
+
+def test_refined_poses_are_a_runs_however_its_photographs_are_named(place, tmp_path):
+    """By the run's default, by the run and by its data set; another data set keeps the poses that it states."""
+    shutil.copytree(place / "run", tmp_path / "run")
+    run = Run(tmp_path / "run")
+    config = run.config()
+    (run.path / "config.json").write_text(json.dumps(config | {"poses": {"reprojection": None, "refined": True}}))
+    args, its = given(place, Fisher)
+    stated = {camera.name: camera for camera in known_views(None, args, its).cameras}
+    moved = []
+    for camera in stated.values():
+        w2c = camera.w2c.copy()
+        w2c[0, 3] += 0.1
+        moved.append(dataclasses.replace(camera, w2c=w2c))
+    save_cameras_json(run.path / "refined_cameras.json", moved)
+    shutil.copytree(place / "data", tmp_path / "data")
+    args, its = given(tmp_path, Fisher)
+    for name, by in ((None, 0.1), (tmp_path / "run", 0.1), (place / "data", 0.1), (tmp_path / "data", 0.0)):
+        cameras = known_views(None if name is None else str(name), args, its).cameras
+        seen = [camera for camera in cameras if camera.name in stated]  # a data set has those that are held out, too
+        assert len(seen) == len(stated)
+        assert [camera.w2c[0, 3] - stated[camera.name].w2c[0, 3] for camera in seen] == pytest.approx([by] * len(seen))
