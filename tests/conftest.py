@@ -154,3 +154,19 @@ def made(monkeypatch):
 
         monkeypatch.setattr(kind, "__post_init__", counted)
     return counts
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """(preset, photograph) of every step of a fit, as it is rendered."""
+    import drgs.fitting.trainer as module
+
+    render = module.render
+    seen: list[tuple[str, str]] = []
+
+    def spied(gaussians, camera, settings, **options):
+        seen.append((settings.nearest_preset()[0], camera.name))
+        return render(gaussians, camera, settings, **options)
+
+    monkeypatch.setattr(module, "render", spied)
+    return seen

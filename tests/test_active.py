@@ -22,6 +22,7 @@ from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import SelectionConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import fitted_views
+from drgs.fitting.renderers import ANY
 from drgs.fitting.timetable import initial_views
 from drgs.information.prior import Prior
 from drgs.train import FitConfig, Trainer, fit
@@ -134,6 +135,16 @@ def config(**fields):
 
 def plan(**fields):
     return SelectionConfig.of(**{"policy": "farthest", "initial": 2, "add": 2, "every": 4, **fields})
+
+
+def test_renderers_are_taken_in_turn_while_views_are_picked(still, tmp_path, rendered):
+    """Views that come on the way meet every renderer, too; the run is measured in each of them."""
+    settings = config(renderers=("any",), max_steps=48, selection=plan(policy="fisher"))
+    result = fit(lazily(still), tmp_path / "run", settings, progress=False)
+    picked = [pick["name"] for pick in json.loads((tmp_path / "run/selection.json").read_text())["picks"]]
+    assert len(picked) == 2
+    assert {preset for preset, name in rendered if name in picked} == {"exact", "fast", "gsplat", "3dgut"}
+    assert {row["name"] for row in result.metrics["renderers"]["rows"]} == set(ANY)
 
 
 # ---- nothing is read before it is picked

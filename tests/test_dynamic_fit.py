@@ -27,6 +27,7 @@ from drgs.fitting.dynamics import FIELD, Motion
 from drgs.fitting.frames import load_frames
 from drgs.fitting.parts import parts_of
 from drgs.fitting.records import load_run
+from drgs.fitting.renderers import ANY
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import first_time, times_of
 from drgs.integrator import render
@@ -104,6 +105,15 @@ def test_two_cameras_are_told_of_before_the_first_step(dataset, tmp_path, caplog
         told.clear()
         fit(dataclasses.replace(dataset, views=views), tmp_path / name, config(max_steps=2), progress=False)
         assert told[0] == expected
+
+
+def test_renderers_are_taken_in_turn_in_the_dynamic_stage(dataset, tmp_path, rendered):
+    """What moves is fitted with all of them; the run is measured in each."""
+    result = fit(dataset, tmp_path / "run", config(renderers=("any",)), progress=False)
+    presets = [preset for preset, _ in rendered]
+    assert set(presets[4:]) == {"exact", "fast", "gsplat", "3dgut"}  # the static stage has four steps of twelve
+    assert result.metrics["motion"]["moving"] > 0
+    assert {row["name"] for row in result.metrics["renderers"]["rows"]} == set(ANY)
 
 
 def test_two_stages_leave_a_complete_run(dataset, tmp_path):

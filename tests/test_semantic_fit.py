@@ -139,6 +139,14 @@ def test_features_tell_the_teachers_classes(taught, size):
     assert float((found == labels)[labels > 0].float().mean()) > 0.75
 
 
+def test_features_learn_from_all_renderers_in_turn(taught, rendered):
+    """Each draws features and colors together, and the loss of the features falls under all of them."""
+    trainer = semantic_trainer(taught, renderers=("any",), max_steps=40)
+    losses = [trainer.step().terms["features"] for _ in range(40)]
+    assert {preset for preset, _ in rendered} == {"exact", "fast", "gsplat", "3dgut"}
+    assert np.mean(losses[-8:]) < 0.8 * np.mean(losses[:8])
+
+
 @pytest.mark.parametrize("size", ["image", "teacher"])
 def test_features_leave_the_geometry_alone(taught, size, monkeypatch):
     """Uncoupled, the gradients of everything but features are those of a fit of colors, to the bit; coupled, not.
