@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 import drgs
+from drgs import runtime
 from drgs.guards import interrupts
 from drgs.tracing.composite import Compositor
 
@@ -188,3 +190,34 @@ def test_pycolmap_is_imported_in_one_place():
     folder = Path(interrupts.__file__).parents[1]
     lines = [(path.name, line.strip()) for path in folder.rglob("*.py") for line in path.read_text().splitlines()]
     assert [name for name, line in lines if line == "import pycolmap"] == ["colmap_bindings.py"]
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_signal_in_traced_code_is_obeyed(inside):
+    """Dr.Jit makes a RuntimeError of what is raised in a branch that it traces; whoever runs a command, or what a fit
+    may leave anywhere, gets the signal's own error. Other errors stay as they are.
+    """
+    import drjit as dr
+
+    lib = runtime.dr_types()
+
+    def traced(error):
+        def stop(x):
+            raise error
+
+        go = dr.opaque(lib.Bool, True)
+        return dr.if_stmt((lib.UInt32(1),), go, stop, lambda x: x, mode="symbolic")
+
+    @contextlib.contextmanager
+    def block():
+        if not inside:
+            with interrupts.handled(lambda: None, str):
+                yield
+            return
+        with interrupts.between_steps(), interrupts.at_once():
+            yield
+
+    with pytest.raises(interrupts.Terminated), block():
+        traced(interrupts.Terminated(signal.SIGTERM))
+    with pytest.raises(RuntimeError, match="if_stmt"), block():
+        traced(ZeroDivisionError())
