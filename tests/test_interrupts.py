@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import subprocess
 import sys
@@ -13,8 +12,8 @@ import numpy as np
 import pytest
 
 import drgs
-from drgs import runtime
 from drgs.guards import interrupts
+from drgs.information import jacobian
 from drgs.tracing.composite import Compositor
 
 # A command that waits in Python, or in native code that no signal ends, which takes minutes.
@@ -192,32 +191,14 @@ def test_pycolmap_is_imported_in_one_place():
     assert [name for name, line in lines if line == "import pycolmap"] == ["colmap_bindings.py"]
 
 
-@pytest.mark.parametrize("inside", [False, True])
-def test_a_signal_in_traced_code_is_obeyed(inside):
-    """Dr.Jit makes a RuntimeError of what is raised in a branch that it traces; whoever runs a command, or what a fit
-    may leave anywhere, gets the signal's own error. Other errors stay as they are.
-    """
-    import drjit as dr
+def test_a_walk_is_interrupted_as_python_is(monkeypatch):
+    """Information is asked in loops and branches that Dr.Jit traces, with no operation around them."""
 
-    lib = runtime.dr_types()
+    def interrupted(*_):
+        raise interrupts.Terminated(signal.SIGTERM)
 
-    def traced(error):
-        def stop(x):
-            raise error
-
-        go = dr.opaque(lib.Bool, True)
-        return dr.if_stmt((lib.UInt32(1),), go, stop, lambda x: x, mode="symbolic")
-
-    @contextlib.contextmanager
-    def block():
-        if not inside:
-            with interrupts.handled(lambda: None, str):
-                yield
-            return
-        with interrupts.between_steps(), interrupts.at_once():
-            yield
-
-    with pytest.raises(interrupts.Terminated), block():
-        traced(interrupts.Terminated(signal.SIGTERM))
-    with pytest.raises(RuntimeError, match="if_stmt"), block():
-        traced(ZeroDivisionError())
+    monkeypatch.setattr(jacobian, "weighted_squares", interrupted)
+    one = drgs.Gaussians.from_arrays([[0, 0, 2.0]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.5], [[[0.0] * 3]])
+    K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+    with pytest.raises(interrupts.Terminated):
+        drgs.diagonal(one, drgs.Camera(K=K, w2c=np.eye(4), width=8, height=8))

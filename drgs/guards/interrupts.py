@@ -124,8 +124,7 @@ def handled(clean: Callable[[], None], say: Callable[[KeyboardInterrupt], str]) 
         watcher = threading.Thread(target=handlers.watch, args=(reader, leave), daemon=True)
         watcher.start()
         try:
-            with _obeyed():
-                yield
+            yield
         finally:
             signal.set_wakeup_fd(before)
             os.write(writer, b"\0")
@@ -164,8 +163,7 @@ def at_once() -> Iterator[None]:
         raise handlers.error()
     handlers.waits = False
     try:
-        with _obeyed():
-            yield
+        yield
     finally:
         handlers.waits = True
 
@@ -210,22 +208,6 @@ def reinstall() -> None:
         for signum in _SIGNALS:
             if (handler := signal.getsignal(signum)) is not None:
                 signal.signal(signum, handler)
-
-
-@contextlib.contextmanager
-def _obeyed() -> Iterator[None]:
-    """A signal that comes in Python code which Dr.Jit traces leaves it as an error of Dr.Jit's: it is raised as what it
-    was.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        cause = error.__cause__
-        while cause is not None and not isinstance(cause, KeyboardInterrupt):
-            cause = cause.__cause__
-        if cause is None:
-            raise
-        raise cause from None
 
 
 @contextlib.contextmanager

@@ -16,8 +16,9 @@ import torch
 
 from drgs.information.complement import Eliminated
 from drgs.information.pullback import Pullback
-from drgs.tracing.bridge import differentiable, own_errors
+from drgs.tracing.bridge import differentiable
 from drgs.tracing.call import Call
+from drgs.tracing.errors import own_errors
 from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:

@@ -51,8 +51,8 @@ from drgs.information.nuisances import Nuisances
 from drgs.information.pullback import Pullback
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
-from drgs.tracing.bridge import own_errors
 from drgs.tracing.call import Call
+from drgs.tracing.errors import own_errors
 from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from drgs.information.elimination import ViewRows
 from drgs.information.groups import Information
 from drgs.information.pullback import Pullback
 from drgs.information.replay import Replay
-from drgs.tracing.bridge import own_errors
 from drgs.tracing.call import Call
+from drgs.tracing.errors import own_errors
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -5,8 +5,7 @@ Not `dr.wrap`, whose description of its outputs is one global of all threads, an
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -19,27 +18,12 @@ from drgs.guards.derivatives import first_only, refuse_batched
 if TYPE_CHECKING:
     from drgs.tracing.call import Call
 
-__all__ = ["differentiable", "own_errors", "to_drjit"]
+__all__ = ["differentiable", "to_drjit"]
 
 
 def to_drjit(lib: ModuleType, x: torch.Tensor) -> Any:
     """A torch tensor as a Dr.Jit tensor of its precision; without its graph, which the functions below keep."""
     return (lib.TensorXf64 if x.dtype == torch.float64 else lib.TensorXf)(x.detach().contiguous())
-
-
-@contextlib.contextmanager
-def own_errors() -> Iterator[None]:
-    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said, and who
-    interrupted is obeyed."""
-    try:
-        yield
-    except RuntimeError as error:
-        cause = error.__cause__
-        while cause is not None and not isinstance(cause, ValueError | NotImplementedError | KeyboardInterrupt):
-            cause = cause.__cause__
-        if cause is None:
-            raise
-        raise cause from None
 
 
 def differentiable(call: Call) -> dict[str, torch.Tensor]:

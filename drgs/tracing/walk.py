@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import drjit as dr
 
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
+from drgs.tracing.errors import own_errors
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.protocols import Candidates, DividedStream, Kernel
@@ -241,7 +242,8 @@ class Part:
 
     def run(self, kernel: Kernel, check: bool = False) -> list[dict]:
         """Walk all rays with a kernel: final states of each shared ray; `check` keeps the certificate in `failed`."""
-        with dr.suspend_grad():  # kernels differentiate on their own: nothing of the loop is recorded
+        # Kernels differentiate on their own: nothing of the loop is recorded.
+        with own_errors(), dr.suspend_grad():
             if not self.ordered:
                 return self._in_order(kernel)
             return self._sorted(kernel, check)
