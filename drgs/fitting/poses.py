@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.display.progress import Bar
 from drgs.fitting.networks import Network
 from drgs.integrator import render, render_jvp
 from drgs.sizes import at_most
@@ -159,20 +160,19 @@ class Poses(torch.nn.Module):
         # A metric of steps, not part of the loss.
         means = gaussians.means.detach().cpu().double()
         opacities = gaussians.logit_opacities.detach().cpu().double().sigmoid()
-        for row, camera in enumerate(self._cameras):
-            small = at_most(camera, _PIXELS)
-            changes = (
-                render_jvp(gaussians, small, {"camera": self._twist_of[row].T.contiguous()}, self._settings, outputs=())
-                .rgb.double()
-                .reshape(6, -1)
-            )
-            information = changes @ changes.T / changes.shape[1]
-            damping = _DAMPING * information.trace() / 6 + _LEAST
-            lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
-            self.whitening[row] = torch.linalg.inv(lower).T
-            moved, weights = _moved(means, opacities, camera, self._extent)
-            moved = moved @ self._twist_of[row]
-            self.shifts[row] = torch.einsum("n,nki,nkj->ij", weights, moved, moved) / weights.sum()
+        with Bar("information about poses", len(self._cameras)) as bar:
+            for row, camera in enumerate(self._cameras):
+                tangents = {"camera": self._twist_of[row].T.contiguous()}
+                small = at_most(camera, _PIXELS)
+                changes = render_jvp(gaussians, small, tangents, self._settings, outputs=()).rgb.double().reshape(6, -1)
+                information = changes @ changes.T / changes.shape[1]
+                damping = _DAMPING * information.trace() / 6 + _LEAST
+                lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
+                self.whitening[row] = torch.linalg.inv(lower).T
+                moved, weights = _moved(means, opacities, camera, self._extent)
+                moved = moved @ self._twist_of[row]
+                self.shifts[row] = torch.einsum("n,nki,nkj->ij", weights, moved, moved) / weights.sum()
+                bar.advance()
 
     def forward(self, frame: Frame) -> Frame:
         """The photograph with its camera as it is now; gradients reach its pose."""
@@ -207,8 +207,7 @@ class Poses(torch.nn.Module):
         if not self.has_begun:
             return
         with torch.no_grad():  # a bound, no step
-            z = torch.stack(list(self.coordinates))
-            u = (self.whitening @ z[..., None])[..., 0]
+            u = self._u()
             square = torch.einsum("vi,vij,vj->v", u, self.shifts, u).clamp_min(0)  # 0 but for rounding
             # A pose that is as stated moves nothing, and 0 / 0 would be no number.
             factors = (self.reach / square.sqrt().clamp_min(1e-300)).clamp_max(1)
@@ -220,12 +219,14 @@ class Poses(torch.nn.Module):
         if not self.has_begun:
             return
         with torch.no_grad():  # a gauge, no step
-            z = torch.stack(list(self.coordinates))
-            u = (self.whitening @ z[..., None])[..., 0]
-            common = self._common @ (self._common.T @ u.reshape(-1))
+            common = self._common @ (self._common.T @ self._u().reshape(-1))
             back = torch.linalg.solve(self.whitening, common.reshape(-1, 6, 1))[..., 0]
             for x, shift in zip(self.coordinates, back, strict=True):
                 x -= shift
+
+    def _u(self) -> torch.Tensor:
+        """(V, 6) turns and moves of all cameras."""
+        return (self.whitening @ torch.stack(list(self.coordinates))[..., None])[..., 0]
 
     def words(self) -> str:
         """What became of the poses, in one line."""
