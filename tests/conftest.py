@@ -170,3 +170,28 @@ def rendered(monkeypatch):
 
     monkeypatch.setattr(module, "render", spied)
     return seen
+
+
+@pytest.fixture
+def whole_and_resumed(tmp_path, monkeypatch):
+    """Runs of one fit: without a stop, and stopped before step `at`, then resumed."""
+    from drgs.files import Run
+    from drgs.train import Trainer, fit
+
+    def runs(dataset, settings, at):
+        fit(dataset, tmp_path / "whole", settings, progress=False)
+        step = Trainer.step
+
+        def stopped(self):
+            if self.step_index == at:
+                raise KeyboardInterrupt
+            return step(self)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "step", stopped)
+            with pytest.raises(KeyboardInterrupt):
+                fit(dataset, tmp_path / "parts", settings, progress=False)
+        fit(dataset, tmp_path / "parts", settings, progress=False, resume=True)
+        return Run(tmp_path / "whole"), Run(tmp_path / "parts")
+
+    return runs

@@ -9,11 +9,11 @@ import torch
 from test_train import config, dataset  # noqa: F401 (a fixture)
 
 from drgs.cameras import orbit
-from drgs.files import Run, load_state
+from drgs.files import load_state
 from drgs.fitting.exposure import Exposure, estimate_exposure, exposure_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
-from drgs.train import SelectionConfig, Trainer, fit
+from drgs.train import SelectionConfig, fit
 
 
 def _photographs(gains, hidden=0.0, seed=0):
@@ -85,25 +85,12 @@ def test_learned_gains_keep_zero_mean_and_held_ones_stay():
     assert json.dumps(held.module.log_gains.tolist())
 
 
-def test_a_fit_with_gains_goes_on(dataset, tmp_path, monkeypatch):  # noqa: F811
+def test_a_fit_with_gains_goes_on(dataset, whole_and_resumed):  # noqa: F811
     """Stopped in its middle and resumed it ends with the same gains, Gaussians and record; information about the scene
     is asked for with exposure eliminated.
     """
     settings = config(max_steps=6, save_every=3, exposure="learned", deterministic=True)
-    fit(dataset, tmp_path / "whole", settings, progress=False)
-    step = Trainer.step
-
-    def stopped(self):
-        if self.step_index == 4:
-            raise KeyboardInterrupt
-        return step(self)
-
-    monkeypatch.setattr(Trainer, "step", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        fit(dataset, tmp_path / "parts", settings, progress=False)
-    monkeypatch.setattr(Trainer, "step", step)
-    fit(dataset, tmp_path / "parts", settings, progress=False, resume=True)
-    runs = [Run(tmp_path / name) for name in ("whole", "parts")]
+    runs = whole_and_resumed(dataset, settings, 4)
     states = [load_state(run.state)[0] for run in runs]
     assert states[0].keys() == states[1].keys()
     assert any(name.startswith("exposure.") for name in states[0])
