@@ -10,7 +10,6 @@ the others were fitted. Scenes are captures by name. One thread.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
@@ -23,7 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, ran  # noqa: E402
+from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -43,11 +42,6 @@ SCALES = (1, 2, 4)
 SEEN = ("exact", "fast", "gsplat", "3dgut")
 MOST = 6  # held-out views, evenly spaced
 KEY = ("scene", "trained", "filter", "seed", "max_pixels")
-
-
-def rows() -> list[dict]:
-    """What has been measured so far."""
-    return [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
 
 
 def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
@@ -114,17 +108,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
-    done = {tuple(row[name] for name in KEY) for row in rows()}
+    done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
     for scene in [] if args.page else args.scenes:
         for trained in args.trained:
             for seed in range(args.seeds):
                 for use in ("off", "on"):
                     if (scene, trained, use, seed, PIXELS.get(scene, 12_000)) not in done:
                         row = measured(scene, trained, use, seed)
-                        with ROWS.open("a") as file:
-                            file.write(json.dumps(row) + "\n")
+                        add_row(ROWS, row)
                         print(scene, trained, use, seed, f"{row['seconds']:.0f} s", flush=True)
-    text = table(rows())
+    text = table(read_rows(ROWS))
     print(text)
     fill_between(PAGE, "filter_3d", text)
 

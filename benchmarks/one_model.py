@@ -11,7 +11,6 @@ the same fit, so that other work on the machine takes from both.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
@@ -24,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, ran  # noqa: E402
+from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -40,11 +39,6 @@ PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("head", "bonsai", "office", "lego")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
 KEY = ("scene", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
-
-
-def rows() -> list[dict]:
-    """What has been measured so far."""
-    return [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
 
 
 def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> dict:
@@ -107,17 +101,16 @@ def main() -> None:
     parser.add_argument("--offset", type=int, default=0, help="of the held-out views")
     parser.add_argument("--page", action="store_true", help="fit nothing, write the tables of the rows that there are")
     args = parser.parse_args()
-    done = {tuple(row[name] for name in KEY) for row in rows()}
+    done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
     for scene in [] if args.page else args.scenes:
         for trained in args.trained:
             for seed in range(args.seeds):
                 if (Path(scene).name, trained, seed, args.offset, *SIZE.values()) not in done:
                     row = measured(scene, trained, seed, args.offset, SIZE)
-                    with ROWS.open("a") as file:
-                        file.write(json.dumps(row) + "\n")
+                    add_row(ROWS, row)
                     means = {name: round(statistics.mean(values), 2) for name, values in row["psnr"].items()}
                     print(scene, trained, seed, means, flush=True)
-    text = tables(rows())
+    text = tables(read_rows(ROWS))
     print(text)
     fill_between(PAGE, "one_model", text)
 

@@ -11,7 +11,6 @@ are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs s
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
@@ -24,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, ran  # noqa: E402
+from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -37,11 +36,6 @@ SCENES = ("office", "head", "banana", "fern", "statue")
 TERMS = ("", "exposure=points", "exposure=learned", "poses=refined", "transients=mask")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
 KEY = ("scene", "term", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
-
-
-def rows() -> list[dict]:
-    """What has been measured so far."""
-    return [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
 
 
 def measured(scene: str, term: str, offset: int, size: dict) -> dict:
@@ -115,17 +109,16 @@ def main() -> None:
     parser.add_argument("--offsets", nargs="+", type=int, default=[0], help="of the held-out views")
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
-    done = {tuple(row[name] for name in KEY) for row in rows()}
+    done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
     for offset in args.offsets:
         for scene in [] if args.page else args.scenes:
             for term in ("", *args.terms):
                 if (Path(scene).name, term, 0, offset, *SIZE.values()) not in done:
                     row = measured(scene, term, offset, SIZE)
-                    with ROWS.open("a") as file:
-                        file.write(json.dumps(row) + "\n")
+                    add_row(ROWS, row)
                     means = {name: round(statistics.mean(row[name]), 2) for name in ("psnr", "cc_psnr")}
                     print(scene, term or "none", means, row["found"], f"{row['seconds']:.0f} s", flush=True)
-    text = table(rows())
+    text = table(read_rows(ROWS))
     print(text)
     fill_between(PAGE, "photographs", text)
 

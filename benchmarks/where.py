@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import datetime
+import json
 import os
 from pathlib import Path
 
 from drgs import machine, runtime
 
-__all__ = ["DATA", "ROOT", "ran"]
+__all__ = ["DATA", "ROOT", "add_row", "ran", "read_rows"]
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
@@ -23,3 +24,14 @@ def ran() -> dict[str, str]:
         "date": datetime.date.today().isoformat(),
         "commit": machine.commit() or "unknown",
     }
+
+
+def read_rows(path: Path) -> list[dict]:
+    """What a study has measured so far: a JSON object a line."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def add_row(path: Path, row: dict) -> None:
+    """Add a row to a study, as soon as it is there."""
+    with path.open("a") as file:
+        file.write(json.dumps(row) + "\n")
