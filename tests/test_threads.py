@@ -148,7 +148,7 @@ import concurrent.futures, gc, sys, time
 import drjit as dr
 import numpy as np
 import torch
-from drgs import fisher
+from drgs import fisher, runtime
 from drgs.integrator import render
 from drgs.lab.accuracy import random_camera, random_gaussians
 from drgs.settings import RenderSettings
@@ -157,6 +157,14 @@ SETTINGS = RenderSettings.preset("fast")
 rng = np.random.default_rng(0)
 g, cam = random_gaussians(rng, 10, 1), random_camera(rng, (18, 14))
 lib = dr.llvm.ad
+
+@runtime.alone
+def leave_cycles():
+    for _ in range(5):
+        numbers = lib.Float(torch.ones(7))
+        dr.enable_grad(numbers)
+        cycle = [numbers * numbers]  # the graph alone keeps the numbers
+        cycle.append(cycle)
 
 def work(_):
     fisher.diagonal(g.detach(), cam, SETTINGS, "probes", probes=2)
@@ -171,11 +179,7 @@ with concurrent.futures.ThreadPoolExecutor(4) as pool:
     while time.monotonic() < end:
         running = [each for each in running if not each.done() or each.result() is not None]
         running += [pool.submit(work, 0) for _ in range(6 - len(running))]
-        numbers = lib.Float(torch.ones(7))
-        dr.enable_grad(numbers)
-        cycle = [numbers, 2 * numbers]
-        cycle.append(cycle)
-        del numbers, cycle
+        leave_cycles()  # as `dr.wrap` does
         gc.collect()
         render(g, cam, SETTINGS)  # whose graph nobody wants
 print("ended")
