@@ -1,11 +1,12 @@
 """What is modeled of single photographs, on and off: exposure, poses, transients, in paired fits of captures.
 
-    python benchmarks/photographs.py [--scenes head office ...] [--terms exposure=points ...] [--offsets 0] [--page]
+    python benchmarks/photographs.py [--scenes head office ...] [--terms exposure=points ...] [--seeds 3] [--page]
 
 Every fit has the defaults of `drgs fit` but for its size and the one term that its row names; what is said of a term
 is a difference to the fit without, of the same scene, split and seed. Appends one row a fit to
-benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the table of docs/one-model.md. Scenes
-are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. One thread.
+benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md. Scenes
+are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. Each seed
+holds out other views, but of data sets that have a split of their own. One thread.
 """
 
 from __future__ import annotations
@@ -23,25 +24,27 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, add_row, ran, read_rows  # noqa: E402
+from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.studies.statistics import estimate  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "photographs.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
+PAGE = ROOT / "docs" / "real-data.md"
 SCENES = ("office", "head", "banana", "fern", "statue")
 TERMS = ("", "exposure=points", "exposure=learned", "poses=refined", "transients=mask")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
+MADE = "capture"
 KEY = ("scene", "term", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
 
 
-def measured(scene: str, term: str, offset: int, size: dict) -> dict:
+def measured(scene: str, term: str, seed: int, offset: int, size: dict) -> dict:
     """One fit: its held-out views, and what it found of its photographs."""
     name, _, value = term.partition("=")
-    config = FitConfig.of(test_offset=offset, **size, **({name: value} if term else {}))
+    config = FitConfig.of(seed=seed, test_offset=offset, **size, **({name: value} if term else {}))
     with tempfile.TemporaryDirectory() as folder:
         result = fit(load(DATA / scene), Path(folder) / "run", config, progress=False)
         recorded = result.run.config()
@@ -51,7 +54,7 @@ def measured(scene: str, term: str, offset: int, size: dict) -> dict:
     found |= {"reprojection": recorded["poses"]["reprojection"]} if "poses" in recorded else {}
     found |= metrics.get("transients", {})
     return {
-        **dict(zip(KEY, (Path(scene).name, term, config.seed, offset, *size.values()), strict=True)),
+        **dict(zip(KEY, (Path(scene).name, term, seed, offset, *size.values()), strict=True)),
         "psnr": [view["psnr"] for view in metrics["views"]],
         "cc_psnr": [view["cc_psnr"] for view in metrics["views"]],
         "found": found,
@@ -61,30 +64,59 @@ def measured(scene: str, term: str, offset: int, size: dict) -> dict:
 
 
 def table(found: list[dict]) -> str:
-    """What each term found of a capture, and what it changes of its held-out views."""
-    lines = ["| capture (held out) | term | what was found | PSNR, mean / worst | color-corrected | seconds |"]
-    lines += ["|---|---|---|---|---|---|"]
-    for scene in dict.fromkeys(row["scene"] for row in found):
-        units = [tuple(row[name] for name in KEY if name != "term") for row in found if row["scene"] == scene]
-        for unit in dict.fromkeys(units):
-            mine = [row for row in found if tuple(row[name] for name in KEY if name != "term") == unit]
-            plain = next((row for row in mine if not row["term"]), None)
-            if plain is None:
-                continue
-            for row in mine:
-                cells = [_means(row["psnr"]), f"{statistics.mean(row['cc_psnr']):.2f}", f"{row['seconds']:.0f}"]
-                if row is not plain:
-                    change = statistics.mean(row["psnr"]) - statistics.mean(plain["psnr"])
-                    worst = min(row["psnr"]) - min(plain["psnr"])
-                    corrected = statistics.mean(row["cc_psnr"]) - statistics.mean(plain["cc_psnr"])
-                    cells[:2] = [f"{change:+.2f} / {worst:+.2f}", f"{corrected:+.2f}"]
-                where = f"{scene} ({len(row['psnr'])})" if row is plain else ""
-                lines.append(f"| {where} | {row['term'] or 'none'} | {_words(row['found'])} | {' | '.join(cells)} |")
+    """What each term found of a capture, and what it changes of its held-out views, on average over seeds."""
+    lines = ["| capture (held out) | term | seeds | what was found | PSNR, mean / worst | color-corrected | seconds |"]
+    lines += ["|---|---|---|---|---|---|---|"]
+    by_unit = {(*_unit(row), row["term"]): row for row in found}
+    for scene, term in dict.fromkeys((row["scene"], row["term"]) for row in found):
+        mine = [row for row in found if (row["scene"], row["term"]) == (scene, term)]
+        pairs = [(row, by_unit[*_unit(row), ""]) for row in mine if (*_unit(row), "") in by_unit]
+        if not pairs:
+            continue
+        plain = term == ""
+        mean, corrected = (
+            statistics.mean(
+                statistics.mean(row[name]) - (0 if plain else statistics.mean(other[name])) for row, other in pairs
+            )
+            for name in ("psnr", "cc_psnr")
+        )
+        worst = statistics.mean(min(row["psnr"]) - (0 if plain else min(other["psnr"])) for row, other in pairs)
+        seconds = statistics.mean(row["seconds"] for row, _ in pairs)
+        sign = "" if plain else "+"
+        cells = [
+            f"{scene} ({'+'.join(str(len(row['psnr'])) for row, _ in pairs)})" if plain else "",
+            term or "none",
+            f"{len(pairs)}",
+            _words(pairs[0][0]["found"]),
+            f"{mean:{sign}.2f} / {worst:{sign}.2f}",
+            f"{corrected:{sign}.2f}",
+            f"{seconds:.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def _means(values: list[float]) -> str:
-    return f"{statistics.mean(values):.2f} / {min(values):.2f}"
+def summary(found: list[dict]) -> str:
+    """What each term changes on average over the captures that people took."""
+    lines = ["| term | captures | PSNR (95 %) | worst view (95 %) | color-corrected (95 %) |", "|---|---|---|---|---|"]
+    by_unit = {(*_unit(row), row["term"]): row for row in found if row["scene"] != MADE}
+    for term in dict.fromkeys(row["term"] for row in found if row["term"]):
+        pairs = {key[:3]: (row, by_unit[*key[:3], ""]) for key, row in by_unit.items() if key[3] == term}
+        cells = []
+        for measure in (
+            lambda row: statistics.mean(row["psnr"]),
+            lambda row: min(row["psnr"]),
+            lambda row: statistics.mean(row["cc_psnr"]),
+        ):
+            effect = estimate({(k[0], k[1:], ()): measure(row) - measure(other) for k, (row, other) in pairs.items()})
+            cells.append(f"{effect.mean:+.2f} ({effect.low:+.2f} to {effect.high:+.2f})")
+        lines.append(f"| {term} | {effect.scenes} ({effect.units} fits) | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _unit(row: dict) -> tuple[str, int, int]:
+    """What fits must have in common to be compared."""
+    return row["scene"], row["seed"], row["offset"]
 
 
 def _words(found: dict) -> str:
@@ -106,21 +138,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures, or folders")
     parser.add_argument("--terms", nargs="+", default=list(TERMS[1:]), help="options of a fit, as NAME=VALUE")
-    parser.add_argument("--offsets", nargs="+", type=int, default=[0], help="of the held-out views")
+    parser.add_argument("--seeds", type=int, default=len(UNITS), choices=range(1, len(UNITS) + 1))
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
     done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
-    for offset in args.offsets:
+    for seed, offset in UNITS[: args.seeds]:
         for scene in [] if args.page else args.scenes:
             for term in ("", *args.terms):
-                if (Path(scene).name, term, 0, offset, *SIZE.values()) not in done:
-                    row = measured(scene, term, offset, SIZE)
+                if (Path(scene).name, term, seed, offset, *SIZE.values()) not in done:
+                    row = measured(scene, term, seed, offset, SIZE)
                     add_row(ROWS, row)
                     means = {name: round(statistics.mean(row[name]), 2) for name in ("psnr", "cc_psnr")}
                     print(scene, term or "none", means, row["found"], f"{row['seconds']:.0f} s", flush=True)
-    text = table(read_rows(ROWS))
-    print(text)
-    fill_between(PAGE, "photographs", text)
+    found = read_rows(ROWS)
+    for name, text in (("terms", summary(found)), ("photographs", table(found))):
+        print(text)
+        fill_between(PAGE, name, text)
 
 
 if __name__ == "__main__":

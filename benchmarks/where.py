@@ -1,4 +1,4 @@
-"""Where and when a benchmark ran: what stands beside every result, and where the captures are."""
+"""Where and when a benchmark ran, where the captures are, and the units of studies of them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from pathlib import Path
 
 from drgs import machine, runtime
 
-__all__ = ["DATA", "ROOT", "add_row", "ran", "read_rows"]
+__all__ = ["DATA", "ROOT", "UNITS", "add_row", "ran", "read_rows"]
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
 """Folder of the captures that people took."""
+UNITS = ((0, 0), (1, 3), (2, 6))
+"""(seed, index of the first held-out view): other views are held out for each seed, where a capture has no split of its
+own."""
 
 
 def ran() -> dict[str, str]:

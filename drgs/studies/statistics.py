@@ -24,6 +24,7 @@ import numpy as np
 
 __all__ = [
     "Effect",
+    "Unit",
     "at_views",
     "coverage",
     "differences",
@@ -35,6 +36,7 @@ __all__ = [
 ]
 
 Unit = tuple[str, tuple[int, int], tuple[str, ...]]
+"""Scene, split, and what was given before the first pick."""
 
 _DRAWS = 10_000
 _QUANTILES = 0.025, 0.975
