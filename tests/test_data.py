@@ -315,6 +315,36 @@ def test_image_composites_alpha_and_reads_16_bits(tmp_path):
     np.testing.assert_allclose(views[1].image(), gradient() / 255, atol=1e-6)
 
 
+def test_alpha_comes_with_the_image(tmp_path):
+    """Reduced by area as the image is; of three channels, and where all is covered, there is none."""
+    write_transforms(tmp_path)
+    alpha = np.zeros((HEIGHT, WIDTH), np.uint8)
+    alpha[:, 3:] = 255
+    write_image(tmp_path / "images" / "0.png", np.dstack([gradient(), alpha]))
+    write_image(tmp_path / "images" / "1.png", np.dstack([gradient(), np.full_like(alpha, 255)]))
+    views = load(tmp_path).views
+    image, found = views[0].image_and_alpha(WIDTH // 2, HEIGHT // 2)
+    np.testing.assert_array_equal(image, views[0].image(WIDTH // 2, HEIGHT // 2))
+    np.testing.assert_allclose(found[0], [0, 0.5] + [1] * (WIDTH // 2 - 2), atol=1e-6)
+    assert [view.image_and_alpha()[1] for view in views[1:3]] == [None, None]
+
+
+def test_alpha_of_a_lens_is_undistorted(tmp_path):
+    """As the image is; what the photograph did not see is not known to be empty."""
+    write_transforms(tmp_path)
+    alpha = np.zeros((HEIGHT, WIDTH), np.uint8)
+    alpha[:, WIDTH // 2 :] = 255
+    write_image(tmp_path / "images" / "0.png", np.dstack([np.repeat(alpha[..., None], 3, 2), alpha]))
+    view = load(tmp_path).views[0]
+    view.camera = dataclasses.replace(view.camera, model="opencv", distortion=(0.3, 0.0, 0.0, 0.0))
+    image, found = view.image_and_alpha()
+    seen = view.mask() > 0
+    assert not seen.all()
+    np.testing.assert_array_equal(found[~seen], 1)
+    inside = seen & (np.abs(np.arange(WIDTH) - WIDTH / 2) > 3)
+    np.testing.assert_allclose(found[inside], image[..., 0][inside], atol=0.05)
+
+
 def test_image_resizes_by_area(tmp_path):
     """Half size is the mean of 2x2 pixels."""
     write_transforms(tmp_path)

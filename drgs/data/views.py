@@ -91,6 +91,19 @@ class View:
             FileNotFoundError, ValueError: The file is missing, no image, or not of the camera's
                 size.
         """
+        return self.image_and_alpha(width, height)[0]
+
+    def image_and_alpha(
+        self, width: int | None = None, height: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """`image`, and how much of each of its pixels the photograph's own alpha channel covers.
+
+        Args, Raises:
+            As `image`.
+        Returns:
+            (H,W,3) float32, and (H,W) float32 in [0,1]; None if there is no such channel, or it covers everything.
+            Pixels of an undistorted image that the photo did not see count as covered.
+        """
         import cv2
 
         if self.frame is not None:
@@ -105,14 +118,20 @@ class View:
         self._check_size(data, path)
         if data.ndim == 2:
             data = np.repeat(data[..., None], 3, axis=2)
+        alpha = None
         if data.shape[2] == 4:
-            alpha = data[..., 3:]
-            data = data[..., :3] * alpha + (1 - alpha) * np.asarray(self.background, dtype=np.float32)
+            alpha = data[..., 3]
+            data = data[..., :3] * data[..., 3:] + (1 - data[..., 3:]) * np.asarray(self.background, dtype=np.float32)
+            alpha = alpha if alpha.min() < 1 else None
         if self.camera.is_distorted:
-            columns, rows, _ = lens_maps(self.camera)
+            columns, rows, unseen = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
-        return resize_area(data, *self._size(width, height))
+            if alpha is not None:
+                alpha = cv2.remap(alpha, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                alpha = alpha if unseen is None else np.where(unseen, np.float32(1), alpha)
+        size = self._size(width, height)
+        return resize_area(data, *size), None if alpha is None else resize_area(alpha, *size)
 
     def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.

@@ -97,7 +97,8 @@ class DataConfig(Record):
         times: How many frames of each synchronous camera are used, evenly over its video, the first and the last
             included.
         mask: Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files,
-            valid where undistorted photographs have empty corners; ignore reads none.
+            valid where undistorted photographs have empty corners; ignore reads none. With object and auto nothing is
+            where a photograph's own alpha channel is transparent, either.
         exposure: Multiply what is rendered for a photograph by its own gain of R, G and B: none (off), those that
             initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
         poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
@@ -216,7 +217,8 @@ class LossConfig(Record):
 
     Attributes:
         ssim_weight: Weight of 1 - SSIM against the L1 distance, in [0, 1].
-        outside_weight: Weight of the opacity outside of a mask of kind object.
+        outside_weight: Weight of the opacity outside of a mask of kind object, and where a photograph's own alpha
+            channel says that nothing is.
         opacity_weight: Weight of the mean opacity, which lets Gaussians that nobody needs fade (MCMC).
         scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
         transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss never (keep), if

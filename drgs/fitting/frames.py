@@ -38,6 +38,8 @@ class Frame:
         pixels: (H, W, 3) float32 in [0, 1], or uint8.
         mask: (H, W) float32 in [0, 1], or None.
         is_object: Whether nothing but background is outside the mask.
+        alpha: (H, W), as `pixels`, how much of each pixel the photograph's own alpha channel covers: nothing but
+            background is where it does not; None: there is no such channel, or it is not asked.
         transient: (H, W) bool, what no other photograph shows, and the photometric term leaves out; None: nothing.
         teacher: Reads the (C, h, w) map of a teacher, which covers the view at a size of its own; None: there is none.
         labels: Reads the (H, W) int64 labels of the pixels, 0 for none; None: there are none.
@@ -48,17 +50,24 @@ class Frame:
     pixels: torch.Tensor
     mask: torch.Tensor | None = None
     is_object: bool = False
+    alpha: torch.Tensor | None = None
     transient: torch.Tensor | None = None
     teacher: _Map | None = None
     labels: _Labels | None = None
 
     def image(self) -> torch.Tensor:
         """(H, W, 3) float32 in [0, 1]."""
-        return self.pixels if self.pixels.dtype == torch.float32 else self.pixels.float() / 255
+        return _as_float(self.pixels)
 
     def target(self) -> torch.Tensor:
         """`image`, black outside the mask."""
         return self.image() if self.mask is None else self.image() * self.mask[..., None]
+
+    def empty(self) -> torch.Tensor | None:
+        """(H, W) float32 in [0, 1], how much of each pixel is known to show nothing; None if nothing tells."""
+        if self.mask is not None and self.is_object:
+            return 1 - self.mask
+        return None if self.alpha is None else 1 - _as_float(self.alpha)
 
 
 def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> Dataset:
@@ -101,18 +110,34 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
     is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_CACHE
     frames = []
     for view, (width, height) in zip(views, sizes, strict=True):
-        pixels = torch.from_numpy(view.image(width, height))
+        image, alpha = view.image_and_alpha(width, height)
+        store = _as_stored if is_float else _as_bytes
         weights = None if mask == "ignore" else view.mask(width, height)
         frames.append(
             Frame(
                 name=view.name,
                 camera=dataclasses.replace(view.camera.undistorted().resized(width, height), name=view.name),
-                pixels=pixels if is_float else (pixels * 255).round().to(torch.uint8),
+                pixels=store(image),
                 mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
                 is_object=mask == "object" or (mask == "auto" and view.mask_path is not None),
+                alpha=store(alpha) if alpha is not None and mask in ("auto", "object") else None,
                 teacher=cast("_Map | None", None if view.teacher_path is None else view.teacher),
                 labels=cast("_Labels | None", view.label_path and functools.partial(view.labels, width, height)),
             )
         )
         bar.advance()
     return frames
+
+
+def _as_float(pixels: torch.Tensor) -> torch.Tensor:
+    """Numbers in [0, 1] of pixels as they are stored."""
+    return pixels if pixels.dtype == torch.float32 else pixels.float() / 255
+
+
+def _as_stored(image: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image))
+
+
+def _as_bytes(image: np.ndarray) -> torch.Tensor:
+    """8 bits of numbers in [0, 1]."""
+    return (torch.from_numpy(image) * 255).round().to(torch.uint8)

@@ -89,7 +89,11 @@ class Photometric:
 
 @dataclasses.dataclass(frozen=True)
 class Outside:
-    """Opacity outside the mask of an object, where nothing is; a mask of valid pixels leaves what is outside free."""
+    """Opacity where a photograph says that nothing is: outside the mask of an object, or by its own alpha channel.
+
+    A mask of valid pixels leaves what is outside free. Without this term what is as dark as the background may be
+    anywhere in front of it.
+    """
 
     weight: float
     name: ClassVar[str] = "outside"
@@ -97,9 +101,8 @@ class Outside:
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
         """See `LossTerm`."""
-        if frame.mask is None or not frame.is_object:
-            return None
-        return self.weight * ((1 - frame.mask) * output.alpha).mean()
+        empty = frame.empty()
+        return None if empty is None else self.weight * (empty * output.alpha).mean()
 
 
 @dataclasses.dataclass(frozen=True)

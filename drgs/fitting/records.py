@@ -458,6 +458,8 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
 
 
 def _mask_kind(frame: Frame) -> str:
+    if frame.mask is None and frame.alpha is not None:
+        return "alpha"
     if frame.mask is None:
         return "none"
     return "object" if frame.is_object else "valid"

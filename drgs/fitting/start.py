@@ -84,6 +84,9 @@ def start(
         torch.from_numpy(points), torch.from_numpy(colors), *config.density.start_of(dense), features=width
     )
     _log.info("%d initial points: %s", len(points), source)
+    if empty := [x for x in (frame.empty() for frame in frames) if x is not None]:
+        share = float(sum(x.sum() for x in empty)) / sum(frame.pixels[..., 0].numel() for frame in frames)
+        _log.info("%.0f %% of the training pixels show nothing, by masks or alpha; they are kept empty", 100 * share)
     made = parts or parts_of(config, extent, channels)
     found = None
     if parts is None and config.data.exposure != "off":
