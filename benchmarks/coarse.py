@@ -3,8 +3,8 @@
     python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--page]
 
 Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes the table of
-docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales; then those with 1 and 2 are
-made once more, with as many steps as take the time of the fit without. Photographs have their full size, of at most
+docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales; then those with 1 and 2
+are made once more, with as many steps as take the time of the fit without. Photographs have their full size, of at most
 200,000 pixels. Seconds are those that the process computed in its steps, whatever ran beside it. One thread.
 """
 
@@ -80,9 +80,9 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
 
 
 def table(rows: list[dict]) -> str:
-    """A row a fit: steps, seconds, and PSNR, mean and worst view, beside that of the fit at the full size throughout."""
+    """A row a fit: steps, seconds, and PSNR, mean and worst view, beside that of the fit that began at the full size."""
     lines = [
-        "| capture (held out) | size | fitted for | `--num-downscales` | steps | process seconds | PSNR, mean / worst |",
+        "| capture (held out) | size | fitted for | `--num-downscales` | steps | seconds | PSNR, mean / worst |",
         "|---|---|---|---|---|---|---|",
     ]
     order = sorted(rows, key=lambda row: (row["scene"], row["trained"], row["steps"], row["num_downscales"]))
@@ -99,10 +99,8 @@ def table(rows: list[dict]) -> str:
                 shown = f"{now - mean:+.2f} / {min(row['psnr']) - min(base['psnr']):+.2f}"
             part = row["process_seconds"] / base["process_seconds"]
             seconds = f"{row['process_seconds']:.0f}" + ("" if row is base else f" ({part:.2f})")
-            lines.append(
-                f"| {row['scene']} ({len(row['psnr'])}) | {width}x{height} | {row['trained']} | {row['num_downscales']} "
-                f"| {row['steps']} | {seconds} | {shown} |"
-            )
+            cells = (f"{row['scene']} ({len(row['psnr'])})", f"{width}x{height}", row["trained"], row["num_downscales"])
+            lines.append("| " + " | ".join(map(str, (*cells, row["steps"], seconds, shown))) + " |")
     return "\n".join(lines)
 
 
