@@ -80,7 +80,7 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
 
 
 def table(rows: list[dict]) -> str:
-    """A row a fit: steps, seconds, and PSNR, mean and worst view, beside that of the fit that began at the full size."""
+    """A row a fit: steps, seconds, and PSNR, mean and worst view, beside that of the fit at the full size."""
     lines = [
         "| capture (held out) | size | fitted for | `--num-downscales` | steps | seconds | PSNR, mean / worst |",
         "|---|---|---|---|---|---|---|",

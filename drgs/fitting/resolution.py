@@ -42,7 +42,7 @@ class Resolution:
     def __init__(self, num_downscales: int, max_steps: int) -> None:
         """
         Args:
-            num_downscales: As `DataConfig` has it.
+            num_downscales: How many times photographs are halved at the start.
             max_steps: Steps of the fit.
         """
         self.num_downscales = num_downscales
@@ -69,8 +69,8 @@ class Resolution:
         are as they were. Pixels and mask are kept until the size changes.
 
         Args:
-            index: Which of the photographs of the fit it is.
-            frame: It, at the size of the fit; its camera may be on the way of being fitted.
+            index: Index of the photograph among those of the fit.
+            frame: The photograph at the size of the fit, whose camera may have a pose that is fitted.
             step: The step, from 0.
         """
         halvings = self.halvings(step)
