@@ -429,6 +429,8 @@ class _Loop:
                 for event in step.events:
                     if event["event"] == "transients" and event["found"]:
                         bar.note(f"step {done - 1}: {line_of(event)}")
+                    if event["event"] == "resolution":
+                        bar.note(f"step {done - 1}: photographs of {event['width']}x{event['height']}")
                 self._log(step)
                 if step.psnr is not None:
                     self._psnr = 0.98 * (self._psnr or step.psnr) + 0.02 * step.psnr

@@ -87,6 +87,8 @@ class DataConfig(Record):
 
     Attributes:
         max_pixels: Images are reduced to at most this many pixels.
+        num_downscales: How many times their width and height are halved at the start; they double again in the first
+            half of the steps, but none is made smaller than 11 pixels.
         init_points: Initial points: of the training views (views) or of the data set (all); auto: all, or views if
             --views active.
         test_every: Every n-th view, by name, is held out; 0 holds out none.
@@ -106,6 +108,7 @@ class DataConfig(Record):
     """
 
     max_pixels: int = 130_000
+    num_downscales: int = 0
     init_points: InitPoints = "auto"
     test_every: int = 8
     test_offset: int = 0
@@ -118,7 +121,7 @@ class DataConfig(Record):
 
     def __post_init__(self) -> None:
         low = {"test_every": (0, 10**9), "test_offset": (0, 10**9)}
-        check_fields("fit", self, {"max_pixels": _COUNT, "times": (1, 10**6), **low})
+        check_fields("fit", self, {"max_pixels": _COUNT, "num_downscales": (0, 16), "times": (1, 10**6), **low})
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
         if self.test_offset >= max(self.test_every, 1):

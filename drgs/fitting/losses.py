@@ -42,7 +42,7 @@ class LossTerm(Protocol):
 
         Args:
             output: What `drgs.render` shows of `gaussians`.
-            frame: The photograph.
+            frame: The photograph, at the size of the picture, which may be smaller at first (resolution.py).
             gaussians: Gaussians at this step and at the time of the view; gradients reach what is fitted.
         Returns:
             A scalar with the term's weight in it, or None where the term has nothing to say about this view.

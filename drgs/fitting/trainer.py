@@ -21,6 +21,7 @@ from drgs.fitting.networks import rate_at
 from drgs.fitting.parts import Parts, means_rate, parts_of
 from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
+from drgs.fitting.resolution import Resolution
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
 from drgs.fitting.transients import Transients
@@ -46,7 +47,7 @@ class StepResult:
     Attributes:
         loss: Loss of its view, before the step, as all of these.
         terms: Terms of the loss by name, those that this view has.
-        psnr: PSNR of this view in dB; None where it is not finite.
+        psnr: PSNR of this view in dB, at the size that the step saw it; None where it is not finite.
         view: Its name.
         events: What is to be logged.
     """
@@ -69,6 +70,7 @@ class Trainer:
         parts: Terms of the loss, learning rates, networks, and what is rendered.
         motion: The stages of a fit to what moves; None of what stands still.
         renderers: What each step is rendered with.
+        resolution: How large each step sees the photographs.
         transients: What single photographs alone show.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
@@ -104,6 +106,7 @@ class Trainer:
         self.motion = motion
         self._check_parts()
         self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
+        self.resolution = Resolution(config.data.num_downscales, config.max_steps)
         self.transients = Transients(config.loss.transients)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
@@ -159,13 +162,16 @@ class Trainer:
         """
         config, rows, done = self.config, self.rows, self.step_index
         events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
+        events += self.resolution.events(done, self.frames)
         events += self._prepare(done)
         if self.transients.is_due(done, config.max_steps, len(self.frames)):
             events.append(self.transients.look(self.photographs(), self.gaussians(), config.settings))
-        frame = self.frames[self._next_view()]
+        index = self._next_view()
+        frame = self.frames[index]
         gaussians = self._fitted_scene().at(frame.camera.time)
         if self.parts.poses is not None:
             frame = self._posed(frame)
+        frame = self.resolution.seen(index, frame, done)
         out = self._shown(gaussians, frame)
         if self.parts.exposure is not None:
             out = self.parts.exposure(out, frame)

@@ -1,0 +1,144 @@
+"""Photographs that begin small: held-out PSNR against the time of a processor, by how often they are halved.
+
+    python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--page]
+
+Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes the table of
+docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales; then those with 1 and 2
+are made once more, with as many steps as take the time of the fit without. Photographs have their full size, of at most
+200,000 pixels. Seconds are those that the process computed in its steps, whatever ran beside it. One thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from where import DATA, add_row, ran, read_rows  # noqa: E402
+
+from drgs.data import load  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.renderers import own_preset  # noqa: E402
+from drgs.fitting.resolution import FULL  # noqa: E402
+from drgs.fitting.start import start  # noqa: E402
+from drgs.metrics import through_renderers  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "coarse.jsonl"
+PAGE = ROOT / "docs" / "one-model.md"
+SCENES = ("fern", "statue")
+SIZE = {"max_pixels": 200_000, "max_gaussians": 20_000}
+DOWNSCALES = (0, 1, 2)
+SEED = 0
+KEY = ("scene", "trained", "num_downscales", "full", "steps", "max_pixels", "max_gaussians", "seed")
+
+
+def key_of(scene: str, trained: str, num_downscales: int, steps: int) -> tuple:
+    """What tells a row from others."""
+    return scene, trained, num_downscales, FULL, steps, *SIZE.values(), SEED
+
+
+def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
+    """One fit, and its held-out views at the full size, in the renderer that stands for those it was fitted with."""
+    dataset = load(DATA / scene)
+    own = own_preset((trained,))
+    config = FitConfig.of(
+        settings=RenderSettings.preset(own),
+        renderers=(trained,),
+        num_downscales=num_downscales,
+        max_steps=steps,
+        seed=SEED,
+        **SIZE,
+    )
+    train, test = dataset.split(config.data.test_every)
+    frames = load_frames(train, config.data.max_pixels)
+    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
+    began = time.process_time()
+    while trainer.step_index < steps:
+        trainer.step()
+    seconds = time.process_time() - began
+    seen = {own: RenderSettings.preset(own)}
+    found = through_renderers(trainer.gaussians(), load_frames(test, config.data.max_pixels), seen, "test", len(test))
+    assert found is not None
+    return {
+        **dict(zip(KEY, key_of(scene, trained, num_downscales, steps), strict=True)),
+        "size": [frames[0].camera.width, frames[0].camera.height],
+        "psnr": [view["psnr"] for view in found["rows"][0]["views"]],
+        "process_seconds": seconds,
+        **ran(),
+    }
+
+
+def table(rows: list[dict]) -> str:
+    """A row a fit: steps, seconds, and PSNR, mean and worst view, beside that of the fit at the full size."""
+    lines = [
+        "| capture (held out) | size | fitted for | `--num-downscales` | steps | seconds | PSNR, mean / worst |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    order = sorted(rows, key=lambda row: (row["scene"], row["trained"], row["steps"], row["num_downscales"]))
+    for base in (row for row in order if not row["num_downscales"]):
+        mean = sum(base["psnr"]) / len(base["psnr"])
+        unit = ("scene", "trained", "max_pixels", "max_gaussians", "seed")
+        for row in order:
+            if any(row[name] != base[name] for name in unit) or (row is not base and not row["num_downscales"]):
+                continue
+            now = sum(row["psnr"]) / len(row["psnr"])
+            width, height = row["size"]
+            shown = f"{now:.2f} / {min(row['psnr']):.2f}"
+            if row is not base:
+                shown = f"{now - mean:+.2f} / {min(row['psnr']) - min(base['psnr']):+.2f}"
+            part = row["process_seconds"] / base["process_seconds"]
+            seconds = f"{row['process_seconds']:.0f}" + ("" if row is base else f" ({part:.2f})")
+            cells = (f"{row['scene']} ({len(row['psnr'])})", f"{width}x{height}", row["trained"], row["num_downscales"])
+            lines.append("| " + " | ".join(map(str, (*cells, row["steps"], seconds, shown))) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
+    parser.add_argument("--trained", default="fast", help="as `drgs fit --for` takes it")
+    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
+    args = parser.parse_args()
+    took = {tuple(row[name] for name in KEY): row["process_seconds"] for row in read_rows(ROWS)}
+
+    def fitted(scene: str, num_downscales: int, steps: int) -> float:
+        """Process seconds of a fit that there is, or is made."""
+        key = key_of(scene, args.trained, num_downscales, steps)
+        if key not in took:
+            row = measured(scene, args.trained, num_downscales, steps)
+            add_row(ROWS, row)
+            took[key] = row["process_seconds"]
+            print(
+                scene,
+                num_downscales,
+                steps,
+                f"{took[key]:.0f} s, {sum(row['psnr']) / len(row['psnr']):.2f} dB",
+                flush=True,
+            )
+        return took[key]
+
+    scenes = [] if args.page else args.scenes
+    same = {scene: {n: fitted(scene, n, args.steps) for n in DOWNSCALES} for scene in scenes}
+    for n in DOWNSCALES[1:]:
+        for scene in scenes:
+            fitted(scene, n, round(args.steps * same[scene][0] / same[scene][n]))
+    text = table(read_rows(ROWS))
+    print(text)
+    fill_between(PAGE, "coarse", text)
+
+
+if __name__ == "__main__":
+    main()

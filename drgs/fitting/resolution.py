@@ -1,0 +1,108 @@
+"""Photographs that begin small: a fit sees them at half, a quarter ... of their width and height, then at their own.
+
+At first only what is large is to be found, and a small photograph shows it in a fraction of the time. With n downscales
+the first steps see photographs of 1 / 2^n of the width and height, which double after equal shares of the steps, until
+from `FULL` of the steps on they have the size of the fit. What a step sees depends on its number alone. The idea is
+that of Nerfstudio's splatfacto [1], which counts steps where this has a fraction of them.
+
+Only steps see small photographs. Whatever measures, compares, samples or chooses has those of the fit: metrics and
+previews, transients, the 3D filter, reach and information of poses, active views.
+
+Reference:
+    [1] Tancik et al., "Nerfstudio: A Modular Framework for Neural Radiance Field Development", SIGGRAPH 2023.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import torch
+
+from drgs.data.resizing import resize_area
+
+if TYPE_CHECKING:
+    from drgs.fitting.frames import Frame
+
+__all__ = ["FULL", "Resolution", "halved_size"]
+
+FULL = 1 / 2
+"""The fraction of the steps from which on photographs have the size of the fit."""
+
+_LEAST = 11  # pixels of the shorter side: the window of SSIM (losses.py) is as wide
+
+
+class Resolution:
+    """How large a step sees the photographs.
+
+    Attributes:
+        num_downscales: How many times they are halved at the start.
+    """
+
+    def __init__(self, num_downscales: int, max_steps: int) -> None:
+        """
+        Args:
+            num_downscales: How many times photographs are halved at the start.
+            max_steps: Steps of the fit.
+        """
+        self.num_downscales = num_downscales
+        self._ends = [round(FULL * max_steps * (k + 1) / num_downscales) for k in range(num_downscales)]
+        self._kept: dict[int, tuple[torch.Tensor, torch.Tensor | None]] = {}
+        self._kept_at = 0
+
+    def halvings(self, step: int) -> int:
+        """How many times photographs are halved in a step (from 0); those that are small already, less often."""
+        return sum(step < end for end in self._ends)
+
+    def events(self, step: int, frames: list[Frame]) -> list[dict]:
+        """What is to be logged before a step: the size, of the first photograph, that it begins to have at this one."""
+        halvings = self.halvings(step)
+        if step and halvings == self.halvings(step - 1) or not self.num_downscales:
+            return []
+        width, height = halved_size(frames[0].camera.width, frames[0].camera.height, halvings)
+        return [{"event": "resolution", "halvings": halvings, "width": width, "height": height}]
+
+    def seen(self, index: int, frame: Frame, step: int) -> Frame:
+        """A photograph as a step sees it: area averages of pixels and mask, with the camera of that size.
+
+        A pixel shows something transient where one of those that it is made of does. Labels and the map of a teacher
+        are as they were. Pixels and mask are kept until the size changes.
+
+        Args:
+            index: Index of the photograph among those of the fit.
+            frame: The photograph at the size of the fit, whose camera may have a pose that is fitted.
+            step: The step, from 0.
+        """
+        halvings = self.halvings(step)
+        if halvings != self._kept_at:
+            self._kept.clear()
+            self._kept_at = halvings
+        size = halved_size(frame.camera.width, frame.camera.height, halvings)
+        if size == (frame.camera.width, frame.camera.height):
+            return frame
+        if index not in self._kept:
+            self._kept[index] = (
+                _averaged(frame.pixels, size),
+                None if frame.mask is None else _averaged(frame.mask, size),
+            )
+        pixels, mask = self._kept[index]
+        return dataclasses.replace(
+            frame,
+            camera=frame.camera.resized(*size),
+            pixels=pixels,
+            mask=mask,
+            # Made anew each time: what is transient changes on the way.
+            transient=None if frame.transient is None else _averaged(frame.transient.float(), size) > 0,
+        )
+
+
+def halved_size(width: int, height: int, times: int) -> tuple[int, int]:
+    """(width, height) of an image halved so many times, rounded down, or as often as the window of SSIM fits in."""
+    while times and min(width, height) >> times < _LEAST:
+        times -= 1
+    return width >> times, height >> times
+
+
+def _averaged(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """(H, W) or (H, W, C) values at a smaller (width, height), of the same type."""
+    return torch.from_numpy(resize_area(values.numpy(), *size))
