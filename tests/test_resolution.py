@@ -82,14 +82,15 @@ def test_no_picture_is_smaller_than_the_window_of_ssim():
 
 @pytest.mark.parametrize("size", [(96, 64), (101, 75)], ids=["even", "odd"])
 def test_means_are_kept(rng, size):
-    """Of pixels and mask, to float32's rounding (measured 1e-7), to half a level of 256 where pixels are bytes; the
-    types stay."""
+    """Of pixels, mask and alpha, to float32's rounding (measured 1e-7), to half a level of 256 where pixels are bytes;
+    the types stay."""
     mask = torch.from_numpy((rng.random(size[::-1]) > 0.3).astype(np.float32))
-    frame = photograph(*size, rng, mask=mask, is_object=True)
+    frame = photograph(*size, rng, mask=mask, is_object=True, alpha=mask)
     small = Resolution(2, 12).seen(0, frame, 0)
     assert small.pixels.shape == (size[1] // 4, size[0] // 4, 3)
     assert torch.allclose(small.pixels.mean((0, 1)), frame.pixels.mean((0, 1)), rtol=0, atol=2e-6)
     assert float(small.mask.mean()) == pytest.approx(float(mask.mean()), abs=2e-6)
+    assert torch.equal(small.alpha, small.mask)
     assert 0 <= float(small.mask.min()) < float(small.mask.max()) <= 1
     assert small.is_object
     eight = dataclasses.replace(frame, pixels=(frame.pixels * 255).round().to(torch.uint8))

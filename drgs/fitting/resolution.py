@@ -47,7 +47,7 @@ class Resolution:
         """
         self.num_downscales = num_downscales
         self._ends = [round(FULL * max_steps * (k + 1) / num_downscales) for k in range(num_downscales)]
-        self._kept: dict[int, tuple[torch.Tensor, torch.Tensor | None]] = {}
+        self._kept: dict[int, tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]] = {}
         self._kept_at = 0
 
     def halvings(self, step: int) -> int:
@@ -63,10 +63,10 @@ class Resolution:
         return [{"event": "resolution", "halvings": halvings, "width": width, "height": height}]
 
     def seen(self, index: int, frame: Frame, step: int) -> Frame:
-        """A photograph as a step sees it: area averages of pixels and mask, with the camera of that size.
+        """A photograph as a step sees it: area averages of pixels, mask and alpha, with the camera of that size.
 
         A pixel shows something transient where one of those that it is made of does. Labels and the map of a teacher
-        are as they were. Pixels and mask are kept until the size changes.
+        are as they were. Averages are kept until the size changes.
 
         Args:
             index: Index of the photograph among those of the fit.
@@ -81,16 +81,15 @@ class Resolution:
         if size == (frame.camera.width, frame.camera.height):
             return frame
         if index not in self._kept:
-            self._kept[index] = (
-                _averaged(frame.pixels, size),
-                None if frame.mask is None else _averaged(frame.mask, size),
-            )
-        pixels, mask = self._kept[index]
+            mask, alpha = (None if x is None else _averaged(x, size) for x in (frame.mask, frame.alpha))
+            self._kept[index] = _averaged(frame.pixels, size), mask, alpha
+        pixels, mask, alpha = self._kept[index]
         return dataclasses.replace(
             frame,
             camera=frame.camera.resized(*size),
             pixels=pixels,
             mask=mask,
+            alpha=alpha,
             # Made anew each time: what is transient changes on the way.
             transient=None if frame.transient is None else _averaged(frame.transient.float(), size) > 0,
         )
