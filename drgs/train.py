@@ -47,6 +47,8 @@ from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
+from drgs.fitting.skybox import line_of as skybox_line
+from drgs.fitting.skybox import visible_share
 from drgs.fitting.stages import moving_labels
 from drgs.fitting.start import motion_of, start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
@@ -265,6 +267,7 @@ def _fit(
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
         **refined,
+        **({"skybox": _skybox_summary(trainer)} if config.data.skybox != "off" else {}),
         **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
     )
     told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
@@ -272,11 +275,19 @@ def _fit(
     return FitResult(g, written, run, loop.seconds)
 
 
+def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
+    """What metrics.json is to say of what is far away: how many Gaussians it has, and how much photographs show it."""
+    if not trainer.rows.skybox:
+        return {"gaussians": 0, "share": 0.0, "largest": 0.0}
+    found = visible_share(trainer.rows, trainer.photographs(), trainer.config.settings)
+    return {"gaussians": trainer.rows.skybox, **dataclasses.asdict(found)}
+
+
 def _check_photographs(config: FitConfig, moves: bool) -> None:
     """Refuse what is modeled of single photographs where that is not built.
 
     Raises:
-        NotImplementedError: With exposure or poses where views are chosen on the way or things move, and with
+        NotImplementedError: With exposure, poses or a skybox where views are chosen on the way or things move, and with
             transients where things move: these are found by what neighbors show of the same surface at rest.
     """
     if config.data.exposure != "off" and (config.selection or moves):
@@ -288,6 +299,11 @@ def _check_photographs(config: FitConfig, moves: bool) -> None:
         raise NotImplementedError(
             f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
             "leave --poses out"
+        )
+    if config.data.skybox != "off" and (config.selection or moves):
+        raise NotImplementedError(
+            f"fit: skybox must be off where views are chosen on the way or things move, got {config.data.skybox}; leave "
+            "--skybox out"
         )
     if config.loss.transients != "keep" and moves:
         raise NotImplementedError(
@@ -427,6 +443,8 @@ class _Loop:
                 self.seconds += time.perf_counter() - began
                 done = trainer.step_index
                 for event in step.events:
+                    if event["event"] == "skybox":
+                        bar.note(f"step {done - 1}: {skybox_line(event)}")
                     if event["event"] == "transients" and event["found"]:
                         bar.note(f"step {done - 1}: {line_of(event)}")
                 self._log(step)

@@ -114,6 +114,15 @@ class View:
             data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
         return resize_area(data, *self._size(width, height))
 
+    def has_alpha(self) -> bool:
+        """Whether the image has an alpha channel that is not opaque everywhere; it is opened for this."""
+        if self.frame is not None:
+            return False  # of a video
+        if self.image_path is None:
+            return False
+        data = read_image(self.image_path)
+        return data.ndim == 3 and data.shape[2] == 4 and bool((unit_range(data, self.image_path)[..., 3] < 1).any())
+
     def mask(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 in [0,1], 1 where the image counts; None if all of it does.
 

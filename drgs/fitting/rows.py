@@ -7,6 +7,7 @@ Gaussian is fitted beside them (networks.py).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 
@@ -23,10 +24,12 @@ class GaussianRows:
     Attributes:
         tensors: means, quats, log_scales, logit_opacities, sh_dc (N, 1, 3) and sh_rest (N, K - 1, 3), perhaps features
             (N, D), and any others (N, ...) whose rows shall follow the Gaussians.
+        skybox: How many of the first rows are what is far away (skybox.py), which density control leaves alone.
         optimizer: One parameter group a tensor, named as in `tensors`.
     """
 
     def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
+        self.skybox = 0
         # Leaves of their own: what the caller has is neither changed nor differentiated.
         self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
         groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
@@ -90,6 +93,24 @@ class GaussianRows:
         self.tensors[name] = x = values.detach().clone().requires_grad_()  # a leaf of its own, as in `__init__`
         self.optimizer.add_param_group({"params": [x], "name": name})
 
+    def add_skybox(self, rows: dict[str, torch.Tensor]) -> None:
+        """Put the Gaussians of a shell before all others, with no moments; before the first step alone.
+
+        Raises:
+            ValueError: If the optimizer has made a step, whose moments would be lost.
+        """
+        if self.optimizer.state:
+            raise ValueError("fit: a skybox must be there before the first step, got one later; begin a fit with it")
+        whole = GaussianRows({name: torch.cat([rows[name], x.detach()]) for name, x in self.tensors.items()})
+        self.tensors, self.optimizer = whole.tensors, whole.optimizer
+        self.skybox = len(rows["means"])
+
+    def drop_skybox(self) -> None:
+        """Take the Gaussians of the shell away, with their moments."""
+        count, self.skybox = self.skybox, 0
+        for name, old in list(self.tensors.items()):
+            self._exchange(name, old.detach()[count:].clone(), lambda moment: moment[count:].clone())
+
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Add Gaussians with zero moments; in tensors that `rows` lacks, their rows are 0."""
         count = len(rows["means"])
@@ -137,14 +158,19 @@ class GaussianRows:
     @torch.no_grad()  # the new tensor is a leaf of its own
     def _extend(self, name: str, more: torch.Tensor, dim: int) -> None:
         """Concatenate a tensor with `more` along `dim`, and its moments with 0."""
+        zeros = torch.zeros_like(more)
+        self._exchange(name, torch.cat([self.tensors[name], more], dim), lambda x: torch.cat([x, zeros], dim))
+
+    def _exchange(self, name: str, values: torch.Tensor, moments: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Put other values in the place of a tensor's, and make its moments theirs."""
         old = self.tensors[name]
-        new = torch.cat([old, more], dim).requires_grad_()
+        new = values.requires_grad_()
         group = next(g for g in self.optimizer.param_groups if g["name"] == name)
         group["params"] = [new]
         state = self.optimizer.state.pop(old, {})
         for key in ("exp_avg", "exp_avg_sq"):
             if key in state:
-                state[key] = torch.cat([state[key], torch.zeros_like(more)], dim)
+                state[key] = moments(state[key])
         if state:
             self.optimizer.state[new] = state
         self.tensors[name] = new

@@ -18,10 +18,12 @@ from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.filter_3d import VARIANCES
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
-from drgs.fitting.parts import Parts, means_rate, parts_of
+from drgs.fitting.parts import Parts, means_rate, parts_of, with_skybox
 from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.rows import GaussianRows
+from drgs.fitting.skybox import is_due as skybox_is_due
+from drgs.fitting.skybox import visible_share
 from drgs.fitting.stages import Stage
 from drgs.fitting.transients import Transients
 from drgs.integrator import render
@@ -162,6 +164,8 @@ class Trainer:
         events += self._prepare(done)
         if self.transients.is_due(done, config.max_steps, len(self.frames)):
             events.append(self.transients.look(self.photographs(), self.gaussians(), config.settings))
+        if rows.skybox and config.data.skybox == "auto" and skybox_is_due(done, config.max_steps):
+            events.append(self._decide_skybox())
         frame = self.frames[self._next_view()]
         gaussians = self._fitted_scene().at(frame.camera.time)
         if self.parts.poses is not None:
@@ -246,6 +250,7 @@ class Trainer:
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
             **({"networks": [network.name for network in self.parts.networks]} if self.parts.networks else {}),
+            **({"skybox": self.rows.skybox} if self.rows.skybox else {}),
             **(self.motion.header() if self.motion is not None else {}),
             **found,
         }
@@ -290,6 +295,9 @@ class Trainer:
         rows = GaussianRows.from_state(tensors)
         extent = header["extent"]
         parts = parts_of(config, extent) if parts is None else parts
+        rows.skybox = header.get("skybox", 0)
+        if rows.skybox:
+            parts = with_skybox(parts, rows.skybox)
         if motion is not None and motion.has_begun(rows):
             parts = motion.restored(rows, parts, header, where)
         trainer = cls(config, frames, rows, extent, parts, motion)
@@ -353,6 +361,23 @@ class Trainer:
         added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self._generator)
         self._sample()
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
+
+    def _decide_skybox(self) -> dict:
+        """Take what is far away out of a fit whose photographs show next to none of it; the evidence, for the log."""
+        rows = self.rows
+        visible = visible_share(rows, self.photographs(), self.config.settings)
+        count = rows.skybox
+        if not visible.is_clear:
+            rows.drop_skybox()
+            self.parts = with_skybox(self.parts, 0)
+            self._sample()
+        return {
+            "event": "skybox",
+            "found": visible.is_clear,
+            "share": visible.share,
+            "largest": visible.largest,
+            "gaussians": count,
+        }
 
     def _sample(self) -> None:
         """How finely the photographs sample the Gaussians, after one or the other has changed."""
