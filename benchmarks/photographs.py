@@ -5,8 +5,9 @@
 
 Every fit has the defaults of `drgs fit` but for its size and the one term that its row names; what is said of a term
 is a difference to the fit without, of the same scene, split and seed. Appends one row a fit to
-benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the table of docs/one-model.md, and that of skyboxes in each renderer. Scenes
-are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. One thread.
+benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the table of docs/one-model.md, and that
+of skyboxes in each renderer. Scenes are captures by name, or folders, as `drgs sfm` makes one of `watch` and
+`drgs scene capture` the made one. One thread.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ def measured(scene: str, term: str, offset: int, seed: int, size: dict) -> dict:
     found |= {key: metrics["poses"][key] for key in ("degrees", "moved", "psnr_refined")} if "poses" in metrics else {}
     found |= {"reprojection": recorded["poses"]["reprojection"]} if "poses" in recorded else {}
     found |= metrics.get("transients", {})
-    found |= {"skybox": metrics["skybox"]} if "skybox" in metrics else {}
+    if "skybox" in recorded:
+        found["skybox"] = {**recorded["skybox"], "visible": metrics.get("skybox", {}).get("visible", 0.0)}
     return {
         **dict(zip(KEY, (Path(scene).name, term, config.seed, offset, *size.values()), strict=True)),
         "psnr": [view["psnr"] for view in metrics["views"]],
@@ -93,12 +95,14 @@ def table(found: list[dict]) -> str:
 
 def skyboxes(found: list[dict]) -> str:
     """What a skybox changes of held-out views in each of three renderers, against the fit without of the same seed."""
-    lines = ["| capture, seed | term | the sky shows in | `exact` | `fast` | `gsplat` | seconds |"]
+    lines = ["| capture, seed | term | agree on what is far / show it | `exact` | `fast` | `gsplat` | seconds |"]
     lines += ["|---|---|---|---|---|---|---|"]
     rest = [name for name in KEY if name != "term"]
     plain = {tuple(row[name] for name in rest): row for row in found if not row["term"] and "renderers" in row}
     with_sky = [row for row in found if row["term"].startswith("skybox")]
-    units = sorted({tuple(row[name] for name in rest) for row in with_sky if tuple(row[name] for name in rest) in plain})
+    units = sorted(
+        {tuple(row[name] for name in rest) for row in with_sky if tuple(row[name] for name in rest) in plain}
+    )
     for unit in units:
         base = plain[unit]
         cells = [f"{base['renderers'][x]['mean']:.2f} / {base['renderers'][x]['worst']:.2f}" for x in RENDERERS]
@@ -111,7 +115,8 @@ def skyboxes(found: list[dict]) -> str:
                 for x in RENDERERS
             ]
             sky = row["found"]["skybox"]
-            seen = f"{100 * sky['share']:.1f} % of the pixels" if sky["gaussians"] else "taken away"
+            shown = f"{100 * sky['visible']:.0f} % of the pixels" if sky["gaussians"] else "none"
+            seen = f"{100 * sky['share']:.0f} % of directions / {shown}"
             lines.append(f"|  | {row['term']} | {seen} | {' | '.join(cells)} | {row['seconds']:.0f} |")
     return "\n".join(lines)
 

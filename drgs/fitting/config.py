@@ -105,7 +105,7 @@ class DataConfig(Record):
         poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
             fitted, where observations of a COLMAP model are clearly off.
         skybox: A tenth of the Gaussians begins far away around the scene, for the sky and what is behind everything
-            (on), stays there only if photographs clearly show it in the middle of the fit (auto), or none does (off).
+            (on), where photographs clearly agree on what is far away (auto), or not at all (off).
     """
 
     max_pixels: int = 130_000

@@ -111,9 +111,7 @@ def with_exposure(
 
 
 def with_skybox(parts: Parts, count: int) -> Parts:
-    """The parts with terms that leave the first `count` Gaussians, which are far away, out of means over all of them;
-    0: with terms that leave none out.
-    """
+    """The parts with terms that leave the first `count` Gaussians, which are far away, out of means over all."""
     return dataclasses.replace(
         parts,
         terms=[

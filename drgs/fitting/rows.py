@@ -7,7 +7,6 @@ Gaussian is fitted beside them (networks.py).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 
@@ -105,12 +104,6 @@ class GaussianRows:
         self.tensors, self.optimizer = whole.tensors, whole.optimizer
         self.skybox = len(rows["means"])
 
-    def drop_skybox(self) -> None:
-        """Take the Gaussians of the shell away, with their moments."""
-        count, self.skybox = self.skybox, 0
-        for name, old in list(self.tensors.items()):
-            self._exchange(name, old.detach()[count:].clone(), lambda moment: moment[count:].clone())
-
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Add Gaussians with zero moments; in tensors that `rows` lacks, their rows are 0."""
         count = len(rows["means"])
@@ -158,19 +151,14 @@ class GaussianRows:
     @torch.no_grad()  # the new tensor is a leaf of its own
     def _extend(self, name: str, more: torch.Tensor, dim: int) -> None:
         """Concatenate a tensor with `more` along `dim`, and its moments with 0."""
-        zeros = torch.zeros_like(more)
-        self._exchange(name, torch.cat([self.tensors[name], more], dim), lambda x: torch.cat([x, zeros], dim))
-
-    def _exchange(self, name: str, values: torch.Tensor, moments: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        """Put other values in the place of a tensor's, and make its moments theirs."""
         old = self.tensors[name]
-        new = values.requires_grad_()
+        new = torch.cat([old, more], dim).requires_grad_()
         group = next(g for g in self.optimizer.param_groups if g["name"] == name)
         group["params"] = [new]
         state = self.optimizer.state.pop(old, {})
         for key in ("exp_avg", "exp_avg_sq"):
             if key in state:
-                state[key] = moments(state[key])
+                state[key] = torch.cat([state[key], torch.zeros_like(more)], dim)
         if state:
             self.optimizer.state[new] = state
         self.tensors[name] = new

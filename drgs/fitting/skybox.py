@@ -13,8 +13,10 @@ Means stay by their distance: a rate in units of the extent moves them by less t
 terms of the loss that keep Gaussians small and let them fade leave them out, or one of their scales would outweigh
 those of all others; density control neither moves nor copies them.
 
-Whether the scene needs it shows in the fit: which part of the light that reaches the cameras comes from behind the
-other Gaussians. `auto` looks once, in the middle, and takes the shell away where it shows next to nowhere.
+Whether there is anything far shows in the photographs before the fit: what is far has the same color in all of them
+along a direction, wherever they were taken from, and what is near has not. That much light passes between Gaussians
+does not tell: the first ones of `statue`, whose park is far, leave nothing open, and those of `banana`, a carpet that
+points cover sparsely, leave most of it open, where a shell does harm.
 
 Reference:
     [1] Kerbl et al., "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets",
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from drgs.fitting.rows import GaussianRows
     from drgs.settings import RenderSettings
 
-__all__ = ["RADIUS", "SHARE", "Skybox", "Visible", "line_of", "visible_share", "why_not"]
+__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "far_evidence", "visible_share", "why_not"]
 
 RADIUS = 100.0
 """Distance of the nearest of them from the middle of the cameras, in extents of the scene."""
@@ -53,9 +55,12 @@ _OPACITY = 0.9
 _WIDTH = 0.75  # of their scales, in the mean distance of neighbors: less than 2 % of the light passes between them
 _MARGIN = 0.05  # of the longer side of a picture, beyond its border: directions that held-out views may look in
 _DRAWN = 4_000  # directions over the whole sphere, of which the part that photographs look in is counted
-_LOOK = 0.5  # of the steps, when it is decided
 _OPEN = 0.5  # transmittance of the others from which on the shell is what a pixel shows
-_CLEAR = 0.1  # share of pixels of all photographs: 0.40 of `statue`, 0.02 of `fern`
+_LOOKED = 800  # directions whose colors are compared
+_VIEWS = 3  # photographs that must look in a direction, so that a median tells of more than two
+_BLUR = 0.012  # radius of the mean that is compared, in widths of a picture: the parallax that is left, and details
+_SAME = 0.03  # median distance of colors from their median that what is far has at most
+_CLEAR = 0.2  # share of directions beyond chance: 0.51 of `statue`, 0.07 of `fern`, 0.01 of `banana`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,55 +118,82 @@ class Skybox:
 
 
 @dataclasses.dataclass(frozen=True)
-class Visible:
-    """How much of photographs shows the shell.
+class FarEvidence:
+    """What photographs say of whether something is far away.
 
     Attributes:
-        share: Of the pixels of all photographs, those behind whose other Gaussians more than half of the light is left.
-        largest: The largest share of one photograph.
+        seen: Of the directions that photographs look in, the share that at least three of them do.
+        agreeing: Of these, the share in which they show the same color.
+        chance: What this share is if every photograph's colors are shuffled among its directions.
     """
 
-    share: float
-    largest: float
+    seen: float
+    agreeing: float
+    chance: float
+
+    @property
+    def share(self) -> float:
+        """Share of all directions in which photographs agree as they do not by chance."""
+        return self.seen * max(0.0, self.agreeing - self.chance)
 
     @property
     def is_clear(self) -> bool:
-        """Whether the scene needs the shell."""
+        """Whether there is clearly something far away."""
         return self.share > _CLEAR
 
+    def words(self) -> str:
+        """What was found, in one line."""
+        return (
+            f"photographs agree on what is far away in {100 * self.share:.1f} % of their directions (clear above "
+            f"{100 * _CLEAR:g} %; {100 * self.seen:.0f} % are seen three times, {100 * self.agreeing:.0f} % of these "
+            f"agree, by chance {100 * self.chance:.0f} %)"
+        )
 
-def is_due(done: int, max_steps: int) -> bool:
-    """Whether `auto` is decided before step `done`."""
-    return done == round(_LOOK * max_steps) and done > 0
+    def to_json(self) -> dict[str, float]:
+        """The evidence as config.json has it."""
+        return {"share": self.share, **dataclasses.asdict(self)}
 
 
-def visible_share(rows: GaussianRows, frames: list[Frame], settings: RenderSettings) -> Visible:
-    """How much of photographs shows the shell of rows: what is left of the light behind all others.
+def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEvidence:
+    """Whether photographs show the same color wherever they look in one direction.
+
+    Args:
+        frames: Training photographs, at least one; nothing outside of their masks is looked at.
+        extent: Extent of the scene.
+        seed: Seed of the shuffling that tells what chance is.
+    """
+    points = Skybox.around(frames, extent, _LOOKED, seed).means
+    colors = _colors_seen(frames, points, _BLUR)
+    there = ~np.isnan(colors[..., 0])
+    many = there.sum(axis=0) >= _VIEWS
+    if not many.any():
+        return FarEvidence(0.0, 0.0, 0.0)
+    shuffled = np.full_like(colors, np.nan)
+    rng = np.random.default_rng(seed)
+    for row in range(len(frames)):
+        index = np.flatnonzero(there[row])
+        shuffled[row, index] = colors[row, rng.permutation(index)]
+    agreeing, chance = (float((_deviation(x[:, many]) < _SAME).mean()) for x in (colors, shuffled))
+    return FarEvidence(float(many.sum() / there.any(axis=0).sum()), agreeing, chance)
+
+
+def visible_share(rows: GaussianRows, frames: list[Frame], settings: RenderSettings) -> float:
+    """Share of the pixels of photographs that show the shell: behind all others more than half of the light is left.
 
     Args:
         rows: Gaussians, the shell first.
         frames: Photographs; nothing outside of their masks is counted.
         settings: What the others are rendered with.
     """
-    others: Gaussians = rows.gaussians().detach().take(slice(rows.skybox, None))
-    others = others.replace(features=None)
-    shares, weights = [], []
+    others: Gaussians = rows.gaussians().detach().take(slice(rows.skybox, None)).replace(features=None)
+    shown = total = 0.0
     with torch.no_grad():  # looked at, not optimized
         for frame in frames:
-            is_open = (1 - render(others, frame.camera, settings, outputs=()).alpha > _OPEN).float()
-            mask = torch.ones_like(is_open) if frame.mask is None else frame.mask
-            weights.append(float(mask.sum()))
-            shares.append(float((is_open * mask).sum()) / max(weights[-1], 1.0))
-    return Visible(float(np.average(shares, weights=np.maximum(weights, 1e-9))), max(shares))
-
-
-def line_of(event: dict) -> str:
-    """What `auto` has decided, in one line."""
-    said = (
-        f"the sky shows in {100 * event['share']:.1f} % of the pixels of training photographs, up to "
-        f"{100 * event['largest']:.1f} % of one (clear from {100 * _CLEAR:g} % on)"
-    )
-    return f"{said}: {event['gaussians']} Gaussians of it stay" if event["found"] else f"{said}: taken away"
+            alpha = render(others, frame.camera, settings, outputs=()).alpha.cpu()
+            mask = torch.ones_like(alpha) if frame.mask is None else frame.mask
+            shown += float(((1 - alpha > _OPEN) * mask).sum())
+            total += float(mask.sum())
+    return shown / max(total, 1.0)
 
 
 def why_not(views: list[View], frames: list[Frame], background: tuple[float, float, float]) -> str | None:
@@ -201,10 +233,17 @@ def _seen(frames: list[Frame], points: np.ndarray) -> np.ndarray:
     return seen
 
 
-def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
-    """(P, 3) median colors of photographs at far points; of those that none shows, the color of the nearest one."""
-    found = np.ma.masked_all((len(frames), len(points), 3), np.float32)
+def _colors_seen(frames: list[Frame], points: np.ndarray, blur: float = 0.0) -> np.ndarray:
+    """(V, P, 3) colors of photographs at far points, NaN where a photograph or its mask does not show them; means over
+    a radius of `blur` widths of the picture.
+    """
+    import cv2
+
+    found = np.full((len(frames), len(points), 3), np.nan, np.float32)
     for row, frame in enumerate(frames):
+        image = frame.image().numpy()
+        if blur:
+            image = cv2.GaussianBlur(image, (0, 0), blur * frame.camera.width)
         pixels, depth = frame.camera.project(points)
         inside = (depth > 0) & ((pixels >= 0) & (pixels < (frame.camera.width, frame.camera.height))).all(axis=1)
         index = np.flatnonzero(inside)
@@ -212,12 +251,26 @@ def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
         if frame.mask is not None:
             kept = frame.mask.numpy()[lines, columns] > 0.5
             index, columns, lines = index[kept], columns[kept], lines[kept]
-        found[row, index] = frame.image().numpy()[lines, columns]
-    has_color = ~np.ma.getmaskarray(found).any(axis=2).all(axis=0)
+        found[row, index] = image[lines, columns]
+    return found
+
+
+def _deviation(colors: np.ndarray) -> np.ndarray:
+    """(P,) median over photographs of the largest channel's distance from the median color, of (V, P, 3) colors of
+    which each point has one at least.
+    """
+    apart = np.abs(colors - np.nanmedian(colors, axis=0)).max(axis=2)
+    return np.nanmedian(apart, axis=0)
+
+
+def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
+    """(P, 3) median colors of photographs at far points; of those that none shows, the color of the nearest one."""
+    found = _colors_seen(frames, points)
+    has_color = ~np.isnan(found[..., 0]).all(axis=0)
     colors = np.full((len(points), 3), 0.5, np.float32)
     if not has_color.any():
         return colors
-    colors[has_color] = np.ma.median(found[:, has_color], axis=0).filled(0.5)
+    colors[has_color] = np.nanmedian(found[:, has_color], axis=0)
     middle = np.stack([frame.camera.center for frame in frames]).mean(axis=0)
     directions = points - middle
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -11,7 +11,7 @@ from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
 from drgs.fitting.parts import parts_of, with_exposure, with_poses, with_skybox
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.skybox import RADIUS, SHARE, Skybox, why_not
+from drgs.fitting.skybox import RADIUS, SHARE, FarEvidence, Skybox, far_evidence, why_not
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
 
@@ -78,16 +78,24 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
-) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None]:
-    """A trainer at step 0, where its points come from, and what is known of exposure and poses, where asked for.
+) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, FarEvidence | None]:
+    """A trainer at step 0, where its points come from, and what is known of exposure, poses and what is far away, where
+    asked for.
 
     Points come, by default, if `strict`, only from `views`.
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
-    sky = parts is None and config.data.skybox != "off" and _may_have_skybox(views, frames, config)
-    room = round(SHARE * config.density.max_gaussians) if sky else 0
+    far = None
+    room = 0
+    if parts is None and config.data.skybox != "off" and _may_have_skybox(views, frames, config):
+        around = scene_extent([frame.camera for frame in frames])
+        with Bar("skybox") as bar:
+            far = far_evidence(frames, around, config.seed)
+            is_on = config.data.skybox == "on" or far.is_clear
+            room = round(SHARE * config.density.max_gaussians) if is_on else 0
+            bar.note(f"skybox: {far.words()}; {'there is one' if is_on else 'there is none'}")
     given = config.data.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     with Bar("initial points") as bar:
         seen = views if motion is None else first_time(views)
@@ -103,7 +111,7 @@ def start(
     )
     _log.info("%d initial points: %s", len(points), source)
     made = parts or parts_of(config, extent, channels)
-    if sky:
+    if room:
         skybox = Skybox.around(frames, extent, room, config.seed)
         model.add_skybox(skybox.rows(width))
         made = with_skybox(made, len(skybox))
@@ -128,4 +136,4 @@ def start(
             bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
         if is_on:
             made = with_poses(made, frames, config, extent, evidence.reach)
-    return Trainer(config, frames, model, extent, made, motion), source, found, evidence
+    return Trainer(config, frames, model, extent, made, motion), source, found, evidence, far

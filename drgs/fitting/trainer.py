@@ -22,8 +22,6 @@ from drgs.fitting.parts import Parts, means_rate, parts_of, with_skybox
 from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.skybox import is_due as skybox_is_due
-from drgs.fitting.skybox import visible_share
 from drgs.fitting.stages import Stage
 from drgs.fitting.transients import Transients
 from drgs.integrator import render
@@ -164,8 +162,6 @@ class Trainer:
         events += self._prepare(done)
         if self.transients.is_due(done, config.max_steps, len(self.frames)):
             events.append(self.transients.look(self.photographs(), self.gaussians(), config.settings))
-        if rows.skybox and config.data.skybox == "auto" and skybox_is_due(done, config.max_steps):
-            events.append(self._decide_skybox())
         frame = self.frames[self._next_view()]
         gaussians = self._fitted_scene().at(frame.camera.time)
         if self.parts.poses is not None:
@@ -361,23 +357,6 @@ class Trainer:
         added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self._generator)
         self._sample()
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
-
-    def _decide_skybox(self) -> dict:
-        """Take what is far away out of a fit whose photographs show next to none of it; the evidence, for the log."""
-        rows = self.rows
-        visible = visible_share(rows, self.photographs(), self.config.settings)
-        count = rows.skybox
-        if not visible.is_clear:
-            rows.drop_skybox()
-            self.parts = with_skybox(self.parts, 0)
-            self._sample()
-        return {
-            "event": "skybox",
-            "found": visible.is_clear,
-            "share": visible.share,
-            "largest": visible.largest,
-            "gaussians": count,
-        }
 
     def _sample(self) -> None:
         """How finely the photographs sample the Gaussians, after one or the other has changed."""
