@@ -10,8 +10,8 @@ Gaussians of equal distance change places from view to view, and `inria` and `gs
 distance. So distances are spread over a factor of two: neighbors on the shell keep their order.
 
 Means stay where they are by their distance: their rate, in units of the extent, moves them by about one extent at most
-in 30,000 steps, where they are a hundred away. The terms of the loss that keep Gaussians small and let them fade leave them out, or one of their scales would outweigh
-those of all others; density control neither moves nor copies them.
+in 30,000 steps, where they are a hundred away. The terms of the loss that keep Gaussians small and let them fade leave
+them out, or one of their scales would outweigh those of all others; density control neither moves nor copies them.
 
 Whether there is anything far shows in the photographs before the fit: what is far has the same color in all of them
 along a direction, wherever they were taken from, and what is near has not. That much light passes between Gaussians
