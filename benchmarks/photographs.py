@@ -1,10 +1,11 @@
-"""What is modeled of single photographs, on and off: exposure, poses, transients, in paired fits of captures.
+"""What is modeled beside the scene, on and off: exposure, poses, transients, a skybox, in paired fits of captures.
 
     python benchmarks/photographs.py [--scenes head office ...] [--terms exposure=points ...] [--seeds 3] [--page]
 
 Every fit has the defaults of `drgs fit` but for its size and the one term that its row names; what is said of a term
 is a difference to the fit without, of the same scene, split and seed. Appends one row a fit to
-benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md. Scenes
+benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md, and
+that of skyboxes, in each renderer, of docs/one-model.md. Scenes
 are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. Each seed
 holds out other views, but of data sets that have a split of their own. One thread.
 """
@@ -33,11 +34,13 @@ from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "photographs.jsonl"
-PAGE = ROOT / "docs" / "real-data.md"
+PAGES = {name: ROOT / "docs" / "real-data.md" for name in ("terms", "photographs")}
+PAGES["skyboxes"] = ROOT / "docs" / "one-model.md"
 SCENES = ("office", "head", "banana", "fern", "statue")
 TERMS = ("", "exposure=points", "exposure=learned", "poses=refined", "transients=mask")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
 MADE = "capture"
+RENDERERS = ("exact", "fast", "gsplat")
 KEY = ("scene", "term", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
 
 
@@ -53,10 +56,16 @@ def measured(scene: str, term: str, seed: int, offset: int, size: dict) -> dict:
     found |= {key: metrics["poses"][key] for key in ("degrees", "moved", "psnr_refined")} if "poses" in metrics else {}
     found |= {"reprojection": recorded["poses"]["reprojection"]} if "poses" in recorded else {}
     found |= metrics.get("transients", {})
+    if "skybox" in recorded:
+        found["skybox"] = {**recorded["skybox"], "visible": metrics.get("skybox", {}).get("visible", 0.0)}
     return {
         **dict(zip(KEY, (Path(scene).name, term, seed, offset, *size.values()), strict=True)),
         "psnr": [view["psnr"] for view in metrics["views"]],
         "cc_psnr": [view["cc_psnr"] for view in metrics["views"]],
+        "renderers": {
+            row["name"]: {"mean": row["mean"]["psnr"], "worst": row["worst"]["psnr"]}
+            for row in metrics["renderers"]["rows"]
+        },
         "found": found,
         "seconds": metrics["seconds"],
         **ran(),
@@ -114,6 +123,28 @@ def summary(found: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def skyboxes(found: list[dict]) -> str:
+    """What a skybox changes of held-out views in each of three renderers, against the fit without of the same unit."""
+    lines = ["| capture, seed | term | agree on what is far / show it | `exact` | `fast` | `gsplat` | seconds |"]
+    lines += ["|---|---|---|---|---|---|---|"]
+    plain = {_unit(row): row for row in found if not row["term"] and "renderers" in row}
+    with_sky = [row for row in found if row["term"].startswith("skybox") and _unit(row) in plain]
+    for unit in sorted({_unit(row) for row in with_sky}):
+        base = plain[unit]
+        cells = [f"{base['renderers'][x]['mean']:.2f} / {base['renderers'][x]['worst']:.2f}" for x in RENDERERS]
+        lines.append(f"| {unit[0]}, {unit[1]} | none | - | {' | '.join(cells)} | {base['seconds']:.0f} |")
+        for row in (row for row in with_sky if _unit(row) == unit):
+            cells = [
+                " / ".join(f"{row['renderers'][x][key] - base['renderers'][x][key]:+.2f}" for key in ("mean", "worst"))
+                for x in RENDERERS
+            ]
+            sky = row["found"]["skybox"]
+            shown = f"{100 * sky['visible']:.0f} % of the pixels" if sky["gaussians"] else "none"
+            seen = f"{100 * sky['share']:.0f} % of directions / {shown}"
+            lines.append(f"|  | {row['term']} | {seen} | {' | '.join(cells)} | {row['seconds']:.0f} |")
+    return "\n".join(lines)
+
+
 def _unit(row: dict) -> tuple[str, int, int]:
     """What fits must have in common to be compared."""
     return row["scene"], row["seed"], row["offset"]
@@ -151,9 +182,10 @@ def main() -> None:
                     means = {name: round(statistics.mean(row[name]), 2) for name in ("psnr", "cc_psnr")}
                     print(scene, term or "none", means, row["found"], f"{row['seconds']:.0f} s", flush=True)
     found = read_rows(ROWS)
-    for name, text in (("terms", summary(found)), ("photographs", table(found))):
+    others = [row for row in found if not row["term"].startswith("skybox")]
+    for name, text in (("terms", summary(others)), ("photographs", table(others)), ("skyboxes", skyboxes(found))):
         print(text)
-        fill_between(PAGE, name, text)
+        fill_between(PAGES[name], name, text)
 
 
 if __name__ == "__main__":

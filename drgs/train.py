@@ -47,6 +47,7 @@ from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
+from drgs.fitting.skybox import visible_share
 from drgs.fitting.stages import moving_labels
 from drgs.fitting.start import motion_of, start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
     from drgs.fitting.poses import PoseEvidence
+    from drgs.fitting.skybox import FarEvidence
     from drgs.information.pool import Workers
 
 __all__ = [
@@ -198,18 +200,19 @@ def _fit(
             made = with_poses(made, frames, config, header["extent"])
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds = seconds_of(run, header) or 0.0
-        exposure = evidence = None
+        exposure = evidence = far = None
         source = header["point_source"]
         config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source, exposure, evidence = start(
+        trainer, source, exposure, evidence, far = start(
             dataset, views, frames, config, parts, taught, plan is not None, room, motion
         )
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= _exposure_record(run, trainer, exposure)
     recorded |= _poses_record(run, trainer, evidence)
+    recorded |= _skybox_record(run, trainer, far)
     poses = trainer.parts.poses
     estimated = [*(["exposure"] if trainer.parts.exposure else []), *(["pose"] if poses else [])]
     if estimated:
@@ -265,6 +268,7 @@ def _fit(
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
         **refined,
+        **({"skybox": _skybox_summary(trainer)} if trainer.rows.skybox else {}),
         **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
     )
     told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
@@ -272,11 +276,17 @@ def _fit(
     return FitResult(g, written, run, loop.seconds)
 
 
+def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
+    """What metrics.json is to say of what is far away: how many Gaussians it has, and how much photographs show it."""
+    share = visible_share(trainer.rows, trainer.photographs(), trainer.config.settings)
+    return {"gaussians": trainer.rows.skybox, "visible": share}
+
+
 def _check_photographs(config: FitConfig, moves: bool) -> None:
     """Refuse what is modeled of single photographs where that is not built.
 
     Raises:
-        NotImplementedError: With exposure or poses where views are chosen on the way or things move, and with
+        NotImplementedError: With exposure, poses or a skybox where views are chosen on the way or things move, and with
             transients where things move: these are found by what neighbors show of the same surface at rest.
     """
     if config.data.exposure != "off" and (config.selection or moves):
@@ -288,6 +298,11 @@ def _check_photographs(config: FitConfig, moves: bool) -> None:
         raise NotImplementedError(
             f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
             "leave --poses out"
+        )
+    if config.data.skybox != "off" and (config.selection or moves):
+        raise NotImplementedError(
+            f"fit: skybox must be off where views are chosen on the way or things move, got {config.data.skybox}; "
+            "leave --skybox out"
         )
     if config.loss.transients != "keep" and moves:
         raise NotImplementedError(
@@ -322,6 +337,15 @@ def _poses_record(run: Run, trainer: Trainer, found: PoseEvidence | None) -> dic
     # A fit that goes on, whose config.json may have been moved away.
     before = run.config() if (run.path / "config.json").is_file() else {}
     return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
+
+
+def _skybox_record(run: Run, trainer: Trainer, found: FarEvidence | None) -> dict[str, Any]:
+    """What config.json is to say of a skybox; arguments as of `_exposure_record`."""
+    if found is not None:
+        return {"skybox": {"gaussians": trainer.rows.skybox, **found.to_json()}}
+    if trainer.config.data.skybox == "off" or not (run.path / "config.json").is_file():
+        return {}
+    return {name: x for name, x in run.config().items() if name == "skybox"}
 
 
 def _checkpoint(

@@ -47,6 +47,7 @@ __all__ = [
     "Schedule",
     "SelectionConfig",
     "SemanticUse",
+    "SkyboxUse",
     "Start",
     "TransientUse",
     "recorded_config",
@@ -61,6 +62,7 @@ Restart = Literal["auto", "always", "never"]
 Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
 PoseUse = Literal["fixed", "auto", "refined"]
+SkyboxUse = Literal["off", "auto", "on"]
 TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
@@ -105,6 +107,8 @@ class DataConfig(Record):
             initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
         poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
             fitted, where observations of a COLMAP model are clearly off.
+        skybox: A tenth of the Gaussians begins far away around the scene, for the sky and what is behind everything
+            (on), where photographs clearly agree on what is far away (auto), or not at all (off).
     """
 
     max_pixels: int = 130_000
@@ -117,6 +121,7 @@ class DataConfig(Record):
     mask: MaskUse = "auto"
     exposure: ExposureUse = "off"
     poses: PoseUse = "fixed"
+    skybox: SkyboxUse = "off"
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:

@@ -107,30 +107,38 @@ class Outside:
 
 @dataclasses.dataclass(frozen=True)
 class Opacity:
-    """Opacity of all Gaussians: those that no photograph needs become transparent, and density control moves them."""
+    """Opacity of all Gaussians: those that no photograph needs become transparent, and density control moves them.
+
+    `skybox`: how many of the first are far away, and left out of the mean.
+    """
 
     weight: float
+    skybox: int = 0
     name: ClassVar[str] = "opacity"
     outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
-        return self.weight * gaussians.opacities.mean()
+        return self.weight * gaussians.opacities[self.skybox :].mean()
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """Scales of all Gaussians, in units of the scene's extent: those that no photograph needs shrink."""
+    """Scales of all Gaussians, in units of the scene's extent: those that no photograph needs shrink.
+
+    `skybox`: how many of the first are far away, and left out of the mean.
+    """
 
     weight: float
     extent: float
+    skybox: int = 0
     name: ClassVar[str] = "scale"
     outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
         # The weight of MCMC's authors is for scenes with an extent of about 5.
-        return self.weight * gaussians.scales.mean() * (5 / self.extent)
+        return self.weight * gaussians.scales[self.skybox :].mean() * (5 / self.extent)
 
 
 def psnr_of(mse: float) -> float:

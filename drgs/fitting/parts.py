@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
 from drgs.fitting.filter_3d import Filter3D
-from drgs.fitting.losses import LossTerm, terms_of
+from drgs.fitting.losses import LossTerm, Opacity, Scale, terms_of
 from drgs.fitting.networks import Network, Rate
 from drgs.fitting.rows import GaussianRows
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drgs.fitting.poses import Poses
     from drgs.integrator import Output
 
-__all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses"]
+__all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses", "with_skybox"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +108,17 @@ def with_exposure(
         frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
     )
     return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
+
+
+def with_skybox(parts: Parts, count: int) -> Parts:
+    """The parts with terms that leave the first `count` Gaussians, which are far away, out of means over all."""
+    return dataclasses.replace(
+        parts,
+        terms=[
+            dataclasses.replace(term, skybox=count) if isinstance(term, (Opacity, Scale)) else term
+            for term in parts.terms
+        ],
+    )
 
 
 def with_poses(parts: Parts, frames: list[Frame], config: FitConfig, extent: float, reach: float = 0.0) -> Parts:

@@ -399,6 +399,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     kind |= {"networks": [str]} if "networks" in header else {}
     kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
     kind |= {"transients": bool} if "transients" in header else {}
+    kind |= {"skybox": int} if "skybox" in header else {}
     check_json(str(path), header, kind, advice)
     active = (header.get("active") or {}).get("config")  # of versions that wrote it there
     check_json(str(path), {"active": active}, {"active": (None, dict)}, advice)
@@ -410,6 +411,9 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     for name, low in least.items():
         if header.get(name, low) < low:
             raise ValueError(f"{path}: {name} must be >= {low}, got {header[name]}; {advice}")
+    most = len(tensors["parameter.means"]) if "parameter.means" in tensors else 0
+    if not 0 <= header.get("skybox", 0) <= most:
+        raise ValueError(f"{path}: skybox must be in 0..{most}, got {header['skybox']}; {advice}")
     if not header["extent"] > 0:
         raise ValueError(f"{path}: extent must be > 0, got {header['extent']}; {advice}")
     if header.get("active") is not None:

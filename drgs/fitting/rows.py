@@ -23,10 +23,12 @@ class GaussianRows:
     Attributes:
         tensors: means, quats, log_scales, logit_opacities, sh_dc (N, 1, 3) and sh_rest (N, K - 1, 3), perhaps features
             (N, D), and any others (N, ...) whose rows shall follow the Gaussians.
+        skybox: How many of the first rows are what is far away (skybox.py), which density control leaves alone.
         optimizer: One parameter group a tensor, named as in `tensors`.
     """
 
     def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
+        self.skybox = 0
         # Leaves of their own: what the caller has is neither changed nor differentiated.
         self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
         groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
@@ -89,6 +91,18 @@ class GaussianRows:
         """One more tensor with a row a Gaussian, with no moments; the others keep theirs."""
         self.tensors[name] = x = values.detach().clone().requires_grad_()  # a leaf of its own, as in `__init__`
         self.optimizer.add_param_group({"params": [x], "name": name})
+
+    def add_skybox(self, rows: dict[str, torch.Tensor]) -> None:
+        """Put the Gaussians of a shell before all others, with no moments; before the first step alone.
+
+        Raises:
+            ValueError: If the optimizer has made a step, whose moments would be lost.
+        """
+        if self.optimizer.state:
+            raise ValueError("fit: a skybox must be there before the first step, got one later; begin a fit with it")
+        whole = GaussianRows({name: torch.cat([rows[name], x.detach()]) for name, x in self.tensors.items()})
+        self.tensors, self.optimizer = whole.tensors, whole.optimizer
+        self.skybox = len(rows["means"])
 
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Add Gaussians with zero moments; in tensors that `rows` lacks, their rows are 0."""

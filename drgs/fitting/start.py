@@ -9,8 +9,9 @@ import torch
 
 from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
-from drgs.fitting.parts import parts_of, with_exposure, with_poses
+from drgs.fitting.parts import parts_of, with_exposure, with_poses, with_skybox
 from drgs.fitting.rows import GaussianRows
+from drgs.fitting.skybox import RADIUS, SHARE, FarEvidence, Skybox, far_evidence, why_not
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
 
@@ -52,6 +53,21 @@ def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion 
     return Motion(config, times_of([*train, *test]))
 
 
+def _may_have_skybox(frames: list[Frame], config: FitConfig) -> bool:
+    """Whether nothing of a data set says what is behind everything.
+
+    Raises:
+        ValueError: If something does, and a skybox is asked for all the same.
+    """
+    reason = why_not(frames, config.settings.background)
+    if reason is not None and config.data.skybox == "on":
+        raise ValueError(f"fit: skybox must be off or auto here, got on: {reason}; leave --skybox out")
+    if reason is not None:
+        with Bar("skybox") as bar:
+            bar.note(f"skybox: none, {reason}")
+    return reason is None
+
+
 def start(
     dataset: Dataset,
     views: list[View],
@@ -62,19 +78,29 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
-) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None]:
-    """A trainer at step 0, where its points come from, and what is known of exposure and poses, where asked for.
+) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, FarEvidence | None]:
+    """A trainer at step 0, where its points come from, and what is known of exposure, poses and what is far away, where
+    asked for.
 
     Points come, by default, if `strict`, only from `views`.
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
+    far = None
+    room = 0
+    if parts is None and config.data.skybox != "off" and _may_have_skybox(frames, config):
+        around = scene_extent([frame.camera for frame in frames])
+        with Bar("skybox") as bar:
+            far = far_evidence(frames, around, config.seed)
+            is_on = config.data.skybox == "on" or far.is_clear
+            room = round(SHARE * config.density.max_gaussians) if is_on else 0
+            bar.note(f"skybox: {far.words()}; {'there is one' if is_on else 'there is none'}")
     given = config.data.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     with Bar("initial points") as bar:
         seen = views if motion is None else first_time(views)
         points, colors, source = initial_points(
-            dataset if given else seen, config.seed, config.density.max_gaussians - reserved, bar.stage
+            dataset if given else seen, config.seed, config.density.max_gaussians - reserved - room, bar.stage
         )
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
@@ -88,6 +114,11 @@ def start(
         share = float(sum(x.sum() for x in empty)) / sum(frame.pixels[..., 0].numel() for frame in frames)
         _log.info("%.0f %% of the training pixels show nothing, by masks or alpha; they are kept empty", 100 * share)
     made = parts or parts_of(config, extent, channels)
+    if room:
+        skybox = Skybox.around(frames, extent, room, config.seed)
+        model.add_skybox(skybox.rows(width))
+        made = with_skybox(made, len(skybox))
+        _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * extent)
     found = None
     if parts is None and config.data.exposure != "off":
         from drgs.fitting.exposure import estimate_exposure
@@ -108,4 +139,4 @@ def start(
             bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
         if is_on:
             made = with_poses(made, frames, config, extent, evidence.reach)
-    return Trainer(config, frames, model, extent, made, motion), source, found, evidence
+    return Trainer(config, frames, model, extent, made, motion), source, found, evidence, far

@@ -18,7 +18,7 @@ from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.filter_3d import VARIANCES
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
-from drgs.fitting.parts import Parts, means_rate, parts_of
+from drgs.fitting.parts import Parts, means_rate, parts_of, with_skybox
 from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.resolution import Resolution
@@ -252,6 +252,7 @@ class Trainer:
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
             **({"networks": [network.name for network in self.parts.networks]} if self.parts.networks else {}),
+            **({"skybox": self.rows.skybox} if self.rows.skybox else {}),
             **(self.motion.header() if self.motion is not None else {}),
             **found,
         }
@@ -296,6 +297,9 @@ class Trainer:
         rows = GaussianRows.from_state(tensors)
         extent = header["extent"]
         parts = parts_of(config, extent) if parts is None else parts
+        rows.skybox = header.get("skybox", 0)
+        if rows.skybox:
+            parts = with_skybox(parts, rows.skybox)
         if motion is not None and motion.has_begun(rows):
             parts = motion.restored(rows, parts, header, where)
         trainer = cls(config, frames, rows, extent, parts, motion)

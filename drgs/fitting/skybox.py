@@ -1,0 +1,277 @@
+"""What is far away, or nothing that has a place: Gaussians on a shell around the scene, fitted with the others.
+
+Where rays end in nothing near, in the sky or far behind the scene, initial points are guesses at the distance of what
+is triangulated beside them, and a fit with a small budget paints each photograph's background in the air before its
+camera. Here a part of the budget begins on a shell, `RADIUS` extents of the scene away, in the directions that training
+photographs look in, opaque, overlapping, with the median color of the photographs there. Hierarchical 3D Gaussians [1]
+have such a skybox of points. They are Gaussians as all others: every renderer and every viewer of the PLY shows them.
+
+Gaussians of equal distance change places from view to view, and `inria` and `gsplat` order by z where others order by
+distance. So distances are spread over a factor of two: neighbors on the shell keep their order.
+
+Means stay where they are by their distance: their rate, in units of the extent, moves them by about one extent at most
+in 30,000 steps, where they are a hundred away. The terms of the loss that keep Gaussians small and let them fade leave
+them out, or one of their scales would outweigh those of all others; density control neither moves nor copies them.
+
+Whether there is anything far shows in the photographs before the fit: what is far has the same color in all of them
+along a direction, wherever they were taken from, and what is near has not. That much light passes between Gaussians
+does not tell: the first ones of `statue`, whose park is far, leave nothing open, and those of `banana`, a carpet that
+points cover sparsely, leave most of it open, where a shell does harm.
+
+Reference:
+    [1] Kerbl et al., "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets",
+        ACM TOG 2024.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from drgs.ellipsoids import Y_00
+from drgs.integrator import render
+
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Gaussians
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.rows import GaussianRows
+    from drgs.settings import RenderSettings
+
+__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "far_evidence", "visible_share", "why_not"]
+
+RADIUS = 100.0
+"""Distance of the nearest of them from the middle of the cameras, in extents of the scene."""
+
+SHARE = 0.1
+"""Their part of the budget of Gaussians."""
+
+_FARTHEST = 2.0  # distance of the farthest, in those of the nearest
+_OPACITY = 0.9
+_WIDTH = 0.75  # of their scales, in the mean distance of neighbors: some percent of the light pass between them
+_MARGIN = 0.05  # of the longer side of a picture, beyond its border: directions that held-out views may look in
+_DRAWN = 4_000  # directions over the whole sphere, of which the part that photographs look in is counted
+_OPEN = 0.5  # transmittance of the others from which on the shell is what a pixel shows
+_LOOKED = 800  # directions whose colors are compared
+_VIEWS = 3  # photographs that must look in a direction, so that a median tells of more than two
+_BLUR = 0.012  # radius of the mean that is compared, in widths of a picture: the parallax that is left, and details
+_SAME = 0.03  # median distance of colors from their median that what is far has at most
+_CLEAR = 0.2  # share of directions beyond chance: 0.48 of `statue`, 0.07 of `fern`, 0.00 of `banana`
+
+
+@dataclasses.dataclass(frozen=True)
+class Skybox:
+    """Gaussians of a shell, in directions that photographs look in.
+
+    Attributes:
+        means: (K, 3) float64 world.
+        colors: (K, 3) float32 in [0, 1]: of each channel the median over the photographs that look there.
+        scales: (K,) float64 standard deviations, of all three axes.
+    """
+
+    means: np.ndarray
+    colors: np.ndarray
+    scales: np.ndarray
+
+    @classmethod
+    def around(cls, frames: list[Frame], extent: float, count: int, seed: int = 0) -> Skybox:
+        """About `count` Gaussians, evenly over the directions that photographs look in.
+
+        Args:
+            frames: Training photographs, at least one; what is outside of their masks has no color.
+            extent: Extent of the scene.
+            count: How many at most.
+            seed: Seed of the distances.
+        """
+        middle = np.stack([frame.camera.center for frame in frames]).mean(axis=0)
+        radius = RADIUS * extent
+        looked_at = _seen(frames, middle + radius * _directions(_DRAWN)).any(axis=0)
+        whole = max(1, int(count * _DRAWN / max(1, int(looked_at.sum()))))
+        directions = _directions(whole)
+        directions = directions[_seen(frames, middle + radius * directions).any(axis=0)][:count]
+        distances = radius * np.exp(np.random.default_rng(seed).uniform(0, math.log(_FARTHEST), len(directions)))
+        means = middle + distances[:, None] * directions
+        spacing = math.sqrt(4 * math.pi / whole)
+        return cls(means, _colors(frames, means), distances * spacing * _WIDTH)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def rows(self, features: int = 0) -> dict[str, torch.Tensor]:
+        """Rows for `GaussianRows`, with `features` channels of features that are 0."""
+        count = len(self)
+        quats = torch.zeros(count, 4)
+        quats[:, 0] = 1
+        return {
+            "means": torch.from_numpy(self.means).float(),
+            "quats": quats,
+            "log_scales": torch.from_numpy(self.scales).log().float()[:, None].repeat(1, 3),
+            "logit_opacities": torch.full((count,), math.log(_OPACITY / (1 - _OPACITY))),
+            "sh_dc": ((torch.from_numpy(self.colors).float() - 0.5) * (1 / Y_00))[:, None, :],
+            "sh_rest": torch.zeros(count, 0, 3),
+            **({"features": torch.zeros(count, features)} if features else {}),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class FarEvidence:
+    """What photographs say of whether something is far away.
+
+    Attributes:
+        seen: Of the directions that photographs look in, the share that at least three of them do.
+        agreeing: Of these, the share in which they show the same color.
+        chance: What this share is if every photograph's colors are shuffled among its directions.
+    """
+
+    seen: float
+    agreeing: float
+    chance: float
+
+    @property
+    def share(self) -> float:
+        """Share of all directions in which photographs agree as they do not by chance."""
+        return self.seen * max(0.0, self.agreeing - self.chance)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether there is clearly something far away."""
+        return self.share > _CLEAR
+
+    def words(self) -> str:
+        """What was found, in one line."""
+        return (
+            f"photographs agree on what is far away in {100 * self.share:.1f} % of their directions (clear above "
+            f"{100 * _CLEAR:g} %; {100 * self.seen:.0f} % are seen three times, {100 * self.agreeing:.0f} % of these "
+            f"agree, by chance {100 * self.chance:.0f} %)"
+        )
+
+    def to_json(self) -> dict[str, float]:
+        """The evidence as config.json has it."""
+        return {"share": self.share, **dataclasses.asdict(self)}
+
+
+def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEvidence:
+    """Whether photographs show the same color wherever they look in one direction.
+
+    Args:
+        frames: Training photographs, at least one; nothing outside of their masks is looked at.
+        extent: Extent of the scene.
+        seed: Seed of the shuffling that tells what chance is.
+    """
+    points = Skybox.around(frames, extent, _LOOKED, seed).means
+    colors = _colors_seen(frames, points, _BLUR)
+    there = ~np.isnan(colors[..., 0])
+    many = there.sum(axis=0) >= _VIEWS
+    if not many.any():
+        return FarEvidence(0.0, 0.0, 0.0)
+    shuffled = np.full_like(colors, np.nan)
+    rng = np.random.default_rng(seed)
+    for row in range(len(frames)):
+        index = np.flatnonzero(there[row])
+        shuffled[row, index] = colors[row, rng.permutation(index)]
+    agreeing, chance = (float((_deviation(x[:, many]) < _SAME).mean()) for x in (colors, shuffled))
+    return FarEvidence(float(many.sum() / there.any(axis=0).sum()), agreeing, chance)
+
+
+def visible_share(rows: GaussianRows, frames: list[Frame], settings: RenderSettings) -> float:
+    """Share of the pixels of photographs that show the shell: behind all others more than half of the light is left.
+
+    Args:
+        rows: Gaussians, the shell first.
+        frames: Photographs; nothing outside of their masks is counted.
+        settings: What the others are rendered with.
+    """
+    others: Gaussians = rows.gaussians().detach().take(slice(rows.skybox, None)).replace(features=None)
+    shown = total = 0.0
+    with torch.no_grad():  # looked at, not optimized
+        for frame in frames:
+            alpha = render(others, frame.camera, settings, outputs=()).alpha.cpu()
+            mask = torch.ones_like(alpha) if frame.mask is None else frame.mask
+            shown += float(((1 - alpha > _OPEN) * mask).sum())
+            total += float(mask.sum())
+    return shown / max(total, 1.0)
+
+
+def why_not(frames: list[Frame], background: tuple[float, float, float]) -> str | None:
+    """What of a data set says what is behind everything, in words; None: nothing does, and there may be a shell.
+
+    Args:
+        frames: Training photographs.
+        background: Color that is behind the Gaussians.
+    """
+    if any(frame.is_object and frame.mask is not None for frame in frames):
+        return "masks say that nothing is behind the object"
+    if any(frame.alpha is not None for frame in frames):
+        return "an alpha channel says where nothing is"
+    if any(background):
+        return "the background has a color that is stated"
+    return None
+
+
+def _directions(count: int) -> np.ndarray:
+    """(count, 3) unit vectors evenly over the sphere: a Fibonacci lattice."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    angle = math.pi * (1 + math.sqrt(5)) * index
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def _seen(frames: list[Frame], points: np.ndarray) -> np.ndarray:
+    """(V, P) which photographs look at which points, a little beyond their borders, too."""
+    seen = np.zeros((len(frames), len(points)), bool)
+    for row, frame in enumerate(frames):
+        size = np.array([frame.camera.width, frame.camera.height])
+        pixels, depth = frame.camera.project(points)
+        margin = _MARGIN * size.max()
+        seen[row] = (depth > 0) & ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
+    return seen
+
+
+def _colors_seen(frames: list[Frame], points: np.ndarray, blur: float = 0.0) -> np.ndarray:
+    """(V, P, 3) colors of photographs at far points, NaN where a photograph or its mask does not show them; means over
+    a radius of `blur` widths of the picture.
+    """
+    import cv2
+
+    found = np.full((len(frames), len(points), 3), np.nan, np.float32)
+    for row, frame in enumerate(frames):
+        image = frame.image().numpy()
+        if blur:
+            image = cv2.GaussianBlur(image, (0, 0), blur * frame.camera.width)
+        pixels, depth = frame.camera.project(points)
+        inside = (depth > 0) & ((pixels >= 0) & (pixels < (frame.camera.width, frame.camera.height))).all(axis=1)
+        index = np.flatnonzero(inside)
+        columns, lines = pixels[index].astype(int).T
+        if frame.mask is not None:
+            kept = frame.mask.numpy()[lines, columns] > 0.5
+            index, columns, lines = index[kept], columns[kept], lines[kept]
+        found[row, index] = image[lines, columns]
+    return found
+
+
+def _deviation(colors: np.ndarray) -> np.ndarray:
+    """(P,) median over photographs of the largest channel's distance from the median color, of (V, P, 3) colors of
+    which each point has one at least.
+    """
+    apart = np.abs(colors - np.nanmedian(colors, axis=0)).max(axis=2)
+    return np.nanmedian(apart, axis=0)
+
+
+def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
+    """(P, 3) median colors of photographs at far points; of those that none shows, the color of the nearest one."""
+    found = _colors_seen(frames, points)
+    has_color = ~np.isnan(found[..., 0]).all(axis=0)
+    colors = np.full((len(points), 3), 0.5, np.float32)
+    if not has_color.any():
+        return colors
+    colors[has_color] = np.nanmedian(found[:, has_color], axis=0)
+    middle = np.stack([frame.camera.center for frame in frames]).mean(axis=0)
+    directions = points - middle
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for row in np.flatnonzero(~has_color):
+        colors[row] = colors[has_color][np.argmax(directions[has_color] @ directions[row])]
+    return colors
