@@ -121,9 +121,9 @@ class FarEvidence:
     """What photographs say of whether something is far away.
 
     Attributes:
-        seen: Of the directions that photographs look in, the share that at least three of them do.
-        agreeing: Of these, the share in which they show the same color.
-        chance: What this share is if every photograph's colors are shuffled among its directions.
+        seen: Share of the directions that photographs look in, those that at least three of them look in.
+        agreeing: Share of these directions, those in which photographs show the same color.
+        chance: The same share where every photograph's colors are shuffled among its directions.
     """
 
     seen: float
