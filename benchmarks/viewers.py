@@ -27,9 +27,6 @@ import dataclasses
 import functools
 import http.server
 import importlib.metadata
-import io
-import json
-import math
 import os
 import re
 import shutil
@@ -71,6 +68,7 @@ PAGES = ROOT / "benchmarks" / "viewer_pages"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 300.0  # s until a viewer must have drawn: the processor draws, and may be busy
 PAUSE = 0.7  # s between two pictures, of which three must be the same: the viewer has sorted and drawn
+SORTED = 3.0  # s that viser's client has for sorting before its first picture, which may be of an older order
 ALIKE = 3
 """Pictures in a row that must be the same."""
 CELL = 200
@@ -267,7 +265,8 @@ def in_page(viewer: Viewer, folder: Path, browser: Any, ply: Path, cameras: list
             }
             code = (
                 f"async (spec) => {{ const opened = import('/pages/{viewer.page}').then((page) => page.open(spec)); "
-                "const late = new Promise((_, no) => setTimeout(() => no(new Error('it took too long')), spec.patience)); "
+                "const late = new Promise((_, no) => setTimeout(() => no(new Error('it takes too long')), "
+                "spec.patience)); "
                 "window.shown = await Promise.race([opened, late]); }"
             )
             try:
@@ -279,9 +278,8 @@ def in_page(viewer: Viewer, folder: Path, browser: Any, ply: Path, cameras: list
             for view, camera in zip(views, cameras, strict=True):
                 page.evaluate("(view) => { window.shown.look(view); }", view)
                 time.sleep(PAUSE)
-                clip = {"x": 0, "y": 0, **size}
-                take = functools.partial(page.screenshot, clip=clip)
-                pictures.append(settled(lambda: pixels_of(take()), f"{viewer.name} of {camera.name}"))
+                take = functools.partial(page.screenshot, clip={"x": 0, "y": 0, **size})
+                pictures.append(settled(lambda take=take: pixels_of(take()), f"{viewer.name} of {camera.name}"))
             return pictures
         finally:
             page.close()
@@ -310,7 +308,7 @@ def in_viser(browser: Any, g: Gaussians, cameras: list[Camera]) -> list[torch.Te
             pose = pose_of(camera, np.asarray(g.origin, np.float64))
             taken: list[Any] = []
             client.camera.wxyz, client.camera.position, client.camera.fov = pose.wxyz, pose.position, pose.fov
-            page.wait_for_timeout(1000 * PAUSE)
+            page.wait_for_timeout(1000 * SORTED)
 
             def take(camera: Camera = camera, pose: Any = pose, taken: list[Any] = taken) -> torch.Tensor:
                 # The client answers only while playwright lets its page run.
@@ -388,9 +386,8 @@ def measured(folder: Path, count: int, wheels: Path, browser: Any) -> tuple[list
     for viewer in VIEWERS:
         place = folder_of(viewer.wheel, wheels)
         if place is None:
-            print(
-                f"viewers: {viewer.name} needs {viewer.wheel}; pip install --no-deps --target {wheels} {viewer.wheel}"
-            )
+            advice = f"pip install --no-deps --target {wheels} {viewer.wheel}"
+            print(f"viewers: {viewer.name} must have the wheel {viewer.wheel}, is left out without; {advice}")
             continue
         shown = in_page(viewer, place, browser, ply, cameras) if viewer.page else in_viser(browser, g, cameras)
         pictures[viewer.name] = shown
