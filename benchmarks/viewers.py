@@ -408,7 +408,7 @@ def table(found: list[dict]) -> str:
                 cells.append("-")
                 continue
             cells.append(f"{statistics.mean(row['photograph']):.2f}, {statistics.mean(row['gsplat']):.1f}")
-        title = f"`{name}`" if name in ANY else name
+        title = f"`{name}`" if name in ANY else "`gsplat`, degree 0" if name.startswith("gsplat,") else name
         lines.append(f"| {title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
