@@ -2,8 +2,8 @@
 
     python benchmarks/photographs.py [--scenes head office ...] [--terms exposure=points ...] [--seeds 3] [--page]
 
-Every fit has the defaults of `drgs fit` but for its size and the one term that its row names; what is said of a term
-is a difference to the fit without, of the same scene, split and seed. Appends one row a fit to
+Every fit has the defaults of `drgs fit` but for its size, the one term that its row names, and no skybox if that is not
+its term; what is said of a term is a difference to the fit without, of the same scene, split and seed. Appends one row a fit to
 benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md, and
 that of skyboxes, in each renderer, of docs/one-model.md. Scenes
 are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. Each seed
@@ -47,7 +47,8 @@ KEY = ("scene", "term", "seed", "offset", "max_steps", "max_pixels", "max_gaussi
 def measured(scene: str, term: str, seed: int, offset: int, size: dict) -> dict:
     """One fit: its held-out views, and what it found of its photographs."""
     name, _, value = term.partition("=")
-    config = FitConfig.of(seed=seed, test_offset=offset, **size, **({name: value} if term else {}))
+    options = {"skybox": "off"} | ({name: value} if term else {})
+    config = FitConfig.of(seed=seed, test_offset=offset, **size, **options)
     with tempfile.TemporaryDirectory() as folder:
         result = fit(load(DATA / scene), Path(folder) / "run", config, progress=False)
         recorded = result.run.config()

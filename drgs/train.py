@@ -299,10 +299,10 @@ def _check_photographs(config: FitConfig, moves: bool) -> None:
             f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
             "leave --poses out"
         )
-    if config.data.skybox != "off" and (config.selection or moves):
+    if config.data.skybox == "on" and (config.selection or moves):
         raise NotImplementedError(
-            f"fit: skybox must be off where views are chosen on the way or things move, got {config.data.skybox}; "
-            "leave --skybox out"
+            "fit: skybox must be off or auto where views are chosen on the way or things move, got on; leave --skybox "
+            "out"
         )
     if config.loss.transients != "keep" and moves:
         raise NotImplementedError(

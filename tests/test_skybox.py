@@ -167,10 +167,9 @@ def test_none_where_the_data_say_what_is_behind(tmp_path, data, background, said
     assert "\n" not in str(error.value)
 
 
-def test_nothing_speaks_against_photographs(tmp_path):
+def test_nothing_speaks_against_photographs():
     """Plain ones, and those of which only the corners are not valid."""
     frames = photographs()
-    dataset = dataset_of(frames, tmp_path)
     masked = [dataclasses.replace(frame, mask=torch.ones(HEIGHT, WIDTH)) for frame in frames]
     assert why_not(frames, (0.0, 0.0, 0.0)) is None
     assert why_not(masked, (0.0, 0.0, 0.0)) is None
@@ -294,15 +293,17 @@ def test_it_comes_before_the_first_step():
 
 def test_refused_where_views_are_chosen(tmp_path):
     """In one line, before anything is fitted."""
-    config = FitConfig.of(**SETTINGS, skybox="auto").replace(selection=SelectionConfig())
-    with pytest.raises(NotImplementedError, match="skybox must be off where views are chosen on the way or"):
+    config = FitConfig.of(**SETTINGS, skybox="on").replace(selection=SelectionConfig())
+    with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
         fit(dataset_of(photographs(), tmp_path), tmp_path / "run", config, progress=False)
 
 
 def test_refused_where_things_move(tmp_path):
-    """The same of photographs of two times."""
+    """The same of photographs of two times; `auto` has none there."""
     dataset = dataset_of(photographs(), tmp_path)
     for i, view in enumerate(dataset.views):
         view.camera = dataclasses.replace(view.camera, time=float(i % 2))
-    with pytest.raises(NotImplementedError, match="skybox must be off where views are chosen on the way or"):
+    with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
         fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS, skybox="on"), progress=False)
+    result = fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS).replace(max_steps=4), progress=False)
+    assert "skybox" not in result.run.config()

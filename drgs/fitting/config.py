@@ -107,8 +107,9 @@ class DataConfig(Record):
             initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
         poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
             fitted, where observations of a COLMAP model are clearly off.
-        skybox: A tenth of the Gaussians begins far away around the scene, for the sky and what is behind everything
-            (on), where photographs clearly agree on what is far away (auto), or not at all (off).
+        skybox: A tenth of the Gaussians begins far away around the scene, for the sky and what is behind everything,
+            where photographs clearly agree on what is far away (auto, not in active fits nor where things move), always
+            (on), or never (off).
     """
 
     max_pixels: int = 130_000
@@ -121,7 +122,7 @@ class DataConfig(Record):
     mask: MaskUse = "auto"
     exposure: ExposureUse = "off"
     poses: PoseUse = "fixed"
-    skybox: SkyboxUse = "off"
+    skybox: SkyboxUse = "auto"
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:

@@ -53,19 +53,24 @@ def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion 
     return Motion(config, times_of([*train, *test]))
 
 
-def _may_have_skybox(frames: list[Frame], config: FitConfig) -> bool:
-    """Whether nothing of a data set says what is behind everything.
+def _look_far(frames: list[Frame], config: FitConfig) -> tuple[FarEvidence | None, int]:
+    """What photographs say of what is far away, None if other data say what is behind everything; and how many
+    Gaussians are to begin there.
 
     Raises:
-        ValueError: If something does, and a skybox is asked for all the same.
+        ValueError: If a skybox is asked for where data say what is behind everything.
     """
-    reason = why_not(frames, config.settings.background)
-    if reason is not None and config.data.skybox == "on":
-        raise ValueError(f"fit: skybox must be off or auto here, got on: {reason}; leave --skybox out")
-    if reason is not None:
-        with Bar("skybox") as bar:
+    with Bar("skybox") as bar:
+        reason = why_not(frames, config.settings.background)
+        if reason is not None and config.data.skybox == "on":
+            raise ValueError(f"fit: skybox must be off or auto here, got on: {reason}; leave --skybox out")
+        if reason is not None:
             bar.note(f"skybox: none, {reason}")
-    return reason is None
+            return None, 0
+        found = far_evidence(frames, scene_extent([frame.camera for frame in frames]), config.seed)
+        is_on = config.data.skybox == "on" or found.is_clear
+        bar.note(f"skybox: {found.words()}; {'there is one' if is_on else 'there is none'}")
+        return found, round(SHARE * config.density.max_gaussians) if is_on else 0
 
 
 def start(
@@ -86,16 +91,9 @@ def start(
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
+    may_look_far = parts is None and config.data.skybox != "off" and not strict and motion is None
+    far, room = _look_far(frames, config) if may_look_far else (None, 0)
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
-    far = None
-    room = 0
-    if parts is None and config.data.skybox != "off" and _may_have_skybox(frames, config):
-        around = scene_extent([frame.camera for frame in frames])
-        with Bar("skybox") as bar:
-            far = far_evidence(frames, around, config.seed)
-            is_on = config.data.skybox == "on" or far.is_clear
-            room = round(SHARE * config.density.max_gaussians) if is_on else 0
-            bar.note(f"skybox: {far.words()}; {'there is one' if is_on else 'there is none'}")
     given = config.data.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     with Bar("initial points") as bar:
         seen = views if motion is None else first_time(views)
