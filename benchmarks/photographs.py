@@ -3,11 +3,11 @@
     python benchmarks/photographs.py [--scenes head office ...] [--terms exposure=points ...] [--seeds 3] [--page]
 
 Every fit has the defaults of `drgs fit` but for its size, the one term that its row names, and no skybox if that is not
-its term; what is said of a term is a difference to the fit without, of the same scene, split and seed. Appends one row a fit to
-benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md, and
-that of skyboxes, in each renderer, of docs/one-model.md. Scenes
-are captures by name, or folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. Each seed
-holds out other views, but of data sets that have a split of their own. One thread.
+its term; what is said of a term is a difference to the fit without, of the same scene, split and seed. Appends one row
+a fit to benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md,
+and that of skyboxes, in each renderer, of docs/one-model.md. Scenes are captures by name, or folders, as `drgs sfm`
+makes one of `watch` and `drgs scene capture` the made one. Each seed holds out other views, but of data sets that have
+a split of their own. One thread.
 """
 
 from __future__ import annotations
