@@ -56,6 +56,7 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
         settings=RenderSettings.preset(own),
         renderers=(trained,),
         num_downscales=num_downscales,
+        skybox="off",
         max_steps=steps,
         seed=SEED,
         **SIZE,

@@ -90,7 +90,7 @@ def between(first: Camera, second: Camera, share: float) -> Camera:
 def measured(scene: str, weight: float, seed: int, offset: int) -> dict:
     """One fit: its held-out views in each renderer, and how alike two renderers' images of them are."""
     dataset = load(DATA / scene)
-    config = FitConfig.of(renderers=("any",), seed=seed, test_offset=offset, **SIZE)
+    config = FitConfig.of(renderers=("any",), seed=seed, test_offset=offset, skybox="off", **SIZE)
     train, test = dataset.split(config.data.test_every, offset)
     test = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, MOST).round().astype(int))]
     frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))

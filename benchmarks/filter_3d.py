@@ -52,6 +52,7 @@ def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
         settings=RenderSettings.preset(own_preset((trained,))),
         renderers=(trained,),
         filter_3d=filter_3d,
+        skybox="off",
         seed=seed,
         max_pixels=pixels,
         **SIZE,

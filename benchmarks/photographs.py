@@ -77,6 +77,8 @@ def table(found: list[dict]) -> str:
     """What each term found of a capture, and what it changes of its held-out views, on average over seeds."""
     lines = ["| capture (held out) | term | seeds | what was found | PSNR, mean / worst | color-corrected | seconds |"]
     lines += ["|---|---|---|---|---|---|---|"]
+    compared = {_unit(row) for row in found if row["term"]}
+    found = [row for row in found if _unit(row) in compared]
     by_unit = {(*_unit(row), row["term"]): row for row in found}
     for scene, term in dict.fromkeys((row["scene"], row["term"]) for row in found):
         mine = [row for row in found if (row["scene"], row["term"]) == (scene, term)]

@@ -268,7 +268,7 @@ def _fit(
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
         **refined,
-        **({"skybox": _skybox_summary(trainer)} if trainer.rows.skybox else {}),
+        **_skybox_summary(trainer),
         **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
     )
     told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
@@ -277,9 +277,14 @@ def _fit(
 
 
 def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
-    """What metrics.json is to say of what is far away: how many Gaussians it has, and how much photographs show it."""
-    share = visible_share(trainer.rows, trainer.photographs(), trainer.config.settings)
-    return {"gaussians": trainer.rows.skybox, "visible": share}
+    """What metrics.json is to say of a skybox: how many Gaussians it has, and how much of it photographs show."""
+    count = trainer.rows.skybox
+    if not count:
+        return {}
+    frames = trainer.photographs()
+    frames = frames[:: -(-len(frames) // metrics.RENDERERS_VIEWS)]
+    share = visible_share(trainer.gaussians(), count, frames, trainer.config.settings)
+    return {"skybox": {"gaussians": count, "visible": share}}
 
 
 def _check_photographs(config: FitConfig, moves: bool) -> None:
@@ -343,9 +348,10 @@ def _skybox_record(run: Run, trainer: Trainer, found: FarEvidence | None) -> dic
     """What config.json is to say of a skybox; arguments as of `_exposure_record`."""
     if found is not None:
         return {"skybox": {"gaussians": trainer.rows.skybox, **found.to_json()}}
-    if trainer.config.data.skybox == "off" or not (run.path / "config.json").is_file():
-        return {}
-    return {name: x for name, x in run.config().items() if name == "skybox"}
+    # A fit that goes on, whose config.json may have been moved away.
+    before = run.config() if (run.path / "config.json").is_file() else {}
+    here = {"skybox": {"gaussians": trainer.rows.skybox}} if trainer.rows.skybox else {}
+    return {name: x for name, x in (here | before).items() if name == "skybox"}
 
 
 def _checkpoint(

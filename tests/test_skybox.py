@@ -16,9 +16,11 @@ from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, load_state, save_state
 from drgs.fitting.density import add_gaussians, explore, relocate
+from drgs.fitting.filter_3d import Filter3D
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import Opacity, Scale
 from drgs.fitting.parts import parts_of, with_skybox
+from drgs.fitting.poses import Poses
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.skybox import RADIUS, Skybox, far_evidence, visible_share, why_not
@@ -273,12 +275,13 @@ def test_what_shows_of_it():
         | {"sh_dc": near.sh.detach(), "sh_rest": torch.zeros(len(near), 0, 3)}
     )
     rows.add_skybox(Skybox.around(frames, 3.3, 40).rows())
+    all_of_it = rows.gaussians()
     is_open = [drgs.render(near, frame.camera, FAST).alpha < 0.5 for frame in frames]
     truth = float(torch.stack(is_open).float().mean())
     assert 0.3 < truth < 0.9
-    assert visible_share(rows, frames, FAST) == pytest.approx(truth, abs=1e-6)
+    assert visible_share(all_of_it, rows.skybox, frames, FAST) == pytest.approx(truth, abs=1e-6)
     masked = [dataclasses.replace(x, mask=mask.float()) for x, mask in zip(frames, is_open, strict=True)]
-    assert visible_share(rows, masked, FAST) == 1
+    assert visible_share(all_of_it, rows.skybox, masked, FAST) == 1
 
 
 def test_it_comes_before_the_first_step():
@@ -307,3 +310,50 @@ def test_refused_where_things_move(tmp_path):
         fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS, skybox="on"), progress=False)
     result = fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS).replace(max_steps=4), progress=False)
     assert "skybox" not in result.run.config()
+
+
+def test_as_many_as_there_may_be_and_evenly():
+    """Never more; what is left out is left out evenly, whatever the lens: no picture has an empty side."""
+    for count in (1, 37, 300):
+        for width in (WIDTH, 40 * WIDTH):  # the second with a lens of few degrees
+            frames = photographs()
+            if width != WIDTH:
+                for frame in frames:
+                    K = frame.camera.K.copy()
+                    K[:2, :2] *= 40
+                    frame.camera = dataclasses.replace(frame.camera, K=K)
+            shell = Skybox.around(frames, 3.3, count)
+            assert 0 < len(shell) <= count
+            if count == 300:
+                assert len(shell) > 200
+                pixels, depth = frames[0].camera.project(shell.means)
+                inside = (depth > 0) & ((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1)
+                low, high = (pixels[inside] < np.array([WIDTH, HEIGHT]) / 2).sum(0), inside.sum()
+                assert ((low > 0.25 * high) & (low < 0.75 * high)).all()
+
+
+def test_poses_have_the_reach_of_what_is_near():
+    """Moving a camera does not move what is far away, which is left out of the bound of poses."""
+    frames = photographs()
+    rows = GaussianRows.from_points(ball().means[:50], torch.full((50, 3), 0.5))
+    shifts = []
+    for is_there in (False, True):
+        if is_there:
+            rows.add_skybox(Skybox.around(frames, 3.3, 400).rows())
+        poses = Poses([frame.camera for frame in frames], 3.3, FAST, reach=1.0)
+        poses.begin(rows.gaussians(), rows.skybox)
+        shifts.append(poses.shifts)
+    torch.testing.assert_close(*shifts, rtol=1e-12, atol=0)
+
+
+def test_the_filter_of_what_no_camera_sees_is_of_what_is_near():
+    """Not the filter of the shell, which would blur it away."""
+    frames = photographs()
+    near = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1e4]])  # the second behind, above or below all cameras
+    shell = torch.from_numpy(Skybox.around(frames, 3.3, 50).means).float()
+    plain, with_shell = Filter3D(), Filter3D()
+    cameras = [frame.camera for frame in frames]
+    plain.sample(near, cameras)
+    with_shell.sample(torch.cat([shell, near]), cameras, len(shell))
+    assert torch.equal(plain.variances, with_shell.variances[len(shell) :])
+    assert plain.variances[0] == plain.variances[1]

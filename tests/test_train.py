@@ -445,6 +445,11 @@ def test_loss_sees_only_the_mask(rng):
     assert bool((rgb.grad[:10] != 0).any())
     assert not alpha.grad[:10].any()
     assert bool((alpha.grad[10:] > 0).all())
-    assert Outside(1.0)(shown, dataclasses.replace(frame, is_object=False), None) is None
+    valid = dataclasses.replace(frame, is_object=False)
+    assert Outside(1.0)(shown, valid, None) is None
+    covered = torch.zeros(20, 20)
+    covered[:, :5] = 1
+    assert torch.equal(dataclasses.replace(valid, alpha=covered).empty(), 1 - covered)
+    assert torch.equal(dataclasses.replace(frame, alpha=covered).empty(), 1 - mask * covered)
     exact = torch.zeros(12, 12, 3)
     assert float(Photometric(0.2)(Output(exact, alpha), Frame("a", None, exact), None)) == pytest.approx(0, abs=1e-6)

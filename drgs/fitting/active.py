@@ -167,6 +167,8 @@ class ActiveViews:
         is_open = alpha < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED
+        if (empty := frame.empty()) is not None:
+            is_open &= empty.numpy() < 1 - _COVERED
         worth = is_open.mean() >= _WORTH
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None

@@ -51,17 +51,18 @@ class Filter3D(torch.nn.Module):
         super().__init__()
         self.register_buffer("variances", torch.zeros(0))
 
-    def sample(self, means: torch.Tensor, cameras: Sequence[Camera]) -> None:
+    def sample(self, means: torch.Tensor, cameras: Sequence[Camera], skybox: int = 0) -> None:
         """Take the sampling rates anew, after Gaussians have come or gone.
 
         Args:
             means: (N, 3) world; nothing is differentiated through them.
             cameras: Those of the photographs, of the size at which these are fitted.
+            skybox: How many of the first means are far away.
         """
         # A rate is a maximum over cameras of what changes little from step to step: constant in between, and after the
         # last density control.
         rates = sampling_rates(means.detach().double().cpu().numpy(), cameras)
-        seen = rates[rates > 0]
+        seen = rates[skybox:][rates[skybox:] > 0]
         # Nothing shows what no camera sees: it gets the filter of the most coarsely sampled of the others [1, code].
         lowest = seen.min() if len(seen) else np.inf
         variances = _STRENGTH / np.square(np.where(rates > 0, rates, lowest))

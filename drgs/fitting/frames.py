@@ -65,9 +65,11 @@ class Frame:
 
     def empty(self) -> torch.Tensor | None:
         """(H, W) float32 in [0, 1], how much of each pixel is known to show nothing; None if nothing tells."""
-        if self.mask is not None and self.is_object:
-            return 1 - self.mask
-        return None if self.alpha is None else 1 - _as_float(self.alpha)
+        shown = self.mask if self.is_object else None
+        if self.alpha is not None:
+            alpha = _as_float(self.alpha)
+            shown = alpha if shown is None else shown * alpha
+        return None if shown is None else 1 - shown
 
 
 def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> Dataset:

@@ -155,11 +155,16 @@ class Poses(torch.nn.Module):
         """Whether information has been computed, and poses may be other than stated."""
         return bool(self.whitening.any())
 
-    def begin(self, gaussians: Gaussians) -> None:
-        """Compute W of every photograph, and what its pose moves its picture by, from what the Gaussians are now."""
+    def begin(self, gaussians: Gaussians, skybox: int = 0) -> None:
+        """Compute W of every photograph, and what its pose moves its picture by, from what the Gaussians are now.
+
+        Args:
+            gaussians: The Gaussians.
+            skybox: How many of the first are far away: no step of a camera moves what they show.
+        """
         # A metric of steps, not part of the loss.
-        means = gaussians.means.detach().cpu().double()
-        opacities = gaussians.logit_opacities.detach().cpu().double().sigmoid()
+        means = gaussians.means[skybox:].detach().cpu().double()
+        opacities = gaussians.logit_opacities[skybox:].detach().cpu().double().sigmoid()
         with Bar("information about poses", len(self._cameras)) as bar:
             for row, camera in enumerate(self._cameras):
                 tangents = {"camera": self._twist_of[row].T.contiguous()}

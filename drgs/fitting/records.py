@@ -295,7 +295,7 @@ def config_record(
         "train": [frame.name for frame in frames],
         "test": [frame.name for frame in held_out],
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
-        "masks": sorted({_mask_kind(frame) for frame in frames}),
+        "masks": sorted({kind for frame in frames for kind in _mask_kinds(frame)}),
         "points": source,
         **({"frames": list(dataset.frames)} if dataset.frames else {}),
         **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
@@ -411,8 +411,8 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     for name, low in least.items():
         if header.get(name, low) < low:
             raise ValueError(f"{path}: {name} must be >= {low}, got {header[name]}; {advice}")
-    most = len(tensors["parameter.means"]) if "parameter.means" in tensors else 0
-    if not 0 <= header.get("skybox", 0) <= most:
+    most = len(tensors["parameter.means"]) - 1 if "parameter.means" in tensors else 0
+    if "parameter.means" in tensors and not 0 <= header.get("skybox", 0) <= most:
         raise ValueError(f"{path}: skybox must be in 0..{most}, got {header['skybox']}; {advice}")
     if not header["extent"] > 0:
         raise ValueError(f"{path}: extent must be > 0, got {header['extent']}; {advice}")
@@ -461,9 +461,8 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     return expected | {"queue": (torch.int64, (length("queue", 0),))}
 
 
-def _mask_kind(frame: Frame) -> str:
-    if frame.mask is None and frame.alpha is not None:
-        return "alpha"
-    if frame.mask is None:
-        return "none"
-    return "object" if frame.is_object else "valid"
+def _mask_kinds(frame: Frame) -> list[str]:
+    """What tells of a photograph where nothing is, or is not known."""
+    kinds = [] if frame.mask is None else ["object" if frame.is_object else "valid"]
+    kinds += [] if frame.alpha is None else ["alpha"]
+    return kinds or ["none"]

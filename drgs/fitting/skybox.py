@@ -32,13 +32,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.display.progress import Bar
 from drgs.ellipsoids import Y_00
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.frames import Frame
-    from drgs.fitting.rows import GaussianRows
     from drgs.settings import RenderSettings
 
 __all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "far_evidence", "visible_share", "why_not"]
@@ -53,7 +53,10 @@ _FARTHEST = 2.0  # distance of the farthest, in those of the nearest
 _OPACITY = 0.9
 _WIDTH = 0.75  # of their scales, in the mean distance of neighbors: some percent of the light pass between them
 _MARGIN = 0.05  # of the longer side of a picture, beyond its border: directions that held-out views may look in
-_DRAWN = 4_000  # directions over the whole sphere, of which the part that photographs look in is counted
+_DRAWN = 4_000  # directions over the whole sphere, of which the part that photographs look in is counted; at first
+_DRAWN_AT_MOST = 1 << 20
+_COUNTED = 200  # of them that photographs must look in, for the count to be right within some percent
+_LEAST_COUNTED = 20  # where a lens is so narrow that even the most drawn do not do
 _OPEN = 0.5  # transmittance of the others from which on the shell is what a pixel shows
 _LOOKED = 800  # directions whose colors are compared
 _VIEWS = 3  # photographs that must look in a direction, so that a median tells of more than two
@@ -90,10 +93,17 @@ class Skybox:
         """
         middle = np.stack([frame.camera.center for frame in frames]).mean(axis=0)
         radius = RADIUS * extent
-        looked_at = _seen(frames, middle + radius * _directions(_DRAWN)).any(axis=0)
-        whole = max(1, int(count * _DRAWN / max(1, int(looked_at.sum()))))
+        drawn = _DRAWN
+        # A narrow lens looks in few directions of the whole sphere: more are drawn until there are enough to count.
+        while (looked_at := int(_seen(frames, middle + radius * _directions(drawn)).sum())) < _COUNTED and (
+            drawn < _DRAWN_AT_MOST
+        ):
+            drawn *= 4
+        whole = max(1, count * drawn // max(looked_at, _LEAST_COUNTED))
         directions = _directions(whole)
-        directions = directions[_seen(frames, middle + radius * directions).any(axis=0)][:count]
+        directions = directions[_seen(frames, middle + radius * directions)]
+        if len(directions) > count:  # evenly fewer: the lattice runs from pole to pole
+            directions = directions[np.linspace(0, len(directions) - 1, count).round().astype(int)]
         distances = radius * np.exp(np.random.default_rng(seed).uniform(0, math.log(_FARTHEST), len(directions)))
         means = middle + distances[:, None] * directions
         spacing = math.sqrt(4 * math.pi / whole)
@@ -178,22 +188,23 @@ def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEviden
     return FarEvidence(float(many.sum() / there.any(axis=0).sum()), agreeing, chance)
 
 
-def visible_share(rows: GaussianRows, frames: list[Frame], settings: RenderSettings) -> float:
+def visible_share(gaussians: Gaussians, skybox: int, frames: list[Frame], settings: RenderSettings) -> float:
     """Share of the pixels of photographs that show the shell: behind all others more than half of the light is left.
 
     Args:
-        rows: Gaussians, the shell first.
+        gaussians: Gaussians, `skybox` of a shell first.
         frames: Photographs; nothing outside of their masks is counted.
         settings: What the others are rendered with.
     """
-    others: Gaussians = rows.gaussians().detach().take(slice(rows.skybox, None)).replace(features=None)
+    others = gaussians.detach().take(slice(skybox, None)).replace(features=None)
     shown = total = 0.0
-    with torch.no_grad():  # looked at, not optimized
+    with torch.no_grad(), Bar("what shows of the skybox", len(frames)) as bar:  # looked at, not optimized
         for frame in frames:
             alpha = render(others, frame.camera, settings, outputs=()).alpha.cpu()
             mask = torch.ones_like(alpha) if frame.mask is None else frame.mask
             shown += float(((1 - alpha > _OPEN) * mask).sum())
             total += float(mask.sum())
+            bar.advance()
     return shown / max(total, 1.0)
 
 
@@ -223,13 +234,13 @@ def _directions(count: int) -> np.ndarray:
 
 
 def _seen(frames: list[Frame], points: np.ndarray) -> np.ndarray:
-    """(V, P) which photographs look at which points, a little beyond their borders, too."""
-    seen = np.zeros((len(frames), len(points)), bool)
-    for row, frame in enumerate(frames):
+    """(P,) which points a photograph looks at, a little beyond its borders, too."""
+    seen = np.zeros(len(points), bool)
+    for frame in frames:
         size = np.array([frame.camera.width, frame.camera.height])
         pixels, depth = frame.camera.project(points)
         margin = _MARGIN * size.max()
-        seen[row] = (depth > 0) & ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
+        seen |= (depth > 0) & ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
     return seen
 
 

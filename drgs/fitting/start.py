@@ -9,7 +9,7 @@ import torch
 
 from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
-from drgs.fitting.parts import parts_of, with_exposure, with_poses, with_skybox
+from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.skybox import RADIUS, SHARE, FarEvidence, Skybox, far_evidence, why_not
 from drgs.fitting.stages import first_time, times_of
@@ -70,7 +70,7 @@ def _look_far(frames: list[Frame], config: FitConfig) -> tuple[FarEvidence | Non
         found = far_evidence(frames, scene_extent([frame.camera for frame in frames]), config.seed)
         is_on = config.data.skybox == "on" or found.is_clear
         bar.note(f"skybox: {found.words()}; {'there is one' if is_on else 'there is none'}")
-        return found, round(SHARE * config.density.max_gaussians) if is_on else 0
+        return found, max(1, round(SHARE * config.density.max_gaussians)) if is_on else 0
 
 
 def start(
@@ -110,12 +110,11 @@ def start(
     _log.info("%d initial points: %s", len(points), source)
     if empty := [x for x in (frame.empty() for frame in frames) if x is not None]:
         share = float(sum(x.sum() for x in empty)) / sum(frame.pixels[..., 0].numel() for frame in frames)
-        _log.info("%.0f %% of the training pixels show nothing, by masks or alpha; they are kept empty", 100 * share)
+        _log.info("%.0f %% of the training pixels show nothing, by masks or alpha", 100 * share)
     made = parts or parts_of(config, extent, channels)
     if room:
         skybox = Skybox.around(frames, extent, room, config.seed)
         model.add_skybox(skybox.rows(width))
-        made = with_skybox(made, len(skybox))
         _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * extent)
     found = None
     if parts is None and config.data.exposure != "off":

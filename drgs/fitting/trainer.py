@@ -102,7 +102,7 @@ class Trainer:
         self.frames = frames
         self.rows = rows
         self.extent = extent
-        self.parts = parts_of(config, extent) if parts is None else parts
+        self.parts = with_skybox(parts_of(config, extent) if parts is None else parts, rows.skybox)
         self.motion = motion
         self._check_parts()
         self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
@@ -143,6 +143,7 @@ class Trainer:
         width = 0 if features is None else features.shape[1]
         degree = self.rows.sh_degree
         self.rows = GaussianRows.from_points(points, colors, *self.config.density.start_of(False), features=width)
+        self.parts = with_skybox(self.parts, 0)
         while self.rows.sh_degree < degree:
             self.rows.raise_sh_degree()
         self._start_count = len(self.rows)
@@ -298,8 +299,6 @@ class Trainer:
         extent = header["extent"]
         parts = parts_of(config, extent) if parts is None else parts
         rows.skybox = header.get("skybox", 0)
-        if rows.skybox:
-            parts = with_skybox(parts, rows.skybox)
         if motion is not None and motion.has_begun(rows):
             parts = motion.restored(rows, parts, header, where)
         trainer = cls(config, frames, rows, extent, parts, motion)
@@ -367,7 +366,8 @@ class Trainer:
     def _sample(self) -> None:
         """How finely the photographs sample the Gaussians, after one or the other has changed."""
         if self.parts.filter_3d is not None:
-            self.parts.filter_3d.sample(self.rows.tensors["means"], [frame.camera for frame in self.photographs()])
+            cameras = [frame.camera for frame in self.photographs()]
+            self.parts.filter_3d.sample(self.rows.tensors["means"], cameras, self.rows.skybox)
 
     def _stage(self) -> Stage:
         """The steps that density control runs over now."""
@@ -403,7 +403,7 @@ class Trainer:
         assert poses is not None
         if is_due(self._part()):
             if not poses.has_begun:
-                poses.begin(self.gaussians())
+                poses.begin(self.gaussians(), self.rows.skybox)
             return poses(frame)
         return dataclasses.replace(frame, camera=poses.camera(frame.name))
 
