@@ -4,7 +4,8 @@ Where rays end in nothing near, in the sky or far behind the scene, initial poin
 is triangulated beside them, and a fit with a small budget paints each photograph's background in the air before its
 camera. Here a part of the budget begins on a shell, `RADIUS` extents of the scene away, in the directions that training
 photographs look in, opaque, overlapping, with the median color of the photographs there. Hierarchical 3D Gaussians [1]
-have such a skybox of points. They are Gaussians as all others: every renderer and every viewer of the PLY shows them.
+have such a skybox of points. They are Gaussians as all others: every renderer shows them, and viewers of the PLY up to
+their far plane.
 
 Gaussians of equal distance change places from view to view, and `inria` and `gsplat` order by z where others order by
 distance. So distances are spread over a factor of two: neighbors on the shell keep their order.
