@@ -5,8 +5,8 @@
 Appends one row a fit to benchmarks/one_model.jsonl as it ends, leaves out what is there, then writes the tables of
 docs/one-model.md and docs/real-data.md. Scenes are captures by name, or folders. Each seed holds out other views, but
 of data sets that have a split of their own. The cycles were chosen on banana, fern, statue and lego, which the averages
-leave out. One thread. What a mix costs is the average of the medians of its presets' steps over the median of the steps with
-`fast` of the same fit, so that other work on the machine takes from both.
+leave out. One thread. What a mix costs is the average of the medians of its presets' steps over the median of the steps
+with `fast` of the same fit, so that other work on the machine takes from both.
 """
 
 from __future__ import annotations
