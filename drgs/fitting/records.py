@@ -411,9 +411,10 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     for name, low in least.items():
         if header.get(name, low) < low:
             raise ValueError(f"{path}: {name} must be >= {low}, got {header[name]}; {advice}")
-    most = len(tensors["parameter.means"]) - 1 if "parameter.means" in tensors else 0
-    if "parameter.means" in tensors and not 0 <= header.get("skybox", 0) <= most:
-        raise ValueError(f"{path}: skybox must be in 0..{most}, got {header['skybox']}; {advice}")
+    skybox = header.get("skybox", 0)
+    if skybox and "parameter.means" in tensors and not 0 < skybox < len(tensors["parameter.means"]):
+        most = len(tensors["parameter.means"]) - 1
+        raise ValueError(f"{path}: skybox must be in 0..{most}, got {skybox}; {advice}")
     if not header["extent"] > 0:
         raise ValueError(f"{path}: extent must be > 0, got {header['extent']}; {advice}")
     if header.get("active") is not None:
