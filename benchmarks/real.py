@@ -70,8 +70,9 @@ def measured(name: str, runs: Path) -> dict:
     metrics = fit(load(source), folder, FitConfig.of(**options), resume=folder.exists()).metrics
     events = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     config = json.loads((folder / "config.json").read_text())
-    PICTURES.mkdir(exist_ok=True)
-    _picture(sorted((folder / "renders" / "test").glob("*.png"))[0], PICTURES / f"{capture}.jpg")
+    if name == capture:
+        PICTURES.mkdir(exist_ok=True)
+        _picture(sorted((folder / "renders" / "test").glob("*.png"))[0], PICTURES / f"{name}.jpg")
     return {
         "name": name,
         "renderers": ",".join(config["fit"]["renderers"]),
