@@ -228,7 +228,7 @@ def test_resumed_fit_has_the_same_bits(tmp_path):
     one, two = whole.rows.state(), again.rows.state()
     assert again.rows.skybox == rows.skybox
     assert all(torch.equal(one[name], two[name]) for name in one)
-    with pytest.raises(ValueError, match=r"skybox must be in 0\.\.\d+, got 5000"):
+    with pytest.raises(ValueError, match=r"skybox must be in 1\.\.\d+, got 5000"):
         check_checkpoint(tmp_path / "x", tensors, {**header, "skybox": 5000})
 
 

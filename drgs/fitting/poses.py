@@ -160,7 +160,7 @@ class Poses(torch.nn.Module):
 
         Args:
             gaussians: The Gaussians.
-            skybox: How many of the first are far away: no step of a camera moves what they show.
+            skybox: How many of the first are far away: where a camera stands makes no difference to how they look.
         """
         # A metric of steps, not part of the loss.
         means = gaussians.means[skybox:].detach().cpu().double()

@@ -414,7 +414,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     skybox = header.get("skybox", 0)
     if skybox and "parameter.means" in tensors and not 0 < skybox < len(tensors["parameter.means"]):
         most = len(tensors["parameter.means"]) - 1
-        raise ValueError(f"{path}: skybox must be in 0..{most}, got {skybox}; {advice}")
+        raise ValueError(f"{path}: skybox must be in 1..{most}, got {skybox}; {advice}")
     if not header["extent"] > 0:
         raise ValueError(f"{path}: extent must be > 0, got {header['extent']}; {advice}")
     if header.get("active") is not None:

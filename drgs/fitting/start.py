@@ -113,7 +113,8 @@ def start(
         _log.info("%.0f %% of the training pixels show nothing, by masks or alpha", 100 * share)
     made = parts or parts_of(config, extent, channels)
     if room:
-        skybox = Skybox.around(frames, extent, room, config.seed)
+        with Bar("colors of the skybox"):
+            skybox = Skybox.around(frames, extent, room, config.seed)
         model.add_skybox(skybox.rows(width))
         _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * extent)
     found = None
