@@ -84,7 +84,8 @@ class Reader:
         begin = self.row["inputs"]
         line = [sys.executable, str(WORKER), self.name, str(begin), str(inputs)]
         with (scratch / "said").open("w") as said:
-            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": said}
+            # Without a buffer: a line that lay in one would not be seen by select below, and be waited for.
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": said, "bufsize": 0}
             process = subprocess.Popen([*line, str(scratch), *([str(self.corpus)] if self.corpus else [])], **pipes)
         ended = ""
         number = begin - 1

@@ -41,6 +41,7 @@ from drgs.viewing.layers import layers_of, tinted
 from drgs.viewing.placed_views import PlacedView, Ranking, Score, Sight, placed_views_of, read_ranking, score_colors
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.server import Viewer
+from drgs.viewing.session import Session
 from drgs.viewing.splats import ClientGaussians
 from drgs.viewing.subject import FirstView, Subject
 from drgs.viewing.uncertainty import Uncertainty
@@ -433,8 +434,23 @@ def viewers():
         assert viewer.stop(30.0)
 
 
+@pytest.fixture
+def told(monkeypatch) -> list[str]:
+    """All that sessions say in their panels. A client need not hear it all: of what is said in quick succession, viser
+    sends the last."""
+    texts = []
+    say = Session.say
+
+    def saying(self, text, scale=None):
+        texts.append(text)
+        say(self, text, scale)
+
+    monkeypatch.setattr(Session, "say", saying)
+    return texts
+
+
 def html(client: Client, text: str, after: int = 0):
-    """Wait until the panel says something."""
+    """Wait until the panel says something that stays."""
     return client.wait(lambda m: text in str((m.get("props") or m.get("updates") or {}).get("content")), after=after)
 
 
@@ -497,7 +513,7 @@ def test_two_browsers_have_each_their_own_camera(viewers):
         assert not [m for m in two.heard[other:] if m["type"] == "BackgroundImageMessage"]
 
 
-def test_uncertainty_is_added_up_once_and_shown(place, viewers):  # noqa: F811
+def test_uncertainty_is_added_up_once_and_shown(place, viewers, told):  # noqa: F811
     """Asked for, it says how far it is, and then shows the map of the view."""
     args = View(scene=place / "run", preset="fast")
     looked = subject_of(args, SceneInput.of(args))
@@ -508,8 +524,9 @@ def test_uncertainty_is_added_up_once_and_shown(place, viewers):  # noqa: F811
         client.picture()
         at = len(client.heard)
         client.choose("show", "uncertainty")
-        html(client, " of 4 photographs added")
         picture = client.picture(after=at)
+        counts = [text for text in told if text.endswith(" of 4 photographs added")]
+        assert counts == [f"uncertainty of step 12 of 12: {done} of 4 photographs added" for done in range(5)]
         assert looked.uncertainty.is_known
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
         wanted, (low, high) = map_colors(looked.uncertainty.map(camera))
@@ -541,7 +558,7 @@ def uncertain(seed: int, hold, calls: list[int]) -> Subject:
     return subject(torch.zeros(12, 3), scene=g, state=f"step {seed}", uncertainty=known, layers=layers)
 
 
-def test_a_map_that_was_begun_is_finished(viewers):
+def test_a_map_that_was_begun_is_finished(viewers, told):
     """Checkpoints that come while the photographs are added up stop nothing: the map of the first is shown, with its
     step, then that of the last one; those between are passed over, and no photograph is added twice."""
     begun, go, calls, drawn = threading.Event(), threading.Event(), [], []
@@ -570,8 +587,9 @@ def test_a_map_that_was_begun_is_finished(viewers):
         html(client, "step 3")
         at = len(client.heard)
         go.set()
-        html(client, "uncertainty of step 1, fast: ", after=at)
         html(client, "uncertainty, fast: 51x38 in ", after=at)
+        maps = [text.rpartition(" in ")[0] for text in told if text.startswith("uncertainty") and " in " in text]
+        assert maps == ["uncertainty of step 1, fast: 51x38", "uncertainty, fast: 51x38"]
         picture = decoded([m for m in client.heard if m["type"] == "BackgroundImageMessage"][-1])
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], np.zeros(3))
         wanted, _ = map_colors(subjects[2].uncertainty.map(camera))
@@ -579,15 +597,14 @@ def test_a_map_that_was_begun_is_finished(viewers):
     assert calls == [1, 1, 1, 3, 3, 3]
 
 
-def test_a_long_picture_says_how_long(viewers):
+def test_a_long_picture_says_how_long(viewers, told):
     """Of a picture in several bands: an estimate by the small one before it, then the share that is done."""
     looked = subject(torch.randn(300, 3))
     viewer = viewers(looked, preset="exact")
     with Client(viewer.port) as client:
         client.look(looked.first.pose.wxyz, looked.first.pose.position, width=640, height=480)
         html(client, "rgb, exact: 640x480 in ")
-    said = [re.sub("<[^>]*>", "", text) for text in client.said()]
-    drawn = [text for text in said if text.startswith("rgb, exact: drawing 640x480")]
+    drawn = [text for text in told if text.startswith("rgb, exact: drawing 640x480")]
     assert re.fullmatch(r"rgb, exact: drawing 640x480, about \d+ (s|min) \.\.\.", drawn[0])
     shares = [int(re.fullmatch(r".*: (\d+)%, about \d+ (?:s|min) left \.\.\.", text)[1]) for text in drawn[1:]]
     assert shares == sorted(shares)
