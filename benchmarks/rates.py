@@ -3,7 +3,8 @@
     python benchmarks/rates.py [--scenes banana ...] [--steps 400 1500] [--page]
 
 Appends one row a fit to benchmarks/rates.jsonl as it ends, leaves out what is there, then writes the table of
-docs/real-data.md. Scenes are captures by name. One thread, one seed.
+docs/real-data.md. Scenes are captures by name, or paths of scenes that move or have a teacher: those are fitted with
+the defaults of `drgs fit`, and have a table of their own. One thread, one seed.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import os
 import statistics
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -24,37 +26,57 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
-from drgs.fitting.config import FitConfig, RateConfig  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
 from drgs.fitting.start import start  # noqa: E402
 from drgs.metrics import through_renderers  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "rates.jsonl"
 PAGE = ROOT / "docs" / "real-data.md"
 SCENES = ("banana", "fern", "statue")
 SIZE = {"max_pixels": 12_000, "max_gaussians": 8_000}
 SEEN = ("exact", "fast", "gsplat")
-BEFORE = RateConfig(means_rate=(1.6e-4, 1.6e-6), scale_rate=5e-3, rest_rate=1.25e-4)
-# Name -> factors of the rates of `BEFORE`
+BEFORE = {
+    "means_rate": (1.6e-4, 1.6e-6),
+    "scale_rate": 5e-3,
+    "rest_rate": 1.25e-4,
+    "rotation_rate": 1e-3,
+    "opacity_rate": 0.05,
+    "dc_rate": 2.5e-3,
+}
+# Name -> factors of what `BEFORE` says
 FACTORS: dict[str, dict[str, float]] = {
     "3DGS": {},
     "scales x 4": {"scale_rate": 4},
     "scales, means, SH x 4": {"scale_rate": 4, "means_rate": 4, "rest_rate": 4},
+    "scales, means, SH x 4, opacities x 2": {"scale_rate": 4, "means_rate": 4, "rest_rate": 4, "opacity_rate": 2},
+    "scales, means, SH, colors x 4": {"scale_rate": 4, "means_rate": 4, "rest_rate": 4, "dc_rate": 4},
+    "scales, means, SH x 8": {"scale_rate": 8, "means_rate": 8, "rest_rate": 8},
+    "scales, means, SH, rotations x 4": {"scale_rate": 4, "means_rate": 4, "rest_rate": 4, "rotation_rate": 4},
+    "scales, means x 4, SH x 8": {"scale_rate": 4, "means_rate": 4, "rest_rate": 8},
 }
+SCORES = ("psnr", "ssim", "miou")
 KEY = ("scene", "rates", "steps", "max_pixels", "max_gaussians")
 
 
-def measured(scene: str, rates: str, steps: int) -> dict:
-    """One fit for all renderers, and its held-out views."""
-    changed = {}
+def options_of(rates: str) -> dict:
+    """The rates that a name stands for, as options of a fit."""
+    options = dict(BEFORE)
     for name, factor in FACTORS[rates].items():
-        value = getattr(BEFORE, name)
-        changed[name] = tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
-    same = {name: getattr(BEFORE, name) for name in ("means_rate", "scale_rate", "rest_rate")}
-    config = FitConfig.of(renderers=("any",), max_steps=steps, **SIZE, **(same | changed))
+        value = BEFORE[name]
+        options[name] = tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
+    return options
+
+
+def measured(scene: str, rates: str, steps: int) -> dict:
+    """One fit for all renderers, and its held-out views; by the defaults where more than color is fitted."""
     dataset = load(DATA / scene)
+    if dataset.is_dynamic or dataset.semantics is not None:
+        return measured_whole(scene, rates, steps)
+    config = FitConfig.of(renderers=("any",), max_steps=steps, **SIZE, **options_of(rates))
     train, test = dataset.split(config.data.test_every)
     frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))
     trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
@@ -73,9 +95,35 @@ def measured(scene: str, rates: str, steps: int) -> dict:
     }
 
 
+def measured_whole(scene: str, rates: str, steps: int) -> dict:
+    """A fit of what moves or has a teacher, with the defaults of `drgs fit` but for its size, and its scores."""
+    config = FitConfig.of(max_steps=steps, **SIZE, **options_of(rates))
+    with tempfile.TemporaryDirectory() as folder:
+        metrics = fit(load(DATA / scene), Path(folder) / "run", config, progress=False).metrics
+    scores = metrics["scores"] | {"worst": min(view["psnr"] for view in metrics["views"])}
+    return {
+        **dict(zip(KEY, (Path(scene).name, rates, steps, *SIZE.values()), strict=True)),
+        "scores": {name: value for name, value in scores.items() if name in (*SCORES, "worst")},
+        "seconds": metrics["seconds"],
+        **ran(),
+    }
+
+
+def whole_table(found: list[dict]) -> str:
+    """Scores of fits of what moves or has a teacher, with the rates of 3DGS and with larger ones."""
+    lines = ["| scene | steps | rates | PSNR, mean / worst | SSIM | mIoU |", "|---|---|---|---|---|---|"]
+    for row in sorted((row for row in found if "scores" in row), key=lambda row: (row["scene"], row["steps"])):
+        scores = row["scores"]
+        labels = f"{scores['miou']:.3f}" if "miou" in scores else "-"
+        cells = [row["scene"], f"{row['steps']:,}", row["rates"], f"{scores['psnr']:.2f} / {scores['worst']:.2f}"]
+        lines.append(f"| {' | '.join(cells)} | {scores['ssim']:.3f} | {labels} |")
+    return "\n".join(lines)
+
+
 def table(found: list[dict]) -> str:
     """Means and worst views with the rates of 3DGS, and what others add."""
     lines = ["| capture | steps | rates | `exact` | `fast` | `gsplat` | seconds |", "|---|---|---|---|---|---|---|"]
+    found = [row for row in found if "psnr" in row]
     for scene, steps in sorted({(row["scene"], row["steps"]) for row in found}):
         by_rates = {row["rates"]: row for row in found if (row["scene"], row["steps"]) == (scene, steps)}
         plain = by_rates.get("3DGS")
@@ -102,19 +150,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
     parser.add_argument("--steps", nargs="+", type=int, default=[400, 1500])
+    parser.add_argument("--rates", nargs="+", choices=FACTORS, default=list(FACTORS))
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
     done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
     for steps in args.steps:
         for scene in [] if args.page else args.scenes:
-            for rates in FACTORS:
-                if (scene, rates, steps, *SIZE.values()) not in done:
+            for rates in args.rates:
+                if (Path(scene).name, rates, steps, *SIZE.values()) not in done:
                     row = measured(scene, rates, steps)
                     add_row(ROWS, row)
-                    print(scene, steps, rates, {x: round(statistics.mean(row["psnr"][x]), 2) for x in SEEN}, flush=True)
-    text = table(read_rows(ROWS))
-    print(text)
-    fill_between(PAGE, "rates", text)
+                    said = row.get("scores") or {x: statistics.mean(row["psnr"][x]) for x in SEEN}
+                    print(scene, steps, rates, {name: round(x, 3) for name, x in said.items()}, flush=True)
+    rows = read_rows(ROWS)
+    for name, text in (("rates", table(rows)), ("rates_whole", whole_table(rows))):
+        print(text)
+        fill_between(PAGE, name, text)
 
 
 if __name__ == "__main__":

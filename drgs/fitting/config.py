@@ -194,7 +194,10 @@ class DensityConfig(Record):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RateConfig(Record):
-    """Learning rates of Adam, a tensor of the Gaussians each; those of features and of motion are with these.
+    """Learning rates of Adam, a tensor of the Gaussians each; those of features and of motion have their own records.
+
+    Those of means, scales and SH are four times those of 3DGS, which are for 30,000 steps: in fits of some hundred or
+    thousand steps they gain up to 3 dB (docs/real-data.md, "Rates for short fits").
 
     Attributes:
         means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
@@ -206,11 +209,11 @@ class RateConfig(Record):
         sh_every: Fraction of the steps between two degrees of SH.
     """
 
-    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
+    means_rate: tuple[float, float] = (6.4e-4, 6.4e-6)
     dc_rate: float = 2.5e-3
-    rest_rate: float = 1.25e-4
+    rest_rate: float = 5e-4
     opacity_rate: float = 0.05
-    scale_rate: float = 5e-3
+    scale_rate: float = 2e-2
     rotation_rate: float = 1e-3
     sh_every: float = 1 / 30
     where: ClassVar[str] = "fit"
