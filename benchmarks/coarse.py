@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -22,15 +21,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, add_row, ran, read_rows  # noqa: E402
+from fits import fitted, psnr_by_renderer  # noqa: E402
+from where import add_row, ran, read_rows  # noqa: E402
 
-from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.fitting.resolution import FULL  # noqa: E402
-from drgs.fitting.start import start  # noqa: E402
-from drgs.metrics import through_renderers  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
@@ -50,7 +47,6 @@ def key_of(scene: str, trained: str, num_downscales: int, steps: int) -> tuple:
 
 def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
     """One fit, and its held-out views at the full size, in the renderer that stands for those it was fitted with."""
-    dataset = load(DATA / scene)
     own = own_preset((trained,))
     config = FitConfig.of(
         settings=RenderSettings.preset(own),
@@ -61,21 +57,15 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
         seed=SEED,
         **SIZE,
     )
-    train, test = dataset.split(config.data.test_every)
-    frames = load_frames(train, config.data.max_pixels)
-    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
-    began = time.process_time()
-    while trainer.step_index < steps:
-        trainer.step()
-    seconds = time.process_time() - began
-    seen = {own: RenderSettings.preset(own)}
-    found = through_renderers(trainer.gaussians(), load_frames(test, config.data.max_pixels), seen, "test", len(test))
-    assert found is not None
+    fit = fitted(scene, config)
+    held_out = load_frames(fit.test, config.data.max_pixels)
+    psnr = psnr_by_renderer(fit.gaussians, held_out, {own: RenderSettings.preset(own)})
+    first = fit.frames[0].camera
     return {
         **dict(zip(KEY, key_of(scene, trained, num_downscales, steps), strict=True)),
-        "size": [frames[0].camera.width, frames[0].camera.height],
-        "psnr": [view["psnr"] for view in found["rows"][0]["views"]],
-        "process_seconds": seconds,
+        "size": [first.width, first.height],
+        "psnr": psnr[own],
+        "process_seconds": fit.process_seconds,
         **ran(),
     }
 

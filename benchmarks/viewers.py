@@ -47,6 +47,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from fits import split_of  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -353,7 +354,7 @@ def held_out(folder: Path, count: int) -> list[Frame]:
     """Evenly spaced held-out photographs of a run, at the size of the fit."""
     record = load_run(folder).record
     dataset = load_dataset(record.data, record.config)
-    _, test = dataset.split(record.config.data.test_every, record.config.data.test_offset)
+    _, test = split_of(dataset, record.config)
     chosen = [test[round((i + 0.5) * len(test) / count - 0.5)] for i in range(min(count, len(test)))]
     return load_frames(chosen, record.config.data.max_pixels)
 
