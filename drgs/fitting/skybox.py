@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
 
-__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "far_evidence", "visible_share", "why_not"]
+__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "SkyboxChoice", "far_evidence", "visible_share", "why_not"]
 
 RADIUS = 100.0
 """Distance of the nearest of them from the middle of the cameras, in extents of the scene."""
@@ -163,6 +163,27 @@ class FarEvidence:
     def to_json(self) -> dict[str, float]:
         """The evidence as config.json has it."""
         return {"share": self.share, **dataclasses.asdict(self)}
+
+
+@dataclasses.dataclass(frozen=True)
+class SkyboxChoice:
+    """Whether a fit begins with a shell, and why.
+
+    Attributes:
+        reason: Why there is none, in words; None where there is one.
+        evidence: What photographs say of it; None where they were not asked.
+    """
+
+    reason: str | None
+    evidence: FarEvidence | None = None
+
+    def to_json(self, gaussians: int) -> dict[str, Any]:
+        """The choice as config.json has it, with a shell of so many Gaussians."""
+        return {
+            "gaussians": gaussians,
+            "reason": self.reason,
+            **({} if self.evidence is None else self.evidence.to_json()),
+        }
 
 
 def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEvidence:
