@@ -1,11 +1,12 @@
 """Photographs that begin small: held-out PSNR against the time of a processor, by how often they are halved.
 
-    python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--page]
+    python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--same] [--page]
 
 Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes the table of
-docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales; then those with 1 and 2
-are made once more, with as many steps as take the time of the fit without. Photographs have their full size, of at most
-200,000 pixels. Seconds are those that the process computed in its steps, whatever ran beside it. One thread.
+docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales or those that are named;
+then those with more than 0 are made once more, with as many steps as take the time of the fit without, but not with
+`--same`. Photographs have their full size, of at most 200,000 pixels. Seconds are those that the process computed in
+its steps, whatever ran beside it. One thread.
 """
 
 from __future__ import annotations
@@ -70,6 +71,15 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
     }
 
 
+def base_of(row: dict, rows: list[dict]) -> dict | None:
+    """The fit at the full size that another one is compared with: of as many steps or, where that has more in the time
+    saved, of the most that are fewer; None where there is none.
+    """
+    unit = ("scene", "trained", "max_pixels", "max_gaussians", "seed")
+    same = [x for x in rows if not x["num_downscales"] and all(x[name] == row[name] for name in unit)]
+    return max((x for x in same if x["steps"] <= row["steps"]), key=lambda x: x["steps"], default=None)
+
+
 def table(rows: list[dict]) -> str:
     """A row a fit: steps, seconds, and PSNR, mean and worst view, beside that of the fit at the full size."""
     lines = [
@@ -79,10 +89,7 @@ def table(rows: list[dict]) -> str:
     order = sorted(rows, key=lambda row: (row["scene"], row["trained"], row["steps"], row["num_downscales"]))
     for base in (row for row in order if not row["num_downscales"]):
         mean = sum(base["psnr"]) / len(base["psnr"])
-        unit = ("scene", "trained", "max_pixels", "max_gaussians", "seed")
-        for row in order:
-            if any(row[name] != base[name] for name in unit) or (row is not base and not row["num_downscales"]):
-                continue
+        for row in (row for row in order if base_of(row, order) is base):
             now = sum(row["psnr"]) / len(row["psnr"])
             width, height = row["size"]
             shown = f"{now:.2f} / {min(row['psnr']):.2f}"
@@ -101,11 +108,13 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
     parser.add_argument("--trained", default="fast", help="as `drgs fit --for` takes it")
     parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--num-downscales", nargs="+", type=int, default=list(DOWNSCALES), help="beside 0")
+    parser.add_argument("--same", action="store_true", help="only fits of as many steps")
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
     took = {tuple(row[name] for name in KEY): row["process_seconds"] for row in read_rows(ROWS)}
 
-    def fitted(scene: str, num_downscales: int, steps: int) -> float:
+    def seconds_of(scene: str, num_downscales: int, steps: int) -> float:
         """Process seconds of a fit that there is, or is made."""
         key = key_of(scene, args.trained, num_downscales, steps)
         if key not in took:
@@ -122,10 +131,11 @@ def main() -> None:
         return took[key]
 
     scenes = [] if args.page else args.scenes
-    same = {scene: {n: fitted(scene, n, args.steps) for n in DOWNSCALES} for scene in scenes}
-    for n in DOWNSCALES[1:]:
+    downscales = sorted({0, *args.num_downscales})
+    same = {scene: {n: seconds_of(scene, n, args.steps) for n in downscales} for scene in scenes}
+    for n in [] if args.same else downscales[1:]:
         for scene in scenes:
-            fitted(scene, n, round(args.steps * same[scene][0] / same[scene][n]))
+            seconds_of(scene, n, round(args.steps * same[scene][0] / same[scene][n]))
     text = table(read_rows(ROWS))
     print(text)
     fill_between(PAGE, "coarse", text)
