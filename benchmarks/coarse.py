@@ -5,8 +5,8 @@
 Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes the table of
 docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales or those that are named;
 then those with more than 0 are made once more, with as many steps as take the time of the fit without, but not with
-`--same`. Photographs have their full size, of at most 200,000 pixels. Seconds are those that the process computed in
-its steps, whatever ran beside it. One thread.
+`--same`. Photographs have their full size, of at most 200,000 pixels unless `--max-pixels` says less. Seconds are those
+that the process computed in its steps, whatever ran beside it. One thread.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ SEED = 0
 KEY = ("scene", "trained", "num_downscales", "full", "steps", "max_pixels", "max_gaussians", "seed")
 
 
-def key_of(scene: str, trained: str, num_downscales: int, steps: int) -> tuple:
+def key_of(scene: str, trained: str, num_downscales: int, steps: int, size: dict[str, int]) -> tuple:
     """What tells a row from others."""
-    return scene, trained, num_downscales, FULL, steps, *SIZE.values(), SEED
+    return scene, trained, num_downscales, FULL, steps, *size.values(), SEED
 
 
-def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
+def measured(scene: str, trained: str, num_downscales: int, steps: int, size: dict[str, int]) -> dict:
     """One fit, and its held-out views at the full size, in the renderer that stands for those it was fitted with."""
     own = own_preset((trained,))
     config = FitConfig.of(
@@ -56,14 +56,14 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
         skybox="off",
         max_steps=steps,
         seed=SEED,
-        **SIZE,
+        **size,
     )
     fit = fitted(scene, config)
     held_out = load_frames(fit.test, config.data.max_pixels)
     psnr = psnr_by_renderer(fit.gaussians, held_out, {own: RenderSettings.preset(own)})
     first = fit.frames[0].camera
     return {
-        **dict(zip(KEY, key_of(scene, trained, num_downscales, steps), strict=True)),
+        **dict(zip(KEY, key_of(scene, trained, num_downscales, steps, size), strict=True)),
         "size": [first.width, first.height],
         "psnr": psnr[own],
         "process_seconds": fit.process_seconds,
@@ -108,17 +108,20 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
     parser.add_argument("--trained", default="fast", help="as `drgs fit --for` takes it")
     parser.add_argument("--steps", type=int, default=150)
+    for name, value in SIZE.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=value)
     parser.add_argument("--num-downscales", nargs="+", type=int, default=list(DOWNSCALES), help="beside 0")
     parser.add_argument("--same", action="store_true", help="only fits of as many steps")
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
+    size = {name: getattr(args, name) for name in SIZE}
     took = {tuple(row[name] for name in KEY): row["process_seconds"] for row in read_rows(ROWS)}
 
     def seconds_of(scene: str, num_downscales: int, steps: int) -> float:
         """Process seconds of a fit that there is, or is made."""
-        key = key_of(scene, args.trained, num_downscales, steps)
+        key = key_of(scene, args.trained, num_downscales, steps, size)
         if key not in took:
-            row = measured(scene, args.trained, num_downscales, steps)
+            row = measured(scene, args.trained, num_downscales, steps, size)
             add_row(ROWS, row)
             took[key] = row["process_seconds"]
             print(
