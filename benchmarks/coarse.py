@@ -1,11 +1,12 @@
 """Photographs that begin small: held-out PSNR against the time of a processor, by how often they are halved.
 
-    python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--page]
+    python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--same] [--page]
 
 Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes the table of
-docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales; then those with 1 and 2
-are made once more, with as many steps as take the time of the fit without. Photographs have their full size, of at most
-200,000 pixels. Seconds are those that the process computed in its steps, whatever ran beside it. One thread.
+docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales or those that are named;
+then those with more than 0 are made once more, with as many steps as take the time of the fit without, but not with
+`--same`. Photographs have their full size, of at most 200,000 pixels unless `--max-pixels` says less. Seconds are those
+that the process computed in its steps, whatever ran beside it. One thread.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -22,15 +22,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, add_row, ran, read_rows  # noqa: E402
+from fits import fitted, psnr_by_renderer  # noqa: E402
+from where import add_row, ran, read_rows  # noqa: E402
 
-from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.fitting.resolution import FULL  # noqa: E402
-from drgs.fitting.start import start  # noqa: E402
-from drgs.metrics import through_renderers  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
@@ -43,14 +41,13 @@ SEED = 0
 KEY = ("scene", "trained", "num_downscales", "full", "steps", "max_pixels", "max_gaussians", "seed")
 
 
-def key_of(scene: str, trained: str, num_downscales: int, steps: int) -> tuple:
+def key_of(scene: str, trained: str, num_downscales: int, steps: int, size: dict[str, int]) -> tuple:
     """What tells a row from others."""
-    return scene, trained, num_downscales, FULL, steps, *SIZE.values(), SEED
+    return scene, trained, num_downscales, FULL, steps, *size.values(), SEED
 
 
-def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
+def measured(scene: str, trained: str, num_downscales: int, steps: int, size: dict[str, int]) -> dict:
     """One fit, and its held-out views at the full size, in the renderer that stands for those it was fitted with."""
-    dataset = load(DATA / scene)
     own = own_preset((trained,))
     config = FitConfig.of(
         settings=RenderSettings.preset(own),
@@ -59,25 +56,28 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int) -> dict:
         skybox="off",
         max_steps=steps,
         seed=SEED,
-        **SIZE,
+        **size,
     )
-    train, test = dataset.split(config.data.test_every)
-    frames = load_frames(train, config.data.max_pixels)
-    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
-    began = time.process_time()
-    while trainer.step_index < steps:
-        trainer.step()
-    seconds = time.process_time() - began
-    seen = {own: RenderSettings.preset(own)}
-    found = through_renderers(trainer.gaussians(), load_frames(test, config.data.max_pixels), seen, "test", len(test))
-    assert found is not None
+    fit = fitted(scene, config)
+    held_out = load_frames(fit.test, config.data.max_pixels)
+    psnr = psnr_by_renderer(fit.gaussians, held_out, {own: RenderSettings.preset(own)})
+    first = fit.frames[0].camera
     return {
-        **dict(zip(KEY, key_of(scene, trained, num_downscales, steps), strict=True)),
-        "size": [frames[0].camera.width, frames[0].camera.height],
-        "psnr": [view["psnr"] for view in found["rows"][0]["views"]],
-        "process_seconds": seconds,
+        **dict(zip(KEY, key_of(scene, trained, num_downscales, steps, size), strict=True)),
+        "size": [first.width, first.height],
+        "psnr": psnr[own],
+        "process_seconds": fit.process_seconds,
         **ran(),
     }
+
+
+def base_of(row: dict, rows: list[dict]) -> dict | None:
+    """The fit at the full size that another one is compared with: of as many steps or, where that has more in the time
+    saved, of the most that are fewer; None where there is none.
+    """
+    unit = ("scene", "trained", "max_pixels", "max_gaussians", "seed")
+    same = [x for x in rows if not x["num_downscales"] and all(x[name] == row[name] for name in unit)]
+    return max((x for x in same if x["steps"] <= row["steps"]), key=lambda x: x["steps"], default=None)
 
 
 def table(rows: list[dict]) -> str:
@@ -89,10 +89,7 @@ def table(rows: list[dict]) -> str:
     order = sorted(rows, key=lambda row: (row["scene"], row["trained"], row["steps"], row["num_downscales"]))
     for base in (row for row in order if not row["num_downscales"]):
         mean = sum(base["psnr"]) / len(base["psnr"])
-        unit = ("scene", "trained", "max_pixels", "max_gaussians", "seed")
-        for row in order:
-            if any(row[name] != base[name] for name in unit) or (row is not base and not row["num_downscales"]):
-                continue
+        for row in (row for row in order if base_of(row, order) is base):
             now = sum(row["psnr"]) / len(row["psnr"])
             width, height = row["size"]
             shown = f"{now:.2f} / {min(row['psnr']):.2f}"
@@ -111,15 +108,20 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
     parser.add_argument("--trained", default="fast", help="as `drgs fit --for` takes it")
     parser.add_argument("--steps", type=int, default=150)
+    for name, value in SIZE.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=value)
+    parser.add_argument("--num-downscales", nargs="+", type=int, default=list(DOWNSCALES), help="beside 0")
+    parser.add_argument("--same", action="store_true", help="only fits of as many steps")
     parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
+    size = {name: getattr(args, name) for name in SIZE}
     took = {tuple(row[name] for name in KEY): row["process_seconds"] for row in read_rows(ROWS)}
 
-    def fitted(scene: str, num_downscales: int, steps: int) -> float:
+    def seconds_of(scene: str, num_downscales: int, steps: int) -> float:
         """Process seconds of a fit that there is, or is made."""
-        key = key_of(scene, args.trained, num_downscales, steps)
+        key = key_of(scene, args.trained, num_downscales, steps, size)
         if key not in took:
-            row = measured(scene, args.trained, num_downscales, steps)
+            row = measured(scene, args.trained, num_downscales, steps, size)
             add_row(ROWS, row)
             took[key] = row["process_seconds"]
             print(
@@ -132,10 +134,11 @@ def main() -> None:
         return took[key]
 
     scenes = [] if args.page else args.scenes
-    same = {scene: {n: fitted(scene, n, args.steps) for n in DOWNSCALES} for scene in scenes}
-    for n in DOWNSCALES[1:]:
+    downscales = sorted({0, *args.num_downscales})
+    same = {scene: {n: seconds_of(scene, n, args.steps) for n in downscales} for scene in scenes}
+    for n in [] if args.same else downscales[1:]:
         for scene in scenes:
-            fitted(scene, n, round(args.steps * same[scene][0] / same[scene][n]))
+            seconds_of(scene, n, round(args.steps * same[scene][0] / same[scene][n]))
     text = table(read_rows(ROWS))
     print(text)
     fill_between(PAGE, "coarse", text)

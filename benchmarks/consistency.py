@@ -15,7 +15,6 @@ import dataclasses
 import os
 import statistics
 import sys
-import time
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -26,17 +25,16 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
+from fits import fitted, psnr_by_renderer  # noqa: E402
+from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
-from drgs.data import load  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import Frame, load_frames  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
-from drgs.fitting.start import start  # noqa: E402
 from drgs.integrator import Output, render  # noqa: E402
-from drgs.metrics import psnr, through_renderers  # noqa: E402
+from drgs.metrics import psnr  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
@@ -89,33 +87,21 @@ def between(first: Camera, second: Camera, share: float) -> Camera:
 
 def measured(scene: str, weight: float, seed: int, offset: int) -> dict:
     """One fit: its held-out views in each renderer, and how alike two renderers' images of them are."""
-    dataset = load(DATA / scene)
     config = FitConfig.of(renderers=("any",), seed=seed, test_offset=offset, skybox="off", **SIZE)
-    train, test = dataset.split(config.data.test_every, offset)
-    test = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, MOST).round().astype(int))]
-    frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))
-    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
-    if weight:
-        term = Consistency(frames, weight, seed)
-        trainer.parts = dataclasses.replace(trainer.parts, terms=[*trainer.parts.terms, term])
-    began = time.process_time()
-    while trainer.step_index < config.max_steps:
-        trainer.step()
-    seconds = time.process_time() - began
-    gaussians = trainer.gaussians()
-    found = through_renderers(gaussians, held_out, renderers_to_measure(("any",), config.settings, "all"), "test")
-    assert found is not None
+    fit = fitted(scene, config, lambda frames: [Consistency(frames, weight, seed)] if weight else [])
+    chosen = np.unique(np.linspace(0, len(fit.test) - 1, MOST).round().astype(int))
+    held_out = load_frames([fit.test[i] for i in chosen], config.data.max_pixels)
+    renderers = renderers_to_measure(("any",), config.settings, "all")
     alike = []
     for frame in held_out:
-        one, other = (
-            render(gaussians, frame.camera, RenderSettings.preset(name), outputs=()).rgb.clamp(0, 1) for name in PAIR
-        )
+        images = (render(fit.gaussians, frame.camera, RenderSettings.preset(name), outputs=()).rgb for name in PAIR)
+        one, other = (image.clamp(0, 1) for image in images)
         alike.append(psnr(one, other))
     return {
         **dict(zip(KEY, (Path(scene).name, weight, seed, offset, *SIZE.values()), strict=True)),
-        "psnr": {row["name"]: [view["psnr"] for view in row["views"]] for row in found["rows"]},
+        "psnr": psnr_by_renderer(fit.gaussians, held_out, renderers),
         "alike": alike,
-        "seconds": seconds,
+        "seconds": fit.process_seconds,
         **ran(),
     }
 

@@ -13,7 +13,6 @@ import argparse
 import os
 import statistics
 import sys
-import time
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -22,14 +21,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, add_row, ran, read_rows  # noqa: E402
+from fits import fitted, psnr_by_renderer  # noqa: E402
+from where import add_row, ran, read_rows  # noqa: E402
 
-from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
-from drgs.fitting.start import start  # noqa: E402
-from drgs.metrics import through_renderers  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
@@ -46,7 +43,6 @@ KEY = ("scene", "trained", "filter", "seed", "max_pixels")
 
 def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
     """One fit, and its held-out views in each renderer at each size."""
-    dataset = load(DATA / scene)
     pixels = PIXELS.get(scene, 12_000)
     config = FitConfig.of(
         settings=RenderSettings.preset(own_preset((trained,))),
@@ -57,23 +53,16 @@ def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
         max_pixels=pixels,
         **SIZE,
     )
-    train, test = dataset.split(config.data.test_every)
-    trainer, *_ = start(dataset, train, load_frames(train, pixels), config, None, None, False, 0)
-    began = time.perf_counter()
-    while trainer.step_index < config.max_steps:
-        trainer.step()
-    seconds = time.perf_counter() - began
+    fit = fitted(scene, config)
     renderers = {name: RenderSettings.preset(name) for name in SEEN}
-    psnr = {}
-    for scale in SCALES:
-        frames = load_frames(test, pixels * scale**2)
-        found = through_renderers(trainer.gaussians(), frames, renderers, "test", MOST)
-        assert found is not None
-        psnr[scale] = {row["name"]: [view["psnr"] for view in row["views"]] for row in found["rows"]}
+    psnr = {
+        scale: psnr_by_renderer(fit.gaussians, load_frames(fit.test, pixels * scale**2), renderers, MOST)
+        for scale in SCALES
+    }
     return {
         **dict(zip(KEY, (scene, trained, filter_3d, seed, pixels), strict=True)),
         "psnr": psnr,
-        "seconds": seconds,
+        "seconds": fit.seconds,
         **ran(),
     }
 

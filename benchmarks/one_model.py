@@ -16,7 +16,6 @@ import operator
 import os
 import statistics
 import sys
-import time
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -25,14 +24,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
+from fits import fitted, psnr_by_renderer  # noqa: E402
+from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
-from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
-from drgs.fitting.start import start  # noqa: E402
-from drgs.metrics import through_renderers  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
@@ -47,29 +44,22 @@ KEY = ("scene", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gau
 
 def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> dict:
     """One fit, and its held-out views in each renderer."""
-    dataset = load(DATA / scene)
     names = tuple(trained.split(","))
     settings = RenderSettings.preset(trained if trained in PRESETS else "fast")
     config = FitConfig.of(settings=settings, renderers=names, seed=seed, test_offset=offset, **size)
-    train, test = dataset.split(config.data.test_every, offset)
-    frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))
-    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
+    fit = fitted(scene, config)
     schedule = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
     took: dict[RenderSettings, list[float]] = {}
-    while trainer.step_index < config.max_steps:
-        settings = schedule.settings_at(trainer.step_index)
-        began = time.perf_counter()
-        trainer.step()
-        took.setdefault(settings, []).append(time.perf_counter() - began)
+    for step, seconds in enumerate(fit.step_seconds):
+        took.setdefault(schedule.settings_at(step), []).append(seconds)
     renderers = renderers_to_measure(names, config.settings, "all")
-    found = through_renderers(trainer.gaussians(), held_out, renderers, "test")
-    assert found is not None
+    psnr = psnr_by_renderer(fit.gaussians, load_frames(fit.test, config.data.max_pixels), renderers)
     names_of = {RenderSettings.preset(name): name for name in PRESETS}
     step_ms = {names_of[settings]: 1000 * statistics.median(each) for settings, each in took.items()}
     average = sum(step_ms[names_of[settings]] * len(each) for settings, each in took.items()) / config.max_steps
     return {
         **dict(zip(KEY, (Path(scene).name, trained, seed, offset, *size.values()), strict=True)),
-        "psnr": {row["name"]: [view["psnr"] for view in row["views"]] for row in found["rows"] if row["name"] in ANY},
+        "psnr": {name: views for name, views in psnr.items() if name in ANY},
         "step_ms": step_ms,
         "over_fast": average / step_ms["fast"] if "fast" in step_ms else None,
         **ran(),

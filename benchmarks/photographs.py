@@ -57,7 +57,7 @@ def measured(scene: str, term: str, seed: int, offset: int, size: dict) -> dict:
     found |= {key: metrics["poses"][key] for key in ("degrees", "moved", "psnr_refined")} if "poses" in metrics else {}
     found |= {"reprojection": recorded["poses"]["reprojection"]} if "poses" in recorded else {}
     found |= metrics.get("transients", {})
-    if "skybox" in recorded:
+    if "share" in recorded.get("skybox", {}):  # photographs were asked
         found["skybox"] = {**recorded["skybox"], "visible": metrics.get("skybox", {}).get("visible", 0.0)}
     return {
         **dict(zip(KEY, (Path(scene).name, term, seed, offset, *size.values()), strict=True)),
@@ -131,7 +131,7 @@ def skyboxes(found: list[dict]) -> str:
     lines = ["| capture, seed | term | agree on what is far / show it | `exact` | `fast` | `gsplat` | seconds |"]
     lines += ["|---|---|---|---|---|---|---|"]
     plain = {_unit(row): row for row in found if not row["term"] and "renderers" in row}
-    with_sky = [row for row in found if row["term"].startswith("skybox") and _unit(row) in plain]
+    with_sky = [row for row in found if "skybox" in row["found"] and _unit(row) in plain]
     for unit in sorted({_unit(row) for row in with_sky}):
         base = plain[unit]
         cells = [f"{base['renderers'][x]['mean']:.2f} / {base['renderers'][x]['worst']:.2f}" for x in RENDERERS]

@@ -14,7 +14,6 @@ import os
 import statistics
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -23,14 +22,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from fits import fitted, psnr_by_renderer  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
-from drgs.fitting.start import start  # noqa: E402
-from drgs.metrics import through_renderers  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
@@ -77,20 +75,12 @@ def measured(scene: str, rates: str, steps: int) -> dict:
     if dataset.is_dynamic or dataset.semantics is not None:
         return measured_whole(scene, rates, steps)
     config = FitConfig.of(renderers=("any",), max_steps=steps, **SIZE, **options_of(rates))
-    train, test = dataset.split(config.data.test_every)
-    frames, held_out = (load_frames(views, config.data.max_pixels) for views in (train, test))
-    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
-    began = time.process_time()
-    while trainer.step_index < steps:
-        trainer.step()
-    seconds = time.process_time() - began
+    done = fitted(scene, config)
     renderers = renderers_to_measure(config.renderers, config.settings, "all")
-    found = through_renderers(trainer.gaussians(), held_out, renderers, "test")
-    assert found is not None
     return {
         **dict(zip(KEY, (scene, rates, steps, *SIZE.values()), strict=True)),
-        "psnr": {row["name"]: [view["psnr"] for view in row["views"]] for row in found["rows"]},
-        "seconds": seconds,
+        "psnr": psnr_by_renderer(done.gaussians, load_frames(done.test, config.data.max_pixels), renderers),
+        "seconds": done.process_seconds,
         **ran(),
     }
 

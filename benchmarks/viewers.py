@@ -1,7 +1,7 @@
 """One model in viewers of others: runs of `drgs fit` in four programs that draw Gaussians in a browser, by WebGL.
 
     pip install --no-deps --target out/viewers vuer==0.1.6 gradio==6.31.0
-    python benchmarks/viewers.py RUN [RUN ...] [--wheels out/viewers] [--views 3] [--page] [--picture FILE]
+    python benchmarks/viewers.py RUN [RUN ...] [--wheels out/viewers] [--far 10000] [--page] [--picture FILE]
 
 | viewer | out of the wheel | what it is |
 |---|---|---|
@@ -15,7 +15,9 @@ served to the browser from where pip put it, and none of it is part of this repo
 
 A run's PLY is drawn from the cameras of held-out photographs, at the size of the fit, on black, and compared with the
 photograph and with our own picture of the preset `gsplat`, of the degree of the spherical harmonics that the viewer
-draws. A row a run and viewer is added to benchmarks/viewers.jsonl; rows of runs of the same name are replaced.
+draws. A row a run and viewer is added to benchmarks/viewers.jsonl; rows of runs of the same name and far plane are
+replaced. Without `--far` the far plane is that of viser and gsplat.js themselves, 1000 and 100 units away, and 1000 for
+the others, which take it from the program around them.
 `--page` writes the table of docs/one-model.md, `--picture` a sheet of one view of the runs of one capture.
 """
 
@@ -47,6 +49,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from fits import split_of  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -69,6 +72,8 @@ FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 PATIENCE = 300.0  # s until a viewer must have drawn: the processor draws, and may be busy
 PAUSE = 0.7  # s between two pictures, of which three must be the same: the viewer has sorted and drawn
 SORTED = 3.0  # s that viser's client has for sorting before its first picture, which may be of an older order
+FAR = 1000.0
+"""Where pictures of those end that have no far plane of their own, in units of the scene."""
 ALIKE = 3
 """Pictures in a row that must be the same."""
 CELL = 200
@@ -232,8 +237,10 @@ def settled(take: Callable[[], torch.Tensor], where: str) -> torch.Tensor:
     sys.exit(f"viewers: {where} must come to rest within {PATIENCE:.0f} s, did not; is the processor busy?")
 
 
-def in_page(viewer: Viewer, folder: Path, browser: Any, ply: Path, cameras: list[Camera]) -> list[torch.Tensor]:
-    """Pictures of a viewer that one of our pages opens."""
+def in_page(
+    viewer: Viewer, folder: Path, browser: Any, ply: Path, cameras: list[Camera], far: float | None
+) -> list[torch.Tensor]:
+    """Pictures of a viewer that one of our pages opens, with another far plane unless that is None."""
     from playwright.sync_api import Error
 
     module = module_of(viewer, folder)
@@ -261,6 +268,7 @@ def in_page(viewer: Viewer, folder: Path, browser: Any, ply: Path, cameras: list
                 "model": f"{server}/models/{ply.name}",
                 "view": views[0],
                 "options": viewer.options,
+                "far": FAR if far is None and viewer.page != "gsplatjs.js" else far,
                 "patience": 1000 * PATIENCE,
             }
             code = (
@@ -285,15 +293,19 @@ def in_page(viewer: Viewer, folder: Path, browser: Any, ply: Path, cameras: list
             page.close()
 
 
-def in_viser(browser: Any, g: Gaussians, cameras: list[Camera]) -> list[torch.Tensor]:
-    """Pictures of viser's client, of what `drgs view` sends it."""
+def in_viser(browser: Any, g: Gaussians, cameras: list[Camera], far: float | None) -> list[torch.Tensor]:
+    """Pictures of viser's client, of what `drgs view` sends it, with another far plane unless that is None.
+
+    The pictures that it is asked for end 1000 units away whatever is said, so that the scene is made smaller instead.
+    """
     import viser
 
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
+        smaller = 1.0 if far is None else FAR / far
         sent = ClientGaussians.of(g)
         server.scene.add_gaussian_splats(
-            "/g", sent.centers, sent.covariances, sent.rgbs, sent.opacities, scale=sent.scale
+            "/g", sent.centers, sent.covariances, sent.rgbs, sent.opacities, scale=smaller * sent.scale
         )
         # Of the size of the views, and with their lens: `get_render` draws Gaussians by those of the window.
         size = {"width": cameras[0].width, "height": cameras[0].height}
@@ -306,6 +318,7 @@ def in_viser(browser: Any, g: Gaussians, cameras: list[Camera]) -> list[torch.Te
         pictures = []
         for camera in cameras:
             pose = pose_of(camera, np.asarray(g.origin, np.float64))
+            pose = dataclasses.replace(pose, position=smaller * pose.position)
             taken: list[Any] = []
             client.camera.wxyz, client.camera.position, client.camera.fov = pose.wxyz, pose.position, pose.fov
             page.wait_for_timeout(1000 * SORTED)
@@ -353,13 +366,15 @@ def held_out(folder: Path, count: int) -> list[Frame]:
     """Evenly spaced held-out photographs of a run, at the size of the fit."""
     record = load_run(folder).record
     dataset = load_dataset(record.data, record.config)
-    _, test = dataset.split(record.config.data.test_every, record.config.data.test_offset)
+    _, test = split_of(dataset, record.config)
     chosen = [test[round((i + 0.5) * len(test) / count - 0.5)] for i in range(min(count, len(test)))]
     return load_frames(chosen, record.config.data.max_pixels)
 
 
-def measured(folder: Path, count: int, wheels: Path, browser: Any) -> tuple[list[dict], dict[str, list[torch.Tensor]]]:
-    """Rows of a run, and the pictures behind them by renderer and viewer."""
+def measured(
+    folder: Path, count: int, wheels: Path, browser: Any, far: float | None
+) -> tuple[list[dict], dict[str, list[torch.Tensor]]]:
+    """Rows of a run, and the pictures behind them by renderer and viewer; `far` as of `in_page`."""
     ply = Run(folder).point_cloud
     g = load_ply(ply)
     frames = held_out(folder, count)
@@ -371,6 +386,7 @@ def measured(folder: Path, count: int, wheels: Path, browser: Any) -> tuple[list
     ours = {d: [drawn(of_degree(g, d), camera, "gsplat") for camera in cameras] for d in degrees}
     rows = []
     about = {"run": folder.name, "views": [frame.name for frame in frames], "gaussians": len(g.means), **ran()}
+    about |= {} if far is None else {"far": far}
 
     def add(name: str, version: str | None, degree: int, options: dict) -> None:
         row = {"seen_with": name, "version": version, "degree": degree, "options": options}
@@ -389,21 +405,29 @@ def measured(folder: Path, count: int, wheels: Path, browser: Any) -> tuple[list
             advice = f"pip install --no-deps --target {wheels} {viewer.wheel}"
             print(f"viewers: {viewer.name} must have the wheel {viewer.wheel}, is left out without; {advice}")
             continue
-        shown = in_page(viewer, place, browser, ply, cameras) if viewer.page else in_viser(browser, g, cameras)
+        shown = (
+            in_page(viewer, place, browser, ply, cameras, far) if viewer.page else in_viser(browser, g, cameras, far)
+        )
         pictures[viewer.name] = shown
         add(viewer.name, version_of(viewer.wheel, place), viewer.degree, viewer.options)
     return rows, pictures
 
 
+def unit_of(row: dict) -> tuple[str, float | None]:
+    """Run and far plane of a row, None for that which a viewer has without."""
+    return row["run"], row.get("far")
+
+
 def table(found: list[dict]) -> str:
     """PSNR against photographs and against our own picture, by run and viewer."""
-    runs = list(dict.fromkeys(row["run"] for row in found))
+    runs = list(dict.fromkeys(unit_of(row) for row in found))
     names = list(dict.fromkeys(row["seen_with"] for row in found))
-    lines = ["| seen with | " + " | ".join(f"`{run}`" for run in runs) + " |", "|---" * (1 + len(runs)) + "|"]
+    titles = [f"`{run}`" + (f", far {far:,.0f}" if far else "") for run, far in runs]
+    lines = [f"| seen with | {' | '.join(titles)} |", "|---" * (1 + len(runs)) + "|"]
     for name in names:
         cells = []
         for run in runs:
-            row = next((row for row in found if (row["run"], row["seen_with"]) == (run, name)), None)
+            row = next((row for row in found if (unit_of(row), row["seen_with"]) == (run, name)), None)
             if row is None:
                 cells.append("-")
                 continue
@@ -453,6 +477,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", type=Path, help="folders that `drgs fit` wrote")
     parser.add_argument("--wheels", type=Path, default=ROOT / "out" / "viewers", help="where pip put vuer and gradio")
     parser.add_argument("--views", type=int, default=3, help="held-out photographs of each run")
+    parser.add_argument("--far", type=float, help="far plane of all viewers, in units of the scene")
     parser.add_argument("--page", action="store_true", help="write the table of docs/one-model.md")
     parser.add_argument("--picture", type=Path, help="JPEG of one view in all of them, a run a row")
     parser.add_argument("--at", type=int, default=0, help="which of the views the picture shows")
@@ -470,8 +495,8 @@ def main() -> None:
         with sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=chromium, args=FLAGS)
             for folder in args.runs:
-                rows, shown[folder.name] = measured(folder, args.views, args.wheels, browser)
-                others = [row for row in read_rows(ROWS) if row["run"] != folder.name]
+                rows, shown[folder.name] = measured(folder, args.views, args.wheels, browser, args.far)
+                others = [row for row in read_rows(ROWS) if unit_of(row) != (folder.name, args.far)]
                 ROWS.write_text("")
                 for row in [*others, *rows]:
                     add_row(ROWS, row)

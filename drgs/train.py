@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
     from drgs.fitting.poses import PoseEvidence
-    from drgs.fitting.skybox import FarEvidence
+    from drgs.fitting.skybox import SkyboxChoice
     from drgs.information.pool import Workers
 
 __all__ = [
@@ -200,19 +200,19 @@ def _fit(
             made = with_poses(made, frames, config, header["extent"])
         trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
         seconds = seconds_of(run, header) or 0.0
-        exposure = evidence = far = None
+        exposure = evidence = choice = None
         source = header["point_source"]
         config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        trainer, source, exposure, evidence, far = start(
+        trainer, source, exposure, evidence, choice = start(
             dataset, views, frames, config, parts, taught, plan is not None, room, motion
         )
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= _exposure_record(run, trainer, exposure)
     recorded |= _poses_record(run, trainer, evidence)
-    recorded |= _skybox_record(run, trainer, far)
+    recorded |= _skybox_record(run, trainer, choice)
     poses = trainer.parts.poses
     estimated = [*(["exposure"] if trainer.parts.exposure else []), *(["pose"] if poses else [])]
     if estimated:
@@ -344,13 +344,13 @@ def _poses_record(run: Run, trainer: Trainer, found: PoseEvidence | None) -> dic
     return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
 
 
-def _skybox_record(run: Run, trainer: Trainer, found: FarEvidence | None) -> dict[str, Any]:
-    """What config.json is to say of a skybox; arguments as of `_exposure_record`."""
-    if found is not None:
-        return {"skybox": {"gaussians": trainer.rows.skybox, **found.to_json()}}
-    # A fit that goes on, whose config.json may have been moved away.
+def _skybox_record(run: Run, trainer: Trainer, choice: SkyboxChoice | None) -> dict[str, Any]:
+    """What config.json is to say of a skybox: `choice` of a fit that begins, None of one that goes on."""
+    if choice is not None:
+        return {"skybox": choice.to_json(trainer.rows.skybox)}
+    # Its config.json may have been moved away, and one of before says nothing of fits that did not look.
     before = run.config() if (run.path / "config.json").is_file() else {}
-    here = {"skybox": {"gaussians": trainer.rows.skybox}} if trainer.rows.skybox else {}
+    here = {"skybox": {"gaussians": trainer.rows.skybox, "reason": None}} if trainer.rows.skybox else {}
     return {name: x for name, x in (here | before).items() if name == "skybox"}
 
 

@@ -32,7 +32,7 @@ from drgs.testing import random_scene
 from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
-    "config.json": {"frames", "absent", "semantics", "times", "poses", "exposure", "skybox", "estimated"},
+    "config.json": {"frames", "absent", "semantics", "times", "poses", "exposure", "estimated"},
     "metrics.json": {"segmentation", "motion", "transients", "poses", "skybox", "scale"},
     "fisher.json": {"nuisances"},
 }
@@ -78,6 +78,14 @@ def test_files_of_fits(place, name):
     """Of a fit to all views and of an active one."""
     found = set().union(*(_read(place / run / name) for run in ("all", "active"))) - {"schema"}
     assert found == _fields(name) - _SOMETIMES[name]
+
+
+def test_why_there_is_no_skybox(place):
+    """Of a fit whose photographs were asked, and of one that picks views."""
+    recorded = [_read(place / run / "config.json")["skybox"] for run in ("all", "active")]
+    assert set().union(*recorded) <= _told_of("config.json", "skybox")
+    assert recorded[0]["reason"] is not None
+    assert recorded[1] == {"gaussians": 0, "reason": "views are chosen on the way"}
 
 
 def test_evaluating_keeps_what_the_fit_said(place):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, load_state, save_state
+from drgs.fitting import skybox as skyboxes
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.filter_3d import Filter3D
 from drgs.fitting.frames import Frame, load_frames
@@ -163,7 +166,10 @@ def test_none_where_the_data_say_what_is_behind(tmp_path, data, background, said
     config = FitConfig.of(**SETTINGS, skybox="auto", settings=settings).replace(max_steps=2)
     result = fit(dataset, tmp_path / "run", config, progress=False)
     assert "skybox" not in result.metrics
-    assert "skybox" not in result.run.config()
+    recorded = result.run.config()["skybox"]
+    assert set(recorded) == {"gaussians", "reason"}
+    assert recorded["gaussians"] == 0
+    assert recorded["reason"].startswith(said)
     with pytest.raises(ValueError, match="skybox must be off or auto here, got on") as error:
         fit(dataset, tmp_path / "other", config.replace(skybox="on"), progress=False)
     assert "\n" not in str(error.value)
@@ -187,6 +193,7 @@ def test_held_out_views_are_better_and_the_file_has_it(tmp_path):
     for name in ("fast", "gsplat"):
         assert shown["auto"][name] > shown["off"][name] + 2
     recorded = result.run.config()["skybox"]
+    assert recorded["reason"] is None
     assert recorded["gaussians"] == result.metrics["skybox"]["gaussians"] > 80
     assert recorded["share"] > 0.2
     assert result.metrics["skybox"]["visible"] > 0.3
@@ -203,7 +210,11 @@ def test_a_near_scene_has_the_bits_of_a_fit_without(tmp_path):
     dataset = dataset_of(photographs(NEAR), tmp_path)
     config = FitConfig.of(**SETTINGS, deterministic=True).replace(max_steps=12)
     ends = [fit(dataset, tmp_path / use, config.replace(skybox=use), progress=False) for use in ("off", "auto")]
-    assert ends[1].run.config()["skybox"]["gaussians"] == 0
+    off, auto = (end.run.config()["skybox"] for end in ends)
+    assert off == {"gaussians": 0, "reason": "skybox is off"}
+    assert auto["gaussians"] == 0
+    assert auto["reason"] == "photographs do not clearly agree on what is far away"
+    assert auto["share"] < 0.25
     one, two = (end.gaussians.parameters() for end in ends)
     assert all(torch.equal(one[name], two[name]) for name in one)
 
@@ -309,7 +320,22 @@ def test_refused_where_things_move(tmp_path):
     with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
         fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS, skybox="on"), progress=False)
     result = fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS).replace(max_steps=4), progress=False)
-    assert "skybox" not in result.run.config()
+    assert result.run.config()["skybox"] == {"gaussians": 0, "reason": "things move"}
+
+
+def test_a_run_that_goes_on_keeps_the_reason(tmp_path):
+    """And one of before, whose config.json has none, is read as it was."""
+    dataset = dataset_of(photographs(NEAR), tmp_path)
+    config = FitConfig.of(**SETTINGS).replace(max_steps=4, save_every=2)
+    run = fit(dataset, tmp_path / "run", config, progress=False).run
+    recorded = run.config()
+    assert recorded["skybox"]["reason"] == "photographs do not clearly agree on what is far away"
+    fit(dataset, run.path, config, resume=True, progress=False)
+    assert run.config()["skybox"] == recorded["skybox"]
+    before = {name: x for name, x in recorded.items() if name != "skybox"}
+    (run.path / "config.json").write_text(json.dumps(before))
+    fit(dataset, run.path, config, resume=True, progress=False)
+    assert "skybox" not in run.config()
 
 
 def test_as_many_as_there_may_be_and_evenly():
@@ -330,6 +356,28 @@ def test_as_many_as_there_may_be_and_evenly():
                 inside = (depth > 0) & ((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1)
                 low, high = (pixels[inside] < np.array([WIDTH, HEIGHT]) / 2).sum(0), inside.sum()
                 assert ((low > 0.25 * high) & (low < 0.75 * high)).all()
+
+
+def test_many_photographs_and_directions_fit_into_memory(monkeypatch):
+    """Colors are looked up some directions at a time, with the bits of all at once, in memory that does not grow with
+    their number: 8,000 directions in 308 photographs are 30 MB of colors, and of their median several times that.
+    """
+    frames = photographs()
+    whole = Skybox.around(frames, 3.3, 8000)
+    many = 22 * frames
+    monkeypatch.setattr(skyboxes, "_COLORS_AT_ONCE", 1 << 20)
+    monkeypatch.setattr(skyboxes, "_POINTS_AT_ONCE", 1 << 10)
+    parts = Skybox.around(frames, 3.3, 8000)
+    for name in ("means", "colors", "scales"):
+        assert np.array_equal(getattr(whole, name), getattr(parts, name))
+    tracemalloc.start()
+    try:
+        colors = skyboxes._colors(many, whole.means)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.array_equal(colors, whole.colors)  # a median of each color 22 times
+    assert peak < 12e6
 
 
 def test_poses_have_the_reach_of_what_is_near():

@@ -242,6 +242,26 @@ def test_the_browser_and_we_draw_the_same(shown):
 
 
 @once_more
+def test_the_browser_draws_what_is_far_away(shown):
+    """Where a skybox may be: 50,000 times as far as what is looked at, with a Gaussian that is small beside it."""
+    looked = subject(torch.zeros(1, 3))
+    first = looked.first
+    way = np.array([-0.55, 0.45, 0.2]) - first.pose.position
+    times = 5e4 * first.distance / np.linalg.norm(way)
+    means = torch.from_numpy(np.stack([np.zeros(3), first.pose.position + times * way])).float()
+    scales = torch.tensor([[0.02], [0.06 * times]]).expand(2, 3)
+    sh = torch.tensor([[[-1.7, -1.7, -1.7]], [[-1.7, 1.7, -1.7]]])
+    looked = subject(means, scene=blobs(means, sh=sh, scales=scales))
+    viewer, page = shown(looked)
+    where = camera_of(looked.first.pose, WIDTH, HEIGHT, np.zeros(3)).project(means.numpy())[0][1]
+    np.testing.assert_allclose(bright(page), where, atol=1.0)
+    page.locator('input[type="checkbox"]').locator("visible=true").first.click()  # our picture
+    page.wait_for_function("document.getElementById('drgs-status').innerText.trim() === ''")
+    page.wait_for_timeout(1500)
+    np.testing.assert_allclose(bright(page), where, atol=1.0)
+
+
+@once_more
 def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     """A click on a frustum flies there and opens what is known of it; a checkpoint that a fit writes meanwhile is
     noticed and shown, with its step."""

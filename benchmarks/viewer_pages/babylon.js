@@ -1,7 +1,7 @@
 // The viewer of Babylon.js, out of the client of gradio, whose Model3D opens .ply files of triangles with it.
 import { axes, canvasOf, projectionMatrix } from "./common.js";
 
-export async function open({ module, model, view }) {
+export async function open({ module, model, view, far }) {
   // The bundle asks for the global of Babylon Native without `typeof`, which is an error where there is none.
   globalThis._native = undefined;
   const { CreateViewerForCanvas } = await import(module);
@@ -28,7 +28,7 @@ export async function open({ module, model, view }) {
   const Matrix = mesh.getWorldMatrix().constructor;
   camera.lowerRadiusLimit = camera.upperRadiusLimit = camera.lowerBetaLimit = camera.upperBetaLimit = null;
   camera.minZ = 0.01;
-  camera.maxZ = 1000;
+  camera.maxZ = far;
   let shown = view;
   const apply = () => {
     const { center, down, forward } = axes(shown);

@@ -2,12 +2,13 @@
 // of its classes to the module, and takes the imports from it that are of the page around it.
 import { axes, canvasOf, keepDrawing } from "./common.js";
 
-export async function open({ module, model, view }) {
+export async function open({ module, model, view, far }) {
   const { Scene, Camera, Renderer, PLYLoader } = await import(module);
   const canvas = canvasOf(view);
   const renderer = new Renderer(canvas);
   const scene = new Scene();
   const camera = new Camera();
+  if (far !== null) camera.data.far = far; // else its own 100
   await PLYLoader.LoadAsync(model, scene, () => {});
   const look = (next) => {
     const { center, right, down, forward } = axes(next);

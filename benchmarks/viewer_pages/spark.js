@@ -2,7 +2,7 @@
 // name in the list of exports, which the server reads (`names`).
 import { canvasOf, keepDrawing, projectionMatrix, viewMatrix } from "./common.js";
 
-export async function open({ module, names, model, view, options }) {
+export async function open({ module, names, model, view, options, far }) {
   const loaded = await import(module);
   const of = (name) => loaded[names[name]];
   const canvas = canvasOf(view);
@@ -12,7 +12,7 @@ export async function open({ module, names, model, view, options }) {
   renderer.setClearColor(0x000000, 1);
   const scene = new (of("Scene"))();
   // The class of perspective cameras has no export of its own; those of the six sides of a cube are of it.
-  const camera = new (new (of("CubeCamera"))(0.01, 1000, null).children[0].constructor)();
+  const camera = new (new (of("CubeCamera"))(0.01, far, null).children[0].constructor)();
   camera.matrixAutoUpdate = false;
   const spark = new (of("SparkRenderer"))({ renderer, ...options });
   scene.add(spark);
@@ -27,7 +27,7 @@ export async function open({ module, names, model, view, options }) {
     camera.matrix.decompose(camera.position, camera.quaternion, camera.scale);
     camera.updateMatrixWorld(true);
     camera.near = 0.01;
-    camera.far = 1000;
+    camera.far = far;
     camera.projectionMatrix.set(...projectionMatrix(next, camera.near, camera.far));
     camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
   };

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
 
-__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "far_evidence", "visible_share", "why_not"]
+__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "SkyboxChoice", "far_evidence", "visible_share", "why_not"]
 
 RADIUS = 100.0
 """Distance of the nearest of them from the middle of the cameras, in extents of the scene."""
@@ -56,6 +56,8 @@ _WIDTH = 0.75  # of their scales, in the mean distance of neighbors: some percen
 _MARGIN = 0.05  # of the longer side of a picture, beyond its border: directions that held-out views may look in
 _DRAWN = 4_000  # directions over the whole sphere, of which the part that photographs look in is counted; at first
 _DRAWN_AT_MOST = 1 << 20
+_POINTS_AT_ONCE = 1 << 18  # of which it is asked whether photographs look at them
+_COLORS_AT_ONCE = 1 << 25  # bytes of the colors of all photographs at some points; a median takes several times that
 _COUNTED = 200  # of them that photographs must look in, for the count to be right within some percent
 _LEAST_COUNTED = 20  # where a lens is so narrow that even the most drawn do not do
 _OPEN = 0.5  # transmittance of the others from which on the shell is what a pixel shows
@@ -96,13 +98,10 @@ class Skybox:
         radius = RADIUS * extent
         drawn = _DRAWN
         # A narrow lens looks in few directions of the whole sphere: more are drawn until there are enough to count.
-        while (looked_at := int(_seen(frames, middle + radius * _directions(drawn)).sum())) < _COUNTED and (
-            drawn < _DRAWN_AT_MOST
-        ):
+        while (looked_at := len(_looked_at(frames, middle, radius, drawn))) < _COUNTED and drawn < _DRAWN_AT_MOST:
             drawn *= 4
         whole = max(1, count * drawn // max(looked_at, _LEAST_COUNTED))
-        directions = _directions(whole)
-        directions = directions[_seen(frames, middle + radius * directions)]
+        directions = _looked_at(frames, middle, radius, whole)
         if len(directions) > count:  # evenly fewer: the lattice runs from pole to pole
             directions = directions[np.linspace(0, len(directions) - 1, count).round().astype(int)]
         distances = radius * np.exp(np.random.default_rng(seed).uniform(0, math.log(_FARTHEST), len(directions)))
@@ -166,6 +165,27 @@ class FarEvidence:
         return {"share": self.share, **dataclasses.asdict(self)}
 
 
+@dataclasses.dataclass(frozen=True)
+class SkyboxChoice:
+    """Whether a fit begins with a shell, and why.
+
+    Attributes:
+        reason: Why there is none, in words; None where there is one.
+        evidence: What photographs say of it; None where they were not asked.
+    """
+
+    reason: str | None
+    evidence: FarEvidence | None = None
+
+    def to_json(self, gaussians: int) -> dict[str, Any]:
+        """The choice as config.json has it, with a shell of so many Gaussians."""
+        return {
+            "gaussians": gaussians,
+            "reason": self.reason,
+            **({} if self.evidence is None else self.evidence.to_json()),
+        }
+
+
 def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEvidence:
     """Whether photographs show the same color wherever they look in one direction.
 
@@ -225,9 +245,18 @@ def why_not(frames: list[Frame], background: tuple[float, float, float]) -> str 
     return None
 
 
-def _directions(count: int) -> np.ndarray:
-    """(count, 3) unit vectors evenly over the sphere: a Fibonacci lattice."""
-    index = np.arange(count) + 0.5
+def _looked_at(frames: list[Frame], middle: np.ndarray, radius: float, whole: int) -> np.ndarray:
+    """(P, 3) those of `whole` directions evenly over the sphere that photographs look in, of points at a distance."""
+    found = []
+    for first in range(0, whole, _POINTS_AT_ONCE):
+        directions = _directions(whole, first, min(first + _POINTS_AT_ONCE, whole))
+        found.append(directions[_seen(frames, middle + radius * directions)])
+    return np.concatenate(found)
+
+
+def _directions(count: int, first: int, end: int) -> np.ndarray:
+    """(end - first, 3) some of `count` unit vectors evenly over the sphere: a Fibonacci lattice."""
+    index = np.arange(first, end) + 0.5
     z = 1 - 2 * index / count
     angle = math.pi * (1 + math.sqrt(5)) * index
     across = np.sqrt(1 - z * z)
@@ -276,16 +305,26 @@ def _deviation(colors: np.ndarray) -> np.ndarray:
 
 
 def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
-    """(P, 3) median colors of photographs at far points; of those that none shows, the color of the nearest one."""
-    found = _colors_seen(frames, points)
-    has_color = ~np.isnan(found[..., 0]).all(axis=0)
+    """(P, 3) median colors of photographs at far points; of those that none shows, the color of the nearest one.
+
+    Some points at a time: each has a color in every photograph, which is gigabytes of many points and photographs.
+    """
+    has_color = np.zeros(len(points), bool)
     colors = np.full((len(points), 3), 0.5, np.float32)
+    step = max(1, _COLORS_AT_ONCE // (12 * len(frames)))
+    for first in range(0, len(points), step):
+        some = slice(first, first + step)
+        found = _colors_seen(frames, points[some])
+        there = ~np.isnan(found[..., 0]).all(axis=0)
+        if there.any():
+            colors[some][there] = np.nanmedian(found[:, there], axis=0)
+        has_color[some] = there
     if not has_color.any():
         return colors
-    colors[has_color] = np.nanmedian(found[:, has_color], axis=0)
     middle = np.stack([frame.camera.center for frame in frames]).mean(axis=0)
     directions = points - middle
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    known, known_directions = colors[has_color], directions[has_color]
     for row in np.flatnonzero(~has_color):
-        colors[row] = colors[has_color][np.argmax(directions[has_color] @ directions[row])]
+        colors[row] = known[np.argmax(known_directions @ directions[row])]
     return colors

@@ -11,7 +11,7 @@ from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.skybox import RADIUS, SHARE, FarEvidence, Skybox, far_evidence, why_not
+from drgs.fitting.skybox import RADIUS, SHARE, Skybox, SkyboxChoice, far_evidence, why_not
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
 
@@ -53,24 +53,40 @@ def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion 
     return Motion(config, times_of([*train, *test]))
 
 
-def _look_far(frames: list[Frame], config: FitConfig) -> tuple[FarEvidence | None, int]:
-    """What photographs say of what is far away, None if other data say what is behind everything; and how many
-    Gaussians are to begin there.
+def _choose_skybox(
+    frames: list[Frame], config: FitConfig, has_own_parts: bool, picks: bool, moves: bool
+) -> SkyboxChoice:
+    """Whether Gaussians are to begin far away, by what is fitted, by what data say is behind everything, and by what
+    photographs show.
 
+    Args:
+        frames: Training photographs.
+        config: Configuration of the fit.
+        has_own_parts: Whether what is fitted to what is a caller's own.
+        picks: Whether views are chosen on the way.
+        moves: Whether things move.
     Raises:
         ValueError: If a skybox is asked for where data say what is behind everything.
     """
+    against = {
+        "skybox is off": config.data.skybox == "off",
+        "the parts of the fit are a caller's own": has_own_parts,
+        "views are chosen on the way": picks,
+        "things move": moves,
+    }
+    if reasons := [reason for reason, holds in against.items() if holds]:
+        return SkyboxChoice(reasons[0])
     with Bar("skybox") as bar:
         reason = why_not(frames, config.settings.background)
         if reason is not None and config.data.skybox == "on":
             raise ValueError(f"fit: skybox must be off or auto here, got on: {reason}; leave --skybox out")
         if reason is not None:
             bar.note(f"skybox: none, {reason}")
-            return None, 0
+            return SkyboxChoice(reason)
         found = far_evidence(frames, scene_extent([frame.camera for frame in frames]), config.seed)
         is_on = config.data.skybox == "on" or found.is_clear
         bar.note(f"skybox: {found.words()}; {'there is one' if is_on else 'there is none'}")
-        return found, max(1, round(SHARE * config.density.max_gaussians)) if is_on else 0
+        return SkyboxChoice(None if is_on else "photographs do not clearly agree on what is far away", found)
 
 
 def start(
@@ -83,16 +99,16 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
-) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, FarEvidence | None]:
-    """A trainer at step 0, where its points come from, and what is known of exposure, poses and what is far away, where
-    asked for.
+) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, SkyboxChoice]:
+    """A trainer at step 0, where its points come from, what is known of exposure and poses, where asked for, and
+    whether Gaussians begin far away.
 
     Points come, by default, if `strict`, only from `views`.
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
-    may_look_far = parts is None and config.data.skybox != "off" and not strict and motion is None
-    far, room = _look_far(frames, config) if may_look_far else (None, 0)
+    choice = _choose_skybox(frames, config, parts is not None, strict, motion is not None)
+    room = max(1, round(SHARE * config.density.max_gaussians)) if choice.reason is None else 0
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
     given = config.data.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
     with Bar("initial points") as bar:
@@ -137,4 +153,4 @@ def start(
             bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
         if is_on:
             made = with_poses(made, frames, config, extent, evidence.reach)
-    return Trainer(config, frames, model, extent, made, motion), source, found, evidence, far
+    return Trainer(config, frames, model, extent, made, motion), source, found, evidence, choice

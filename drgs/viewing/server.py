@@ -23,7 +23,9 @@ __all__ = ["Viewer"]
 _log = logging.getLogger(__name__)
 
 _NEAR = 1e-3  # times the distance to what is looked at: where the client's pictures begin
-_FAR = 1e3  # times that distance: where they end
+# Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which what is looked at may
+# be a small part. What is near is told apart by the nearer number alone.
+_FAR = 1e5
 # Keys of jobs that can wait.
 _LEARNING = "uncertainty"
 _LEFT = "what browsers have left"
