@@ -1,6 +1,7 @@
 """One model in every renderer: fits with one renderer alone and with several in turn, each seen with all of them.
 
-    python benchmarks/one_model.py [--scenes head bonsai ...] [--trained fast any ...] [--seeds 3] [--page]
+    python benchmarks/one_model.py [--scenes head bonsai ...] [--trained fast any ...] [--seeds 3] [--steps 400]
+    python benchmarks/one_model.py --page
 
 Appends one row a fit to benchmarks/one_model.jsonl as it ends, leaves out what is there, then writes the tables of
 docs/one-model.md and docs/real-data.md. Scenes are captures by name, or folders. Each seed holds out other views, but
@@ -12,7 +13,6 @@ with `fast` of the same fit, so that other work on the machine takes from both.
 from __future__ import annotations
 
 import argparse
-import operator
 import os
 import statistics
 import sys
@@ -35,7 +35,8 @@ from drgs.studies.statistics import Unit, estimate  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "one_model.jsonl"
-PAGES = {"behind": ROOT / "docs" / "one-model.md", "one_model": ROOT / "docs" / "real-data.md"}
+PAGES = dict.fromkeys(("behind", "longer"), ROOT / "docs" / "one-model.md")
+PAGES["one_model"] = ROOT / "docs" / "real-data.md"
 SCENES = ("head", "bonsai", "office", "lego", "banana", "fern", "statue")
 TUNED_ON = ("banana", "fern", "statue", "lego")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
@@ -66,21 +67,33 @@ def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> di
     }
 
 
+def _unit(row: dict) -> tuple[str, int, int]:
+    """What fits that are compared have in common: capture, seed, first held-out view."""
+    return row["scene"], row["seed"], row["offset"]
+
+
+def _lags(found: list[dict], trained: str, name: str) -> dict[tuple, list[float]]:
+    """Unit -> dB by which each held-out view, seen with a renderer, is behind that of a fit with it alone."""
+    by_fit = {(_unit(row), row["trained"]): row["psnr"] for row in found}
+    return {
+        unit: [a - b for a, b in zip(psnr[name], by_fit[unit, trained][name], strict=True)]
+        for (unit, other), psnr in by_fit.items()
+        if other == name and (unit, trained) in by_fit
+    }
+
+
 def behind(found: list[dict]) -> str:
     """How far fits are behind the one for each renderer alone, of the same capture, split and seed."""
     lines = [
         "| trained with | seen with | behind, on average (95 %) | most, of a capture | most, of a view | captures |"
     ]
     lines += ["|---|---|---|---|---|---|"]
-    unit = operator.itemgetter("scene", "seed", "offset")
-    by_fit = {(unit(row), row["trained"]): row["psnr"] for row in found if row["scene"] not in TUNED_ON}
+    reported = [row for row in found if row["scene"] not in TUNED_ON]
     for trained in ("any", "fast", "gsplat"):
         for name in ANY:
             lags: dict[Unit, list[float]] = {}
-            for (key, other), psnr in by_fit.items():
-                if other == name != trained and (key, trained) in by_fit:
-                    ours = by_fit[key, trained][name]
-                    lags[key[0], key[1:], ()] = [a - b for a, b in zip(psnr[name], ours, strict=True)]
+            if name != trained:
+                lags = {(unit[0], unit[1:], ()): views for unit, views in _lags(reported, trained, name).items()}
             if not lags:
                 continue
             effect = estimate({key: statistics.mean(views) for key, views in lags.items()})
@@ -90,6 +103,28 @@ def behind(found: list[dict]) -> str:
             average = f"{effect.mean:.2f} ({effect.low:.2f} to {effect.high:.2f})"
             cells = [f"`{name}`", average, f"{most:.2f} ({scene})", f"{view:.1f} ({where})", f"{effect.scenes}"]
             lines.append(f"| {trained} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def longer(found: list[dict]) -> str:
+    """How far `any` is behind in fits of several lengths: for each capture, over the units that all lengths have."""
+    lines = ["| capture (fits) | steps | seen with | fit for it alone | `any` is behind | most, of a view |"]
+    lines += ["|---|---|---|---|---|---|"]
+    for scene in dict.fromkeys(row["scene"] for row in found if row["max_steps"] != SIZE["max_steps"]):
+        mine = [row for row in found if row["scene"] == scene]
+        lengths = sorted({row["max_steps"] for row in mine})
+        for name in ANY:
+            lags = {steps: _lags([row for row in mine if row["max_steps"] == steps], "any", name) for steps in lengths}
+            units = set.intersection(*(set(each) for each in lags.values()))
+            for steps in lengths if units else ():
+                views = [lag for unit in units for lag in lags[steps][unit]]
+                alone = [
+                    statistics.mean(row["psnr"][name])
+                    for row in mine
+                    if (row["max_steps"], row["trained"]) == (steps, name) and _unit(row) in units
+                ]
+                cells = [f"{scene} ({len(units)})", f"{steps:,}", f"`{name}`", f"{statistics.mean(alone):.2f}"]
+                lines.append(f"| {' | '.join(cells)} | {statistics.mean(views):.2f} | {max(views):.1f} |")
     return "\n".join(lines)
 
 
@@ -119,19 +154,22 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures, or folders")
     parser.add_argument("--trained", nargs="+", default=[*ANY, "any"], help="as `drgs fit --for` takes them")
     parser.add_argument("--seeds", type=int, default=len(UNITS), choices=range(1, len(UNITS) + 1))
+    parser.add_argument("--steps", type=int, default=SIZE["max_steps"])
     parser.add_argument("--page", action="store_true", help="fit nothing, write the tables of the rows that there are")
     args = parser.parse_args()
     done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
+    size = SIZE | {"max_steps": args.steps}
     for scene in [] if args.page else args.scenes:
         for trained in args.trained:
             for seed, offset in UNITS[: args.seeds]:
-                if (Path(scene).name, trained, seed, offset, *SIZE.values()) not in done:
-                    row = measured(scene, trained, seed, offset, SIZE)
+                if (Path(scene).name, trained, seed, offset, *size.values()) not in done:
+                    row = measured(scene, trained, seed, offset, size)
                     add_row(ROWS, row)
                     means = {name: round(statistics.mean(values), 2) for name, values in row["psnr"].items()}
                     print(scene, trained, seed, means, flush=True)
     found = read_rows(ROWS)
-    for name, text in (("behind", behind(found)), ("one_model", tables(found))):
+    short = [row for row in found if row["max_steps"] == SIZE["max_steps"]]
+    for name, text in (("behind", behind(short)), ("longer", longer(found)), ("one_model", tables(short))):
         print(text)
         fill_between(PAGES[name], name, text)
 
