@@ -42,6 +42,7 @@ from drgs.fitting.config import (
 from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
+from drgs.fitting.photographs import check_photographs, photographs_record
 from drgs.fitting.poses import CAMERAS, POSE_NETWORK
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
@@ -62,10 +63,7 @@ from drgs.machine import peak_memory
 if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
-    from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
-    from drgs.fitting.poses import PoseEvidence
-    from drgs.fitting.skybox import FarEvidence
     from drgs.information.pool import Workers
 
 __all__ = [
@@ -176,7 +174,7 @@ def _fit(
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
-    _check_photographs(config, motion is not None)
+    check_photographs(config, motion is not None)
     plan = ActiveViews(train, config, motion is not None, workers) if selection else None
     if selection and selection.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
@@ -210,13 +208,8 @@ def _fit(
         )
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
-    recorded |= _exposure_record(run, trainer, exposure)
-    recorded |= _poses_record(run, trainer, evidence)
-    recorded |= _skybox_record(run, trainer, far)
+    recorded |= photographs_record(run, trainer, exposure, evidence, far)
     poses = trainer.parts.poses
-    estimated = [*(["exposure"] if trainer.parts.exposure else []), *(["pose"] if poses else [])]
-    if estimated:
-        recorded["estimated"] = estimated
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -285,73 +278,6 @@ def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
     frames = frames[:: -(-len(frames) // metrics.RENDERERS_VIEWS)]
     share = visible_share(trainer.gaussians(), count, frames, trainer.config.settings)
     return {"skybox": {"gaussians": count, "visible": share}}
-
-
-def _check_photographs(config: FitConfig, moves: bool) -> None:
-    """Refuse what is modeled of single photographs where that is not built.
-
-    Raises:
-        NotImplementedError: With exposure, poses or a skybox where views are chosen on the way or things move, and with
-            transients where things move: these are found by what neighbors show of the same surface at rest.
-    """
-    if config.data.exposure != "off" and (config.selection or moves):
-        raise NotImplementedError(
-            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
-            "leave --exposure out"
-        )
-    if config.data.poses != "fixed" and (config.selection or moves):
-        raise NotImplementedError(
-            f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
-            "leave --poses out"
-        )
-    if config.data.skybox == "on" and (config.selection or moves):
-        raise NotImplementedError(
-            "fit: skybox must be off or auto where views are chosen on the way or things move, got on; leave --skybox "
-            "out"
-        )
-    if config.loss.transients != "keep" and moves:
-        raise NotImplementedError(
-            f"fit: transients must be keep where things move, got {config.loss.transients}; leave --transients out, or "
-            "fit to what stands still (--dynamics ignore)"
-        )
-
-
-def _exposure_record(run: Run, trainer: Trainer, found: ExposureEstimate | None) -> dict[str, Any]:
-    """What config.json is to say of exposure.
-
-    Args:
-        run: The run folder; a fit that goes on keeps what was found at its start.
-        trainer: The fit.
-        found: What points said of it just now; None if they were not asked.
-    """
-    recorded: dict[str, Any] = {}
-    if found is not None:
-        recorded["exposure"] = found.to_json([frame.name for frame in trainer.frames])
-    elif trainer.config.data.exposure != "off" and (run.path / "config.json").is_file():
-        recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
-    return recorded
-
-
-def _poses_record(run: Run, trainer: Trainer, found: PoseEvidence | None) -> dict[str, Any]:
-    """What config.json is to say of poses; arguments as of `_exposure_record`."""
-    refined = trainer.parts.poses is not None
-    if found is not None:
-        return {"poses": found.to_json(refined)}
-    if trainer.config.data.poses == "fixed":
-        return {}
-    # A fit that goes on, whose config.json may have been moved away.
-    before = run.config() if (run.path / "config.json").is_file() else {}
-    return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
-
-
-def _skybox_record(run: Run, trainer: Trainer, found: FarEvidence | None) -> dict[str, Any]:
-    """What config.json is to say of a skybox; arguments as of `_exposure_record`."""
-    if found is not None:
-        return {"skybox": {"gaussians": trainer.rows.skybox, **found.to_json()}}
-    # A fit that goes on, whose config.json may have been moved away.
-    before = run.config() if (run.path / "config.json").is_file() else {}
-    here = {"skybox": {"gaussians": trainer.rows.skybox}} if trainer.rows.skybox else {}
-    return {name: x for name, x in (here | before).items() if name == "skybox"}
 
 
 def _checkpoint(

@@ -1,0 +1,110 @@
+"""What a fit finds of its photographs besides the scene: where that is built, and what config.json says of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drgs.files import Run
+    from drgs.fitting.config import FitConfig
+    from drgs.fitting.exposure import ExposureEstimate
+    from drgs.fitting.poses import PoseEvidence
+    from drgs.fitting.skybox import FarEvidence
+    from drgs.fitting.trainer import Trainer
+    from drgs.information.nuisances import Nuisance
+
+__all__ = ["check_photographs", "estimated_of", "photographs_record"]
+
+
+def check_photographs(config: FitConfig, moves: bool) -> None:
+    """Refuse what is modeled of single photographs where that is not built.
+
+    Raises:
+        NotImplementedError: With exposure, poses or a skybox where views are chosen on the way or things move, and with
+            transients where things move: these are found by what neighbors show of the same surface at rest.
+    """
+    if config.data.exposure != "off" and (config.selection or moves):
+        raise NotImplementedError(
+            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
+            "leave --exposure out"
+        )
+    if config.data.poses != "fixed" and (config.selection or moves):
+        raise NotImplementedError(
+            f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
+            "leave --poses out"
+        )
+    if config.data.skybox == "on" and (config.selection or moves):
+        raise NotImplementedError(
+            "fit: skybox must be off or auto where views are chosen on the way or things move, got on; leave --skybox "
+            "out"
+        )
+    if config.loss.transients != "keep" and moves:
+        raise NotImplementedError(
+            f"fit: transients must be keep where things move, got {config.loss.transients}; leave --transients out, or "
+            "fit to what stands still (--dynamics ignore)"
+        )
+
+
+def estimated_of(trainer: Trainer) -> list[Nuisance]:
+    """Unknowns of the photographs that a fit estimates beside the scene, as it is now."""
+    parts = trainer.parts
+    exposure: list[Nuisance] = ["exposure"] if parts.exposure is not None else []
+    return exposure + (["pose"] if parts.poses is not None else [])
+
+
+def photographs_record(
+    run: Run,
+    trainer: Trainer,
+    exposure: ExposureEstimate | None,
+    poses: PoseEvidence | None,
+    far: FarEvidence | None,
+) -> dict[str, Any]:
+    """What config.json is to say of what a fit finds of its photographs.
+
+    Args:
+        run: The run folder; a fit that goes on keeps what was found at its start.
+        trainer: The fit.
+        exposure, poses, far: What was found just now; None where nobody looked.
+    """
+    recorded = _exposure_record(run, trainer, exposure) | _poses_record(run, trainer, poses)
+    recorded |= _skybox_record(run, trainer, far)
+    estimated = estimated_of(trainer)
+    return recorded | ({"estimated": estimated} if estimated else {})
+
+
+def _exposure_record(run: Run, trainer: Trainer, found: ExposureEstimate | None) -> dict[str, Any]:
+    """What config.json is to say of exposure.
+
+    Args:
+        run: The run folder; a fit that goes on keeps what was found at its start.
+        trainer: The fit.
+        found: What points said of it just now; None if they were not asked.
+    """
+    recorded: dict[str, Any] = {}
+    if found is not None:
+        recorded["exposure"] = found.to_json([frame.name for frame in trainer.frames])
+    elif trainer.config.data.exposure != "off" and (run.path / "config.json").is_file():
+        recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
+    return recorded
+
+
+def _poses_record(run: Run, trainer: Trainer, found: PoseEvidence | None) -> dict[str, Any]:
+    """What config.json is to say of poses; arguments as of `_exposure_record`."""
+    refined = trainer.parts.poses is not None
+    if found is not None:
+        return {"poses": found.to_json(refined)}
+    if trainer.config.data.poses == "fixed":
+        return {}
+    # A fit that goes on, whose config.json may have been moved away.
+    before = run.config() if (run.path / "config.json").is_file() else {}
+    return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
+
+
+def _skybox_record(run: Run, trainer: Trainer, found: FarEvidence | None) -> dict[str, Any]:
+    """What config.json is to say of a skybox; arguments as of `_exposure_record`."""
+    if found is not None:
+        return {"skybox": {"gaussians": trainer.rows.skybox, **found.to_json()}}
+    # A fit that goes on, whose config.json may have been moved away.
+    before = run.config() if (run.path / "config.json").is_file() else {}
+    here = {"skybox": {"gaussians": trainer.rows.skybox}} if trainer.rows.skybox else {}
+    return {name: x for name, x in (here | before).items() if name == "skybox"}
