@@ -42,7 +42,7 @@ from drgs.fitting.config import (
 from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
-from drgs.fitting.photographs import check_photographs, photographs_record
+from drgs.fitting.photographs import check_photographs, estimated_of, join, photographs_record
 from drgs.fitting.poses import CAMERAS, POSE_NETWORK
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
@@ -203,12 +203,17 @@ def _fit(
         config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
+        looks = plan is not None and parts is None and config.data.exposure != "off"
+        compared = plan.compared_points(dataset.points) if plan and looks else None
         trainer, source, exposure, evidence, far = start(
-            dataset, views, frames, config, parts, taught, plan is not None, room, motion
+            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared
         )
+        if plan and exposure is not None:
+            plan.exposure = exposure.to_json(plan.names)
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= photographs_record(run, trainer, exposure, evidence, far)
+    recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
     poses = trainer.parts.poses
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
@@ -225,7 +230,8 @@ def _fit(
             trainer.scene(), held_out, config.settings, pictures=pictures, segmentation=shown, moving=moving
         )
 
-    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured)
+    joins = _Joins(dataset.points, recorded, parts is None) if plan else None
+    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured, joins)
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
             bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")
@@ -328,6 +334,21 @@ def _preview_name(step: int) -> str:
     return f"preview_{step:06d}.png"
 
 
+@dataclasses.dataclass(frozen=True)
+class _Joins:
+    """What photographs that join an active fit have to do with.
+
+    Attributes:
+        points: (P, 3) points of the data set; None where they are not read.
+        recorded: Contents of config.json, which changes where more is known of exposure.
+        looks: Whether photographs have unknowns that the config asks for: the parts are not the caller's own.
+    """
+
+    points: np.ndarray | None
+    recorded: dict[str, Any]
+    looks: bool
+
+
 class _Loop:
     """Steps, and the files that are due at them."""
 
@@ -341,6 +362,7 @@ class _Loop:
         plan: ActiveViews | None,
         taught: SemanticRecord | None,
         measured: Callable[[], dict],
+        joins: _Joins | None = None,
     ) -> None:
         self.run_folder = run
         self.trainer = trainer
@@ -350,6 +372,7 @@ class _Loop:
         self.plan = plan
         self.taught = taught
         self._measured = measured
+        self._joins = joins
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
@@ -425,7 +448,9 @@ class _Loop:
         """Choose one more view, and add its photograph and points to the fit."""
         trainer = self.trainer
         decoder: Any = trainer.network("decoder")
-        frame, record = plan.pick(trainer.scene(), trainer.frames, trainer.step_index, decoder)
+        seen, estimated = trainer.photographs(), estimated_of(trainer)
+        frame, record = plan.pick(trainer.scene(), seen, trainer.step_index, decoder, estimated)
+        self._join(plan, frame)
         if start := plan.new_start():
             trainer.restart(*start)
             record["points"] = len(start[0])
@@ -444,6 +469,23 @@ class _Loop:
             f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.timetable.add}, chosen "
             f"by {plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
         )
+
+    def _join(self, plan: ActiveViews, frame: Frame) -> None:
+        """Begin with what is unknown of a photograph that was picked, and record what was found."""
+        trainer, joins = self.trainer, self._joins
+        if joins is None or not joins.looks:
+            trainer.add_unknowns(frame)
+            return
+        found = join(trainer, plan, frame, joins.points)
+        if found is None:
+            return
+        used = trainer.parts.exposure is not None
+        told = {key: x for key, x in found.to_json(plan.names).items() if key != "gains"}
+        self.run_folder.log("exposure", step=trainer.step_index, **told, used=used)
+        joins.recorded["exposure"] = plan.exposure
+        if estimated := estimated_of(trainer):
+            joins.recorded["estimated"] = estimated
+        self.run_folder.record(joins.recorded)
 
     def _log(self, step: StepResult) -> None:
         """The events of a step, and every so often the averages of the last ones."""

@@ -13,7 +13,6 @@ from drgs.files import load_state
 from drgs.fitting.exposure import Exposure, estimate_exposure, exposure_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
-from drgs.train import SelectionConfig, fit
 
 
 def _photographs(gains, hidden=0.0, seed=0):
@@ -98,11 +97,3 @@ def test_a_fit_with_gains_goes_on(dataset, whole_and_resumed):  # noqa: F811
     exposures = [run.config()["exposure"] for run in runs]
     assert exposures[0] == exposures[1]
     assert [fit_record(run).estimated for run in runs] == [("exposure",)] * 2
-
-
-def test_chosen_views_have_no_gains(dataset, tmp_path):  # noqa: F811
-    """Photographs that come one by one are compared by nothing yet: refused before anything is written."""
-    chosen = config(exposure="points", selection=SelectionConfig(initial=2, add=1))
-    with pytest.raises(NotImplementedError, match="exposure must be off where views are chosen on the way"):
-        fit(dataset, tmp_path / "run", chosen, progress=False)
-    assert not (tmp_path / "run" / "config.json").exists()

@@ -24,7 +24,14 @@ from drgs.display.progress import Bar
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.ply_headers import ply_source
 
-__all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_count", "triangulated_points"]
+__all__ = [
+    "added_points",
+    "initial_points",
+    "matched_points",
+    "read_point_ply",
+    "triangulated_count",
+    "triangulated_points",
+]
 
 _MIN_TRIANGULATED = 50
 _ENOUGH = 2_000  # triangulated points that need no others beside them
@@ -124,11 +131,20 @@ def triangulated_points(
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
 
 
+def matched_points(
+    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
+) -> np.ndarray:
+    """(P, 3) points that two or more of these views show, as far as they are triangulated; arguments as of
+    `triangulated_points`.
+    """
+    return _triangulated(views, matches, progress)[0]
+
+
 def triangulated_count(
     views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
 ) -> int:
     """The third value of `triangulated_points` alone."""
-    return len(_triangulated(views, matches, progress)[0])
+    return len(matched_points(views, matches, progress))
 
 
 def _all_at_first(data: Dataset) -> list[View]:

@@ -4,34 +4,42 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from drgs.display.progress import Bar
+from drgs.fitting.exposure import estimate_exposure
+
 if TYPE_CHECKING:
+    import numpy as np
+
     from drgs.files import Run
+    from drgs.fitting.active import ActiveViews
     from drgs.fitting.config import FitConfig
     from drgs.fitting.exposure import ExposureEstimate
+    from drgs.fitting.frames import Frame
     from drgs.fitting.poses import PoseEvidence
     from drgs.fitting.skybox import FarEvidence
     from drgs.fitting.trainer import Trainer
     from drgs.information.nuisances import Nuisance
 
-__all__ = ["check_photographs", "estimated_of", "photographs_record"]
+__all__ = ["check_photographs", "estimated_of", "join", "photographs_record"]
 
 
 def check_photographs(config: FitConfig, moves: bool) -> None:
     """Refuse what is modeled of single photographs where that is not built.
 
     Raises:
-        NotImplementedError: With exposure, poses or a skybox where views are chosen on the way or things move, and with
-            transients where things move: these are found by what neighbors show of the same surface at rest.
+        NotImplementedError: With a skybox where views are chosen on the way or things move; where things move, with
+            poses, because a field explains a camera's error as well and the photographs of one camera at many times
+            have one pose, not many, and with transients, which are found by what neighbors show of the same surface at
+            rest.
     """
-    if config.data.exposure != "off" and (config.selection or moves):
+    if config.data.exposure != "off" and moves:
         raise NotImplementedError(
-            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
-            "leave --exposure out"
+            f"fit: exposure must be off where things move, got {config.data.exposure}; leave --exposure out"
         )
-    if config.data.poses != "fixed" and (config.selection or moves):
+    if config.data.poses != "fixed" and moves:
         raise NotImplementedError(
-            f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
-            "leave --poses out"
+            f"fit: poses must be fixed where things move, got {config.data.poses}: what moves would explain their "
+            "errors, too; leave --poses out, or refine them on photographs of what stands still (--dynamics ignore)"
         )
     if config.data.skybox == "on" and (config.selection or moves):
         raise NotImplementedError(
@@ -50,6 +58,33 @@ def estimated_of(trainer: Trainer) -> list[Nuisance]:
     parts = trainer.parts
     exposure: list[Nuisance] = ["exposure"] if parts.exposure is not None else []
     return exposure + (["pose"] if parts.poses is not None else [])
+
+
+def join(trainer: Trainer, plan: ActiveViews, frame: Frame, given: np.ndarray | None) -> ExposureEstimate | None:
+    """Begin with what is unknown of a photograph that has been picked, as far as the fit estimates it.
+
+    Args:
+        trainer: The fit, to which `add_frame` adds the photograph afterwards.
+        plan: The views that are seen, this one last.
+        frame: The photograph.
+        given: (P, 3) points of the data set; None where they are not read.
+    Returns:
+        What points say of the exposure of all photographs, this one last; None where the fit does not look.
+    """
+    use = trainer.config.data.exposure
+    if use == "off":
+        trainer.add_unknowns(frame)
+        return None
+    frames = [*trainer.photographs(), frame]
+    with Bar("exposure") as bar:
+        found = estimate_exposure(frames, plan.compared_points(given), trainer.config.seed)
+        was_on = trainer.parts.exposure is not None
+        is_on = was_on or use != "auto" or found.is_clear
+        if is_on and not was_on:
+            bar.note(f"exposure: {found.words()}; each has its own from step {trainer.step_index} on")
+    trainer.add_unknowns(frame, found if is_on else None)
+    plan.exposure = found.to_json([frame.name for frame in frames])
+    return found
 
 
 def photographs_record(
