@@ -50,6 +50,24 @@ def test_known_gains_are_recovered(hidden):
     assert found.spread == pytest.approx(logs.std(axis=0) / np.log(2), abs=0.02)
 
 
+def test_only_photographs_that_show_a_point_are_compared():
+    """Most points are behind something dark in one photograph, which then seems dark; where it is known who shows
+    which, nothing hides.
+    """
+    frames, points = _photographs(np.ones((6, 3)))
+    pixels, _ = frames[0].camera.project(points)
+    hidden = pixels[:, 0] > 120
+    frames[0].pixels[:, 117:] *= 0.6
+    assert 0.6 < hidden.mean() < 0.9
+    shown = np.ones((6, len(points)), bool)
+    shown[0, hidden] = False
+    fooled = estimate_exposure(frames, points)
+    assert fooled.log_gains[0].max() < -0.3
+    found = estimate_exposure(frames, points, shown=shown)
+    assert np.abs(found.log_gains).max() < 0.02
+    assert found.observations == pytest.approx(fooled.observations - hidden.sum(), abs=3)  # some were too dark
+
+
 def test_equal_photographs_have_no_clear_gains():
     """Of photographs of one exposure, what is left is noise: no fit turns gains on for it."""
     found = estimate_exposure(*_photographs(np.ones((6, 3)), 0.2))

@@ -133,18 +133,19 @@ def triangulated_points(
 
 def matched_points(
     views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
-) -> np.ndarray:
-    """(P, 3) points that two or more of these views show, as far as they are triangulated; arguments as of
-    `triangulated_points`.
+) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 3) points that two or more of V views show, as far as they are triangulated, and (V, P) bool of which show
+    which; arguments as of `triangulated_points`.
     """
-    return _triangulated(views, matches, progress)[0]
+    points, _, shown = _triangulated(views, matches, progress)
+    return points, shown
 
 
 def triangulated_count(
     views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
 ) -> int:
     """The third value of `triangulated_points` alone."""
-    return len(matched_points(views, matches, progress))
+    return len(_triangulated(views, matches, progress)[0])
 
 
 def _all_at_first(data: Dataset) -> list[View]:

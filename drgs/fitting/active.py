@@ -200,23 +200,27 @@ class ActiveViews:
             return nothing
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
 
-    def compared_points(self, given: np.ndarray | None) -> np.ndarray:
-        """(P, 3) points by which the photographs seen so far are compared: of the data set, if the fit begins with
-        these, of depth maps, or those that are triangulated with the photographs.
+    def compared_points(self, given: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Points by which the photographs seen so far are compared: of the data set, if the fit begins with these, of
+        depth maps, or those that are triangulated with the photographs.
 
         Args:
-            given: Points of the data set; None where it has none, or they are not read.
+            given: (P, 3) points of the data set; None where it has none, or they are not read.
+        Returns:
+            (P, 3) points and, of those that are triangulated, which of the V photographs show which, (V, P) bool; else
+            None.
         """
         from drgs.data import initial_points, matched_points
 
         if self.pool_leak and given is not None:
-            return given
+            return given, None
         seen = [self.views[i] for i in self.chosen]
         with Bar("points of all views") as bar:
             if any(view.depth_path is not None for view in seen):
-                return initial_points(seen, self._config.seed, self._config.density.max_gaussians, bar.stage)[0]
+                most = self._config.density.max_gaussians
+                return initial_points(seen, self._config.seed, most, bar.stage)[0], None
             if len(seen) < 2:
-                return np.empty((0, 3))
+                return np.empty((0, 3)), None
             self._count_start(bar)  # before there are more pictures
             return matched_points(seen, self._matches, bar.stage)
 

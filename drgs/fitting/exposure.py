@@ -94,7 +94,9 @@ class ExposureEstimate:
         return _three(np.sqrt(np.square(self.errors).mean(axis=0)) / math.log(2))
 
 
-def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) -> ExposureEstimate:
+def estimate_exposure(
+    frames: list[Frame], points: np.ndarray, seed: int = 0, shown: np.ndarray | None = None
+) -> ExposureEstimate:
     """Gains of photographs from points of the scene, in closed form under robust weights.
 
     The colors of points are eliminated from the normal equations of each channel, so that V unknowns are left, whose
@@ -104,11 +106,16 @@ def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) ->
         frames: V photographs with their cameras; nothing outside of masks is looked at.
         points: (P, 3) world points, of which as many are drawn as memory has room for.
         seed: Seed of this draw.
+        shown: (V, P) bool, which photographs were found to show which points; None: nobody knows, and every photograph
+            into which a point is projected may.
     """
     most = max(1, _MOST // max(1, len(frames)))
     if len(points) > most:
-        points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
+        kept = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
+        points, shown = points[kept], None if shown is None else shown[:, kept]
     logs, there = _observed(frames, points)
+    if shown is not None:
+        there &= shown[:, :, None]
     shared = there.any(axis=2)
     there &= (shared.sum(axis=0) >= 2)[None, :, None]  # a point that one photograph shows compares nothing
     robust = there.any(axis=2).astype(np.float64)

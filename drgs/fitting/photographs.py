@@ -32,10 +32,6 @@ def check_photographs(config: FitConfig, moves: bool) -> None:
             have one pose, not many, and with transients, which are found by what neighbors show of the same surface at
             rest.
     """
-    if config.data.exposure != "off" and moves:
-        raise NotImplementedError(
-            f"fit: exposure must be off where things move, got {config.data.exposure}; leave --exposure out"
-        )
     if config.data.poses != "fixed" and moves:
         raise NotImplementedError(
             f"fit: poses must be fixed where things move, got {config.data.poses}: what moves would explain their "
@@ -77,7 +73,8 @@ def join(trainer: Trainer, plan: ActiveViews, frame: Frame, given: np.ndarray | 
         return None
     frames = [*trainer.photographs(), frame]
     with Bar("exposure") as bar:
-        found = estimate_exposure(frames, plan.compared_points(given), trainer.config.seed)
+        points, shown = plan.compared_points(given)
+        found = estimate_exposure(frames, points, trainer.config.seed, shown)
         was_on = trainer.parts.exposure is not None
         is_on = was_on or use != "auto" or found.is_clear
         if is_on and not was_on:

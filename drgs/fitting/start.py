@@ -84,14 +84,14 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
-    compared: np.ndarray | None = None,
+    compared: tuple[np.ndarray, np.ndarray | None] | None = None,
 ) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, FarEvidence | None]:
     """A trainer at step 0, where its points come from, and what is known of exposure, poses and what is far away, where
     asked for.
 
     Points come, by default, if `strict`, only from `views`; then nothing is known of observations, either, and exposure
-    is looked at again with every photograph that joins. `compared` are the (P, 3) points by which it is; default the
-    initial points.
+    is looked at again with every photograph that joins. `compared` are the points by which it is, as of
+    `ActiveViews.compared_points`; default the initial points.
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
@@ -126,7 +126,8 @@ def start(
         from drgs.fitting.exposure import estimate_exposure
 
         with Bar("exposure") as bar:
-            found = estimate_exposure(frames, points if compared is None else compared, config.seed)
+            by, shown = (points, None) if compared is None else compared
+            found = estimate_exposure(frames, by, config.seed, shown)
             is_on = config.data.exposure != "auto" or found.is_clear
             now = " for now" if strict else ""
             bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else f'off, all have the same{now}'}")
