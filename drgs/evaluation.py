@@ -65,7 +65,7 @@ def evaluate_run(
         strict=strict,
         semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
     )
-    stated = [view.camera for view in dataset.split()[0]]
+    stated = {view.name: view.camera for view in dataset.split()[0]}
     train, test = recorded.with_refined_poses(dataset).split()
     chosen: dict[str, Any] = {}
     if recorded.is_active:  # the rest of the training split was never seen
@@ -91,7 +91,8 @@ def evaluate_run(
     refined: dict[str, Any] = {}
     if recorded.refined:
         told = refined_scores(scene, frames, config.settings) if split == "test" and scale == 1 else {}
-        refined = {"poses": {**displacement(stated, [view.camera for view in train]), **told}}
+        moved = displacement([stated[view.name] for view in train], [view.camera for view in train])
+        refined = {"poses": {**moved, **told}}
     wanted = renderers_to_measure(config.renderers, config.settings, renderer)
     renderers = through_renderers(scene, frames, wanted, split)
     return write_metrics(

@@ -390,8 +390,12 @@ class Run:
             raise ValueError(f"{self.path}: must be a folder, is a file; choose another")
         self.path.mkdir(parents=True, exist_ok=True)
         self._drop_partial_line()
-        write_json(self.path / "config.json", {"schema": SCHEMA, **config})
+        self.record(config)
         write_json(self.path / "env.json", {"schema": SCHEMA, **runtime.info()})
+
+    def record(self, config: dict) -> None:
+        """Write config.json, as `start` does; again where a fit finds out on the way what it has to say."""
+        write_json(self.path / "config.json", {"schema": SCHEMA, **config})
 
     def config(self) -> dict:
         """What `start` recorded.

@@ -42,6 +42,7 @@ from drgs.fitting.config import (
 from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
+from drgs.fitting.photographs import check_photographs, estimated_of, join, photographs_record
 from drgs.fitting.poses import CAMERAS, POSE_NETWORK
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
@@ -62,10 +63,7 @@ from drgs.machine import peak_memory
 if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
-    from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.parts import Parts
-    from drgs.fitting.poses import PoseEvidence
-    from drgs.fitting.skybox import SkyboxChoice
     from drgs.information.pool import Workers
 
 __all__ = [
@@ -176,7 +174,7 @@ def _fit(
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
-    _check_photographs(config, motion is not None)
+    check_photographs(config, motion is not None)
     plan = ActiveViews(train, config, motion is not None, workers) if selection else None
     if selection and selection.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
@@ -205,18 +203,18 @@ def _fit(
         config = trainer.config  # with the renderers that it began with
     else:
         views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
+        looks = plan is not None and parts is None and config.data.exposure != "off"
+        compared = plan.compared_points(dataset.points) if plan and looks else None
         trainer, source, exposure, evidence, choice = start(
-            dataset, views, frames, config, parts, taught, plan is not None, room, motion
+            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared
         )
+        if plan and exposure is not None:
+            plan.exposure = exposure.to_json(plan.names)
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
-    recorded |= _exposure_record(run, trainer, exposure)
-    recorded |= _poses_record(run, trainer, evidence)
-    recorded |= _skybox_record(run, trainer, choice)
+    recorded |= photographs_record(run, trainer, exposure, evidence, choice)
+    recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
     poses = trainer.parts.poses
-    estimated = [*(["exposure"] if trainer.parts.exposure else []), *(["pose"] if poses else [])]
-    if estimated:
-        recorded["estimated"] = estimated
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)
     if taught:
@@ -232,7 +230,8 @@ def _fit(
             trainer.scene(), held_out, config.settings, pictures=pictures, segmentation=shown, moving=moving
         )
 
-    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured)
+    joins = _Joins(dataset.points, recorded, parts is None) if plan else None
+    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured, joins)
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
             bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")
@@ -287,73 +286,6 @@ def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
     return {"skybox": {"gaussians": count, "visible": share}}
 
 
-def _check_photographs(config: FitConfig, moves: bool) -> None:
-    """Refuse what is modeled of single photographs where that is not built.
-
-    Raises:
-        NotImplementedError: With exposure, poses or a skybox where views are chosen on the way or things move, and with
-            transients where things move: these are found by what neighbors show of the same surface at rest.
-    """
-    if config.data.exposure != "off" and (config.selection or moves):
-        raise NotImplementedError(
-            f"fit: exposure must be off where views are chosen on the way or things move, got {config.data.exposure}; "
-            "leave --exposure out"
-        )
-    if config.data.poses != "fixed" and (config.selection or moves):
-        raise NotImplementedError(
-            f"fit: poses must be fixed where views are chosen on the way or things move, got {config.data.poses}; "
-            "leave --poses out"
-        )
-    if config.data.skybox == "on" and (config.selection or moves):
-        raise NotImplementedError(
-            "fit: skybox must be off or auto where views are chosen on the way or things move, got on; leave --skybox "
-            "out"
-        )
-    if config.loss.transients != "keep" and moves:
-        raise NotImplementedError(
-            f"fit: transients must be keep where things move, got {config.loss.transients}; leave --transients out, or "
-            "fit to what stands still (--dynamics ignore)"
-        )
-
-
-def _exposure_record(run: Run, trainer: Trainer, found: ExposureEstimate | None) -> dict[str, Any]:
-    """What config.json is to say of exposure.
-
-    Args:
-        run: The run folder; a fit that goes on keeps what was found at its start.
-        trainer: The fit.
-        found: What points said of it just now; None if they were not asked.
-    """
-    recorded: dict[str, Any] = {}
-    if found is not None:
-        recorded["exposure"] = found.to_json([frame.name for frame in trainer.frames])
-    elif trainer.config.data.exposure != "off" and (run.path / "config.json").is_file():
-        recorded |= {name: x for name, x in run.config().items() if name == "exposure"}
-    return recorded
-
-
-def _poses_record(run: Run, trainer: Trainer, found: PoseEvidence | None) -> dict[str, Any]:
-    """What config.json is to say of poses; arguments as of `_exposure_record`."""
-    refined = trainer.parts.poses is not None
-    if found is not None:
-        return {"poses": found.to_json(refined)}
-    if trainer.config.data.poses == "fixed":
-        return {}
-    # A fit that goes on, whose config.json may have been moved away.
-    before = run.config() if (run.path / "config.json").is_file() else {}
-    return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
-
-
-def _skybox_record(run: Run, trainer: Trainer, choice: SkyboxChoice | None) -> dict[str, Any]:
-    """What config.json is to say of a skybox: `choice` of a fit that begins, None of one that goes on."""
-    if choice is not None:
-        return {"skybox": choice.to_json(trainer.rows.skybox)}
-    # Its config.json may have been moved away, and one of before says nothing of fits that did not look.
-    before = run.config() if (run.path / "config.json").is_file() else {}
-    here = {"skybox": {"gaussians": trainer.rows.skybox, "reason": None}} if trainer.rows.skybox else {}
-    return {name: x for name, x in (here | before).items() if name == "skybox"}
-
-
 def _checkpoint(
     run: Run, plan: ActiveViews | None, taught: SemanticRecord | None
 ) -> tuple[dict[str, torch.Tensor], dict] | tuple[None, None]:
@@ -402,6 +334,21 @@ def _preview_name(step: int) -> str:
     return f"preview_{step:06d}.png"
 
 
+@dataclasses.dataclass(frozen=True)
+class _Joins:
+    """What photographs that join an active fit have to do with.
+
+    Attributes:
+        points: (P, 3) points of the data set; None where they are not read.
+        recorded: Contents of config.json, which changes where more is known of exposure.
+        looks: Whether photographs have unknowns that the config asks for: the parts are not the caller's own.
+    """
+
+    points: np.ndarray | None
+    recorded: dict[str, Any]
+    looks: bool
+
+
 class _Loop:
     """Steps, and the files that are due at them."""
 
@@ -415,6 +362,7 @@ class _Loop:
         plan: ActiveViews | None,
         taught: SemanticRecord | None,
         measured: Callable[[], dict],
+        joins: _Joins | None = None,
     ) -> None:
         self.run_folder = run
         self.trainer = trainer
@@ -424,6 +372,7 @@ class _Loop:
         self.plan = plan
         self.taught = taught
         self._measured = measured
+        self._joins = joins
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
@@ -499,7 +448,9 @@ class _Loop:
         """Choose one more view, and add its photograph and points to the fit."""
         trainer = self.trainer
         decoder: Any = trainer.network("decoder")
-        frame, record = plan.pick(trainer.scene(), trainer.frames, trainer.step_index, decoder)
+        seen, estimated = trainer.photographs(), estimated_of(trainer)
+        frame, record = plan.pick(trainer.scene(), seen, trainer.step_index, decoder, estimated)
+        self._join(plan, frame)
         if start := plan.new_start():
             trainer.restart(*start)
             record["points"] = len(start[0])
@@ -518,6 +469,23 @@ class _Loop:
             f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.timetable.add}, chosen "
             f"by {plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
         )
+
+    def _join(self, plan: ActiveViews, frame: Frame) -> None:
+        """Begin with what is unknown of a photograph that was picked, and record what was found."""
+        trainer, joins = self.trainer, self._joins
+        if joins is None or not joins.looks:
+            trainer.add_unknowns(frame)
+            return
+        found = join(trainer, plan, frame, joins.points)
+        if found is None:
+            return
+        used = trainer.parts.exposure is not None
+        told = {key: x for key, x in found.to_json(plan.names).items() if key != "gains"}
+        self.run_folder.log("exposure", step=trainer.step_index, **told, used=used)
+        joins.recorded["exposure"] = plan.exposure
+        if estimated := estimated_of(trainer):
+            joins.recorded["estimated"] = estimated
+        self.run_folder.record(joins.recorded)
 
     def _log(self, step: StepResult) -> None:
         """The events of a step, and every so often the averages of the last ones."""

@@ -13,7 +13,6 @@ from drgs.files import load_state
 from drgs.fitting.exposure import Exposure, estimate_exposure, exposure_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
-from drgs.train import SelectionConfig, fit
 
 
 def _photographs(gains, hidden=0.0, seed=0):
@@ -49,6 +48,24 @@ def test_known_gains_are_recovered(hidden):
     assert np.abs(found.log_gains.mean(axis=0)).max() < 1e-12
     assert found.is_clear
     assert found.spread == pytest.approx(logs.std(axis=0) / np.log(2), abs=0.02)
+
+
+def test_only_photographs_that_show_a_point_are_compared():
+    """Most points are behind something dark in one photograph, which then seems dark; where it is known who shows
+    which, nothing hides.
+    """
+    frames, points = _photographs(np.ones((6, 3)))
+    pixels, _ = frames[0].camera.project(points)
+    hidden = pixels[:, 0] > 120
+    frames[0].pixels[:, 117:] *= 0.6
+    assert 0.6 < hidden.mean() < 0.9
+    shown = np.ones((6, len(points)), bool)
+    shown[0, hidden] = False
+    fooled = estimate_exposure(frames, points)
+    assert fooled.log_gains[0].max() < -0.3
+    found = estimate_exposure(frames, points, shown=shown)
+    assert np.abs(found.log_gains).max() < 0.02
+    assert found.observations == pytest.approx(fooled.observations - hidden.sum(), abs=3)  # some were too dark
 
 
 def test_equal_photographs_have_no_clear_gains():
@@ -98,11 +115,3 @@ def test_a_fit_with_gains_goes_on(dataset, whole_and_resumed):  # noqa: F811
     exposures = [run.config()["exposure"] for run in runs]
     assert exposures[0] == exposures[1]
     assert [fit_record(run).estimated for run in runs] == [("exposure",)] * 2
-
-
-def test_chosen_views_have_no_gains(dataset, tmp_path):  # noqa: F811
-    """Photographs that come one by one are compared by nothing yet: refused before anything is written."""
-    chosen = config(exposure="points", selection=SelectionConfig(initial=2, add=1))
-    with pytest.raises(NotImplementedError, match="exposure must be off where views are chosen on the way"):
-        fit(dataset, tmp_path / "run", chosen, progress=False)
-    assert not (tmp_path / "run" / "config.json").exists()

@@ -8,7 +8,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from test_active import plan
 from test_train import config, dataset  # noqa: F401 (a fixture)
 
 import drgs
@@ -238,9 +237,3 @@ def test_poses_stay_where_nothing_says_they_are_off(dataset, tmp_path):  # noqa:
     states = [load_state(run.state)[0] for run in runs]
     assert all(torch.equal(x, states[1][name]) for name, x in states[0].items())
     assert not (runs[0].path / CAMERAS).exists()
-
-
-def test_active_fits_keep_their_poses(dataset, tmp_path):  # noqa: F811
-    """Poses and views that are chosen on the way are refused together."""
-    with pytest.raises(NotImplementedError, match="poses must be fixed where views are chosen on the way"):
-        fit(dataset, tmp_path / "run", config(poses="refined", selection=plan()), progress=False)

@@ -12,7 +12,7 @@ from drgs.data.formats import Format
 from drgs.data.guesses import scene_extent
 from drgs.data.llff import POSES_BOUNDS
 from drgs.data.multicamera import frame_folders
-from drgs.data.points import added_points, initial_points, triangulated_count, triangulated_points
+from drgs.data.points import added_points, initial_points, matched_points, triangulated_count, triangulated_points
 from drgs.data.replica import POSES
 from drgs.data.semantics import Semantics
 from drgs.data.sidecars import attach
@@ -30,6 +30,7 @@ __all__ = [
     "View",
     "added_points",
     "initial_points",
+    "matched_points",
     "load",
     "scene_extent",
     "triangulated_count",

@@ -24,7 +24,14 @@ from drgs.display.progress import Bar
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.ply_headers import ply_source
 
-__all__ = ["added_points", "initial_points", "read_point_ply", "triangulated_count", "triangulated_points"]
+__all__ = [
+    "added_points",
+    "initial_points",
+    "matched_points",
+    "read_point_ply",
+    "triangulated_count",
+    "triangulated_points",
+]
 
 _MIN_TRIANGULATED = 50
 _ENOUGH = 2_000  # triangulated points that need no others beside them
@@ -122,6 +129,16 @@ def triangulated_points(
     keep = subset(found, max_points - guesses, rng)
     more, more_colors = points_beside(views, points, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
+
+
+def matched_points(
+    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 3) points that two or more of V views show, as far as they are triangulated, and (V, P) bool of which show
+    which; arguments as of `triangulated_points`.
+    """
+    points, _, shown = _triangulated(views, matches, progress)
+    return points, shown
 
 
 def triangulated_count(

@@ -6,6 +6,9 @@ The camera file gives the poses and image sizes of all candidates. Nothing else 
 not its pixels, mask, depth or size on disk, no points or observations that it took part in; the extent of the scene
 and the initial points come from the initial views. (`--init-points all`, the rule of [1], breaks this and says so.)
 
+What is unknown of a photograph besides the scene, its exposure and its pose, begins when it joins; until then it is
+eliminated from what the view would tell (`drgs.information.complement`).
+
 Reference:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771.
 """
@@ -61,6 +64,7 @@ class ActiveViews:
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
         measured: One record for each number of views at which the held-out views were measured on the way.
+        exposure: What the last look at exposure found, as config.json has it; None where the fit does not look.
         pool_leak: Whether initial points have seen views that were not picked.
     """
 
@@ -106,6 +110,7 @@ class ActiveViews:
         self.chosen = list(self.timetable.start)
         self.picks = list[dict]()
         self.measured = list[dict]()
+        self.exposure: dict | None = None
         self.pool_leak = config.data.init_points == "all"
         # Photographs of another time do not say where things are at this one.
         wanted = not self.pool_leak and self.timetable.schedule == "views"
@@ -195,6 +200,39 @@ class ActiveViews:
             return nothing
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
 
+    def compared_points(self, given: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Points by which the photographs seen so far are compared: of the data set, if the fit begins with these, of
+        depth maps, or those that are triangulated with the photographs.
+
+        Args:
+            given: (P, 3) points of the data set; None where it has none, or they are not read.
+        Returns:
+            (P, 3) points and, of those that are triangulated, which of the V photographs show which, (V, P) bool; else
+            None.
+        """
+        from drgs.data import initial_points, matched_points
+
+        if self.pool_leak and given is not None:
+            return given, None
+        seen = [self.views[i] for i in self.chosen]
+        with Bar("points of all views") as bar:
+            if any(view.depth_path is not None for view in seen):
+                most = self._config.density.max_gaussians
+                return initial_points(seen, self._config.seed, most, bar.stage)[0], None
+            if len(seen) < 2:
+                return np.empty((0, 3)), None
+            self._count_start(bar)  # before there are more pictures
+            return matched_points(seen, self._matches, bar.stage)
+
+    def _count_start(self, bar: Bar) -> int:
+        """How many points are triangulated with the initial views alone; what is matched here is kept."""
+        from drgs.data import triangulated_count
+
+        if self._began is None:
+            start = [self.views[i] for i in self.chosen[: len(self.timetable.start)]]
+            self._began = triangulated_count(start, self._matches, bar.stage) if len(start) > 1 else 0
+        return self._began
+
     def new_start(self) -> tuple[torch.Tensor, torch.Tensor] | None:
         """(P, 3) points and (P, 3) colors to begin the fit again with, as all views seen so far show them together;
         None where it goes on.
@@ -211,11 +249,9 @@ class ActiveViews:
             return None
         seed = self._config.seed + len(self.picks)
         room = self._config.density.max_gaussians - self.reserved
-        began = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), self._began)
+        last = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), None)
         with Bar("points of all views") as bar:
-            if began is None:  # the first call: what is matched here is kept for the next one
-                start = seen[: len(self.timetable.start)]
-                began = self._began = triangulated_count(start, self._matches, bar.stage) if len(start) > 1 else 0
+            began = self._count_start(bar) if last is None else last
             if restart == "auto" and began >= _SURE:  # it goes on: nobody needs the points
                 found = triangulated_count(seen, self._matches, bar.stage)
                 self.picks[-1] |= {"triangulated": found, "restarted": False}
@@ -343,6 +379,7 @@ class ActiveViews:
         picks = [{name: x for name, x in pick.items() if name != "seconds"} for pick in self.picks]
         header = {"pool": [view.name for view in self.views], "picks": picks}
         header |= {"measured": self.measured}
+        header |= {} if self.exposure is None else {"exposure": self.exposure}
         return {"policy_rng": self._generator.get_state()}, {"active": header}
 
     def restore(self, tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
@@ -369,6 +406,7 @@ class ActiveViews:
             )
         self.picks = old["picks"]
         self.measured = old.get("measured", [])
+        self.exposure = old.get("exposure")
         self.chosen = self.chosen[: len(self.timetable.start)] + [pick["index"] for pick in self.picks]
         self._generator.set_state(tensors["policy_rng"])
 

@@ -49,12 +49,14 @@ class ExposureEstimate:
         errors: (V, 3) their standard errors.
         observations: How many colors of points were compared.
         components: Sets of photographs that share points; each is centered by itself, for nothing compares them.
+        labels: (V,) int64, the set of each photograph: the index of its first one.
     """
 
     log_gains: np.ndarray
     errors: np.ndarray
     observations: int
     components: int
+    labels: np.ndarray
 
     @property
     def spread(self) -> tuple[float, float, float]:
@@ -92,7 +94,9 @@ class ExposureEstimate:
         return _three(np.sqrt(np.square(self.errors).mean(axis=0)) / math.log(2))
 
 
-def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) -> ExposureEstimate:
+def estimate_exposure(
+    frames: list[Frame], points: np.ndarray, seed: int = 0, shown: np.ndarray | None = None
+) -> ExposureEstimate:
     """Gains of photographs from points of the scene, in closed form under robust weights.
 
     The colors of points are eliminated from the normal equations of each channel, so that V unknowns are left, whose
@@ -102,11 +106,16 @@ def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) ->
         frames: V photographs with their cameras; nothing outside of masks is looked at.
         points: (P, 3) world points, of which as many are drawn as memory has room for.
         seed: Seed of this draw.
+        shown: (V, P) bool, which photographs were found to show which points; None: nobody knows, and every photograph
+            into which a point is projected may.
     """
     most = max(1, _MOST // max(1, len(frames)))
     if len(points) > most:
-        points = points[np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))]
+        kept = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
+        points, shown = points[kept], None if shown is None else shown[:, kept]
     logs, there = _observed(frames, points)
+    if shown is not None:
+        there &= shown[:, :, None]
     shared = there.any(axis=2)
     there &= (shared.sum(axis=0) >= 2)[None, :, None]  # a point that one photograph shows compares nothing
     robust = there.any(axis=2).astype(np.float64)
@@ -131,7 +140,7 @@ def estimate_exposure(frames: list[Frame], points: np.ndarray, seed: int = 0) ->
             robust = seen * np.minimum(1, _HUBER * noise / np.maximum(size, 1e-12))  # a residual may be 0
         else:
             robust = seen * np.square(np.maximum(0, 1 - np.square(size / (_TUKEY * noise))))
-    return ExposureEstimate(gains, errors, observations, len(np.unique(label)))
+    return ExposureEstimate(gains, errors, observations, len(np.unique(label)), label)
 
 
 class Exposure(torch.nn.Module):
@@ -150,6 +159,7 @@ class Exposure(torch.nn.Module):
         """
         super().__init__()
         self._rows = {name: row for row, name in enumerate(names)}
+        self._learned = learned
         start = torch.tensor(log_gains, dtype=torch.float32)
         self.log_gains = torch.nn.Parameter(start, requires_grad=learned)
 
@@ -157,6 +167,36 @@ class Exposure(torch.nn.Module):
         """The output as its photograph shows it; gradients reach both."""
         gain = self.log_gains[self._rows[frame.name]].exp().to(output.rgb.device)
         return dataclasses.replace(output, rgb=output.rgb * gain)
+
+    def join(self, names: list[str], estimate: ExposureEstimate) -> torch.Tensor:
+        """Go on with photographs that have been joined by others, each with a gain of its own.
+
+        Gains that points tell are those of the new estimate, which has seen more of them. Learned ones stay, and new
+        ones stand to them as the estimate says: their log gain is the estimate's, plus what was learned beyond it, on
+        average over the photographs of the same set; 0 where there is none. Then all have zero mean again.
+
+        Args:
+            names: V names, those that were there first.
+            estimate: What points say of all of them.
+        Returns:
+            (3,) float32, by how much the log gains of those that were there have grown, on average: the scene's colors
+            are to be divided by this, so that these look as before.
+        """
+        before = self.log_gains.detach()  # values, which go on in a parameter with more rows
+        told = torch.tensor(estimate.log_gains, dtype=torch.float32)
+        labels = torch.from_numpy(estimate.labels)
+        old = len(before)
+        after = told.clone()
+        if self._learned:
+            beyond = before - told[:old]
+            after[:old] = before
+            for row in range(old, len(told)):
+                mine = labels[:old] == labels[row]
+                after[row] = told[row] + beyond[mine].mean(dim=0) if mine.any() else 0.0
+            after -= after.mean(dim=0)
+        self._rows = {name: row for row, name in enumerate(names)}
+        self.log_gains = torch.nn.Parameter(after, requires_grad=self._learned)
+        return (after[:old] - before).mean(dim=0)
 
     def center(self) -> None:
         """Give the log gains zero mean over the photographs: gain 1, which viewers show, is the mean exposure."""

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import torch
 
 __all__ = ["Network", "Rate", "rate_at", "saved_networks"]
+
+_T = TypeVar("_T")
 
 Rate = float | Callable[[float], float]
 """A learning rate, or what gives it from the fraction of the fit that is done."""
@@ -45,9 +48,10 @@ class Network:
         self.module = module
         self.rate = rate
         self.constraint = constraint
+        self._factors = factors or {}
         groups: dict[float, list] = {}
         for key, x in module.named_parameters():
-            groups.setdefault((factors or {}).get(key, 1.0), []).append(x)
+            groups.setdefault(self._factors.get(key, 1.0), []).append(x)
         self.optimizer = torch.optim.Adam(
             [{"params": listed, "factor": factor} for factor, listed in groups.items()],
             lr=rate_at(rate, 0.0),
@@ -63,6 +67,36 @@ class Network:
         """Restore what must hold after a step, unless its rate was 0."""
         if self.constraint is not None and any(group["lr"] for group in self.optimizer.param_groups):
             self.constraint()
+
+    def extend(self, change: Callable[[], _T]) -> _T:
+        """Let the module get parameters more, or parameters with more rows, between two steps of its optimizer.
+
+        What was there keeps its moments, and those of what is new are 0, as if its gradient had been 0 until now.
+
+        Args:
+            change: Called once. A parameter that it replaces by another has the same rows first.
+        Returns:
+            What `change` returns.
+        """
+        before = dict(self.module.named_parameters())
+        result = change()
+        for key, x in self.module.named_parameters():
+            was = before.get(key)
+            if was is x:
+                continue
+            factor = self._factors.get(key, 1.0)
+            group = next(group for group in self.optimizer.param_groups if group["factor"] == factor)
+            if was is None:
+                group["params"].append(x)
+                continue
+            group["params"] = [x if y is was else y for y in group["params"]]
+            moments = self.optimizer.state.pop(was, {})
+            for moment, value in moments.items():
+                if value.shape == was.shape:  # else it is the count of steps
+                    moments[moment] = torch.cat([value, value.new_zeros(len(x) - len(was), *x.shape[1:])])
+            if moments:
+                self.optimizer.state[x] = moments
+        return result
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that a checkpoint needs, by name; a tensor that has several names is copied under each of them."""

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses", "with_skybox"]
 
+_BEFORE = ("decoder",)  # networks that come before the gains of photographs
+
 
 @dataclasses.dataclass(frozen=True)
 class Parts:
@@ -107,7 +109,10 @@ def with_exposure(
     network = exposure_network(
         frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
     )
-    return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
+    # At one place whenever they come: the networks of a checkpoint have an order.
+    first = [other for other in parts.networks if other.name in _BEFORE]
+    rest = [other for other in parts.networks if other.name not in _BEFORE]
+    return dataclasses.replace(parts, networks=[*first, network, *rest], exposure=network.module)
 
 
 def with_skybox(parts: Parts, count: int) -> Parts:

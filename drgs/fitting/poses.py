@@ -146,9 +146,13 @@ class Poses(torch.nn.Module):
         self.register_buffer("whitening", torch.zeros(len(cameras), 6, 6, dtype=torch.float64))
         self.register_buffer("shifts", torch.zeros(len(cameras), 6, 6, dtype=torch.float64))
         self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
-        centers = torch.tensor(np.stack([camera.c2w[:3, 3] for camera in cameras]))
-        self._twist_of = torch.stack([_twist_of_u(center, extent) for center in centers])
-        self._common = _common_motions(centers, extent)
+        self._place()
+
+    def _place(self) -> None:
+        """What follows from where the cameras of all photographs are stated to be."""
+        centers = torch.tensor(np.stack([camera.c2w[:3, 3] for camera in self._cameras]))
+        self._twist_of = torch.stack([_twist_of_u(center, self._extent) for center in centers])
+        self._common = _common_motions(centers, self._extent)
 
     @property
     def has_begun(self) -> bool:
@@ -162,22 +166,50 @@ class Poses(torch.nn.Module):
             gaussians: The Gaussians.
             skybox: How many of the first are far away: where a camera stands makes no difference to how they look.
         """
+        with Bar("information about poses", len(self._cameras)) as bar:
+            for row in range(len(self._cameras)):
+                self._look(row, gaussians, skybox)
+                bar.advance()
+
+    def _look(self, row: int, gaussians: Gaussians, skybox: int) -> None:
+        """W of a photograph, and what its pose moves its picture by; arguments as of `begin`."""
+        camera = self._cameras[row]
         # A metric of steps, not part of the loss.
         means = gaussians.means[skybox:].detach().cpu().double()
         opacities = gaussians.logit_opacities[skybox:].detach().cpu().double().sigmoid()
-        with Bar("information about poses", len(self._cameras)) as bar:
-            for row, camera in enumerate(self._cameras):
-                tangents = {"camera": self._twist_of[row].T.contiguous()}
-                small = at_most(camera, _PIXELS)
-                changes = render_jvp(gaussians, small, tangents, self._settings, outputs=()).rgb.double().reshape(6, -1)
-                information = changes @ changes.T / changes.shape[1]
-                damping = _DAMPING * information.trace() / 6 + _LEAST
-                lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
-                self.whitening[row] = torch.linalg.inv(lower).T
-                moved, weights = _moved(means, opacities, camera, self._extent)
-                moved = moved @ self._twist_of[row]
-                self.shifts[row] = torch.einsum("n,nki,nkj->ij", weights, moved, moved) / weights.sum()
-                bar.advance()
+        tangents = {"camera": self._twist_of[row].T.contiguous()}
+        small = at_most(camera, _PIXELS)
+        changes = render_jvp(gaussians, small, tangents, self._settings, outputs=()).rgb.double().reshape(6, -1)
+        information = changes @ changes.T / changes.shape[1]
+        damping = _DAMPING * information.trace() / 6 + _LEAST
+        lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
+        self.whitening[row] = torch.linalg.inv(lower).T
+        moved, weights = _moved(means, opacities, camera, self._extent)
+        moved = moved @ self._twist_of[row]
+        self.shifts[row] = torch.einsum("n,nki,nkj->ij", weights, moved, moved) / weights.sum()
+
+    def join(self, camera: Camera, gaussians: Gaussians, skybox: int = 0) -> None:
+        """One photograph more, whose pose is as stated until it is fitted.
+
+        The gauge is held over it, too, from now on. That moves no camera: the tangents of all cameras, restricted to
+        those that were there, span what theirs do, and the newcomer's u is 0.
+
+        Args:
+            camera: Its pinhole camera, named as it.
+            gaussians: The Gaussians, which are looked at only once refinement has begun.
+            skybox: How many of the first are far away, as of `begin`.
+        """
+        begun = self.has_begun
+        row = len(self.names)
+        self.names.append(camera.name)
+        self._rows[camera.name] = row
+        self._cameras.append(camera)
+        self.coordinates.append(torch.nn.Parameter(torch.zeros(6, dtype=torch.float64)))
+        nothing = torch.zeros(1, 6, 6, dtype=torch.float64)
+        self.whitening, self.shifts = torch.cat([self.whitening, nothing]), torch.cat([self.shifts, nothing])
+        self._place()
+        if begun:
+            self._look(row, gaussians, skybox)
 
     def forward(self, frame: Frame) -> Frame:
         """The photograph with its camera as it is now; gradients reach its pose."""

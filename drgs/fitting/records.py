@@ -56,7 +56,7 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _CONFIG = {"data": str, "train": [str], "test": [str], "fit": {"settings": dict}}
-_OPTIONAL = {"times": [float], "estimated": [str], "poses": {"refined": bool}}
+_OPTIONAL = {"times": [float], "estimated": [str], "poses": {"refined": bool}, "pool": [str]}
 _VIEW = {"index": int, "name": str}
 _HEADER = {
     "step": int,
@@ -359,7 +359,8 @@ def _refined_poses(run: Run, config: dict, advice: str) -> dict[str, np.ndarray]
             raise FileNotFoundError(f"{path}: must hold the cameras that the fit has refined, found none; {advice}")
         return {}
     poses = {camera.name: camera.w2c for camera in load_cameras_json(path)}
-    if set(poses) != set(config["train"]):
+    # In an active fit photographs of the pool have joined those that it began with.
+    if not set(config["train"]) <= set(poses) <= set(config.get("pool", config["train"])):
         raise ValueError(f"{path}: must hold the {len(config['train'])} training photographs, does not; {advice}")
     return poses
 
@@ -395,7 +396,10 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
             or has another shape than the number of Gaussians asks for, or a network has no tensor.
     """
     advice = "restore the file, or fit again in another folder"
-    kind = _HEADER | ({"active": _ACTIVE} if header.get("active") is not None else {})
+    kind = dict(_HEADER)
+    if header.get("active") is not None:
+        found = isinstance(header["active"], dict) and "exposure" in header["active"]
+        kind |= {"active": _ACTIVE | ({"exposure": dict} if found else {})}
     kind |= {"networks": [str]} if "networks" in header else {}
     kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
     kind |= {"transients": bool} if "transients" in header else {}

@@ -104,6 +104,15 @@ class GaussianRows:
         self.tensors, self.optimizer = whole.tensors, whole.optimizer
         self.skybox = len(rows["means"])
 
+    def scale_colors(self, factors: torch.Tensor) -> None:
+        """Multiply the colors that directions see by (3,) factors of R, G and B; moments stay.
+
+        A color is 0.5 plus the sum of its SH.
+        """
+        with torch.no_grad():  # leaves are changed in place
+            self.tensors["sh_dc"].mul_(factors).add_((factors - 1) * (0.5 / Y_00))
+            self.tensors["sh_rest"].mul_(factors)
+
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Add Gaussians with zero moments; in tensors that `rows` lacks, their rows are 0."""
         count = len(rows["means"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from drgs.data import initial_points, scene_extent
@@ -99,11 +100,14 @@ def start(
     strict: bool,
     reserved: int,
     motion: Motion | None = None,
+    compared: tuple[np.ndarray, np.ndarray | None] | None = None,
 ) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, SkyboxChoice]:
     """A trainer at step 0, where its points come from, what is known of exposure and poses, where asked for, and
     whether Gaussians begin far away.
 
-    Points come, by default, if `strict`, only from `views`.
+    Points come, by default, if `strict`, only from `views`; then nothing is known of observations, either, and exposure
+    is looked at again with every photograph that joins. `compared` are the points by which it is, as of
+    `ActiveViews.compared_points`; default the initial points.
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
@@ -138,9 +142,11 @@ def start(
         from drgs.fitting.exposure import estimate_exposure
 
         with Bar("exposure") as bar:
-            found = estimate_exposure(frames, points, config.seed)
+            by, shown = (points, None) if compared is None else compared
+            found = estimate_exposure(frames, by, config.seed, shown)
             is_on = config.data.exposure != "auto" or found.is_clear
-            bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else 'off, all have the same'}")
+            now = " for now" if strict else ""
+            bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else f'off, all have the same{now}'}")
         if is_on:
             made = with_exposure(made, frames, config, found)
     evidence = None
@@ -148,7 +154,8 @@ def start(
         from drgs.fitting.poses import PoseEvidence
 
         with Bar("poses") as bar:
-            evidence = PoseEvidence.of(dataset.reprojection, frames)
+            all_seen = not strict or config.data.init_points == "all"
+            evidence = PoseEvidence.of(dataset.reprojection if all_seen else None, frames)
             is_on = config.data.poses == "refined" or evidence.is_clear
             bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
         if is_on:

@@ -7,6 +7,7 @@ of random order. What moves is fitted in two stages (dynamics.py). `drgs.train` 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -15,10 +16,11 @@ import torch
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.density import add_gaussians, explore, relocate
+from drgs.fitting.exposure import Exposure
 from drgs.fitting.filter_3d import VARIANCES
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
-from drgs.fitting.parts import Parts, means_rate, parts_of, with_skybox
+from drgs.fitting.parts import Parts, means_rate, parts_of, with_exposure, with_skybox
 from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.resolution import Resolution
@@ -30,6 +32,7 @@ from drgs.integrator import render
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.fitting.dynamics import Motion
+    from drgs.fitting.exposure import ExposureEstimate
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
@@ -148,6 +151,32 @@ class Trainer:
             self.rows.raise_sh_degree()
         self._start_count = len(self.rows)
         self._sample()
+
+    def add_unknowns(self, frame: Frame, estimate: ExposureEstimate | None = None) -> None:
+        """Begin with what is unknown of a photograph that is about to be added, besides the scene.
+
+        The scene's colors change by what the gauge of the gains does, so that the other photographs look as before.
+
+        Args:
+            frame: The photograph; it gets a pose where the others have.
+            estimate: What points say of the gains of all photographs, of this one last. From now on each has its own;
+                None: all have the same.
+        """
+        poses = self.parts.poses
+        if poses is not None:
+            for network in self.parts.networks:
+                if network.module is poses:
+                    network.extend(lambda: poses.join(frame.camera, self.gaussians(), self.rows.skybox))
+        if estimate is None:
+            return
+        if self.parts.exposure is None:
+            self.parts = with_exposure(self.parts, self.frames, self.config)
+        names = [frame.name for frame in (*self.frames, frame)]
+        for network in self.parts.networks:
+            gains = network.module
+            if isinstance(gains, Exposure):
+                grown = network.extend(functools.partial(gains.join, names, estimate))
+                self.rows.scale_colors((-grown).exp())
 
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
