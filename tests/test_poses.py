@@ -11,7 +11,7 @@ import torch
 from test_train import config, dataset  # noqa: F401 (a fixture)
 
 import drgs
-from drgs.cameras import orbit
+from drgs.cameras import Camera, intrinsics, look_at, orbit
 from drgs.data.camera_lists import load_cameras_json
 from drgs.files import Run, load_state
 from drgs.fitting.frames import Frame
@@ -173,6 +173,23 @@ def test_a_camera_is_refined_against_its_photograph(photographs):
     assert right[1] < 0.05 * wrong[1]
     stays = refined_against(g, dataclasses.replace(frames[0], camera=true[0]), FAST)
     assert max(apart(stays, true[0])) < 1e-4
+
+
+def test_a_camera_is_refined_only_as_far_as_a_linear_model_holds(photographs):
+    """One round Gaussian says next to nothing about turns around it: steps that would turn by many radians are none."""
+    _, frames, _ = photographs
+    camera = Camera(intrinsics(20.0, 20.0, 8.0, 8.0), look_at((0, 0, -3), (1e-7, 0, 0), (0, -1, 0)), 16, 16)
+    alone = drgs.Gaussians.from_arrays(
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), 0.3),
+        torch.tensor([0.9]),
+        torch.ones(1, 1, 3),
+    )
+    pixels = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+    frame = dataclasses.replace(frames[0], camera=camera, pixels=(255 * pixels).to(frames[0].pixels.dtype), mask=None)
+    found = refined_against(alone, frame, FAST)
+    assert apart(found, camera)[0] < 90
 
 
 def test_stated_poses_until_it_begins(photographs):

@@ -67,6 +67,7 @@ _NEAR = 0.25  # of the median depth: what is nearer may be a floater, whose shif
 _LEAST = 1e-4  # of H: a picture of nothing has no information, and its first step would be without measure
 _UNKNOWN = 2.0  # pixels of the fit, where a data set says nothing about its poses
 _AGAINST = 12  # steps at most of a camera that is refined against one photograph
+_TURN = 0.5  # radians of such a step at most: what is farther is no longer linear
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,7 +311,7 @@ def refined_against(scene: Scene, frame: Frame, settings: RenderSettings) -> Cam
     """The camera of a photograph, refined against it by Gauss-Newton's steps with the scene as it is.
 
     For measuring only: what a held-out view shows apart from the error of its pose. A step that does not lower the
-    squared error is tried again with more damping (Levenberg).
+    squared error, or turns the camera too far for a linear model, is tried again with more damping (Levenberg).
 
     Args:
         scene: What is shown.
@@ -327,6 +328,9 @@ def refined_against(scene: Scene, frame: Frame, settings: RenderSettings) -> Cam
         information = rows @ rows.T
         scaled = information + damping * information.diagonal().diag() + 1e-12 * torch.eye(6, dtype=torch.float64)
         u = torch.linalg.solve(scaled, rows @ left)
+        if float(u[:3].norm()) > _TURN:
+            damping *= 10
+            continue
         w2c = torch.tensor(camera.w2c) @ motion(-(twist_of @ u))
         moved = dataclasses.replace(camera, w2c=w2c.numpy())
         now, rest = _difference(scene, frame, moved, settings)
