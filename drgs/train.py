@@ -483,6 +483,7 @@ class _Loop:
         told = {key: x for key, x in found.to_json(plan.names).items() if key != "gains"}
         self.run_folder.log("exposure", step=trainer.step_index, **told, used=used)
         joins.recorded["exposure"] = plan.exposure
+        joins.recorded.pop("estimated", None)
         if estimated := estimated_of(trainer):
             joins.recorded["estimated"] = estimated
         self.run_folder.record(joins.recorded)

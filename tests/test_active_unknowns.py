@@ -329,6 +329,38 @@ def test_auto_begins_when_a_photograph_differs(even, tmp_path, capsys):
     same_run(tmp_path / "run", tmp_path / "again")
 
 
+def test_auto_ends_when_more_photographs_say_otherwise(even, tmp_path, monkeypatch, capsys):
+    """What the first few points said is taken back: gains and their network go, and nothing is eliminated any more;
+    resumed after that, the fit ends in the same bits.
+    """
+    import drgs.fitting.exposure
+    import drgs.fitting.photographs
+
+    true = drgs.fitting.exposure.estimate_exposure
+
+    def fooled(frames, *rest, **options):
+        found = true(frames, *rest, **options)
+        if len(frames) > 3:
+            return found
+        logs = np.linspace(-0.2, 0.2, len(frames))[:, None] * np.ones(3)
+        return dataclasses.replace(found, log_gains=logs)
+
+    monkeypatch.setattr(drgs.fitting.exposure, "estimate_exposure", fooled)
+    monkeypatch.setattr(drgs.fitting.photographs, "estimate_exposure", fooled)
+    settings = config(exposure="auto", deterministic=True, selection=plan(policy="fisher", add=3))
+    fit(lazily(even), tmp_path / "run", settings, progress=True)
+    assert [event["used"] for event in events(tmp_path / "run", "exposure")] == [True, False, False]
+    told = capsys.readouterr().err
+    assert "each has its own for now" in told
+    assert "off, all have the same from step 8 on" in told
+    picks = json.loads((tmp_path / "run" / "selection.json").read_text())["picks"]
+    assert ["nuisances" in pick for pick in picks] == [True, True, False]
+    assert "estimated" not in Run(tmp_path / "run").config()
+    assert "networks" not in load_state(tmp_path / "run" / "state.safetensors")[1]
+    stopped(even, tmp_path / "again", settings, 10)
+    same_run(tmp_path / "run", tmp_path / "again")
+
+
 def stopped(folder, run, settings, at):
     """The fit, killed before a step, then resumed."""
     whole = Trainer.step

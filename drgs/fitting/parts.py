@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drgs.fitting.poses import Poses
     from drgs.integrator import Output
 
-__all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses", "with_skybox"]
+__all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses", "with_skybox", "without_exposure"]
 
 _BEFORE = ("decoder",)  # networks that come before the gains of photographs
 
@@ -113,6 +113,12 @@ def with_exposure(
     first = [other for other in parts.networks if other.name in _BEFORE]
     rest = [other for other in parts.networks if other.name not in _BEFORE]
     return dataclasses.replace(parts, networks=[*first, network, *rest], exposure=network.module)
+
+
+def without_exposure(parts: Parts) -> Parts:
+    """The parts with one exposure for all photographs."""
+    networks = [network for network in parts.networks if network.module is not parts.exposure]
+    return dataclasses.replace(parts, networks=networks, exposure=None)
 
 
 def with_skybox(parts: Parts, count: int) -> Parts:

@@ -75,10 +75,13 @@ def join(trainer: Trainer, plan: ActiveViews, frame: Frame, given: np.ndarray | 
     with Bar("exposure") as bar:
         points, shown = plan.compared_points(given)
         found = estimate_exposure(frames, points, trainer.config.seed, shown)
-        was_on = trainer.parts.exposure is not None
-        is_on = was_on or use != "auto" or found.is_clear
-        if is_on and not was_on:
-            bar.note(f"exposure: {found.words()}; each has its own from step {trainer.step_index} on")
+        # A few points of the first photographs may have said something else than all of them do.
+        is_on = use != "auto" or found.is_clear
+        if is_on != (trainer.parts.exposure is not None):
+            now = "each has its own" if is_on else "off, all have the same"
+            bar.note(f"exposure: {found.words()}; {now} from step {trainer.step_index} on")
+    if not is_on:
+        trainer.drop_exposure()
     trainer.add_unknowns(frame, found if is_on else None)
     plan.exposure = found.to_json([frame.name for frame in frames])
     return found

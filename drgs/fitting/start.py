@@ -145,8 +145,9 @@ def start(
             by, shown = (points, None) if compared is None else compared
             found = estimate_exposure(frames, by, config.seed, shown)
             is_on = config.data.exposure != "auto" or found.is_clear
-            now = " for now" if strict else ""
-            bar.note(f"exposure: {found.words()}; {'each has its own' if is_on else f'off, all have the same{now}'}")
+            said = "each has its own" if is_on else "off, all have the same"
+            now = " for now" if strict and config.data.exposure == "auto" else ""
+            bar.note(f"exposure: {found.words()}; {said}{now}")
         if is_on:
             made = with_exposure(made, frames, config, found)
     evidence = None

@@ -20,7 +20,7 @@ from drgs.fitting.exposure import Exposure
 from drgs.fitting.filter_3d import VARIANCES
 from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import rate_at
-from drgs.fitting.parts import Parts, means_rate, parts_of, with_exposure, with_skybox
+from drgs.fitting.parts import Parts, means_rate, parts_of, with_exposure, with_skybox, without_exposure
 from drgs.fitting.poses import is_due
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.resolution import Resolution
@@ -160,7 +160,7 @@ class Trainer:
         Args:
             frame: The photograph; it gets a pose where the others have.
             estimate: What points say of the gains of all photographs, of this one last. From now on each has its own;
-                None: all have the same.
+                None: nothing is said of gains.
         """
         poses = self.parts.poses
         if poses is not None:
@@ -177,6 +177,11 @@ class Trainer:
             if isinstance(gains, Exposure):
                 grown = network.extend(functools.partial(gains.join, names, estimate))
                 self.rows.scale_colors((-grown).exp())
+
+    def drop_exposure(self) -> None:
+        """From now on all photographs have the same gain; that of theirs was 1 on average, so that colors stay."""
+        if self.parts.exposure is not None:
+            self.parts = without_exposure(self.parts)
 
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
