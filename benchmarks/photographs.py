@@ -13,6 +13,7 @@ a split of their own. One thread.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import statistics
 import sys
@@ -80,7 +81,9 @@ def table(found: list[dict]) -> str:
     compared = {_unit(row) for row in found if row["term"]}
     found = [row for row in found if _unit(row) in compared]
     by_unit = {(*_unit(row), row["term"]): row for row in found}
-    for scene, term in dict.fromkeys((row["scene"], row["term"]) for row in found):
+    scenes = list(dict.fromkeys(row["scene"] for row in found))
+    terms = list(dict.fromkeys(row["term"] for row in found))
+    for scene, term in itertools.product(scenes, terms):
         mine = [row for row in found if (row["scene"], row["term"]) == (scene, term)]
         pairs = [(row, by_unit[*_unit(row), ""]) for row in mine if (*_unit(row), "") in by_unit]
         if not pairs:
