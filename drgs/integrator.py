@@ -60,7 +60,7 @@ def render(
         An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
         ValueError: If a parameter is not finite, an output is unknown, or cameras differ in size.
-        NotImplementedError: If tiles are asked for with a camera that is no pinhole.
+        NotImplementedError: If a model of the image plane (`ewa`) is asked for with a camera that has distortion.
     Gradients:
         Of rgb, alpha, depth and features, with respect to means, quats, log_scales, logit_opacities, sh, features and
         the pose, in reverse mode (`backward`, `torch.func.grad`) and forward mode (`torch.func.jvp`,

@@ -17,8 +17,9 @@ from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.composite import Arguments, Composite, Compositor, compositor_of
+from drgs.tracing.lens_rays import lens_of
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
-from drgs.tracing.tiles import TileTraversal
+from drgs.tracing.tiles import TILE, TileTraversal
 from drgs.tracing.walk import Traversal
 
 __all__ = ["OF_VIEW", "Call", "Output", "numbers"]
@@ -89,10 +90,11 @@ class Call:
         self.want = want
         must_be("render", "couple_features", couple, bool, "True or False")
         self.couple = couple
-        if settings.traversal == "tiles" and camera.is_distorted:
+        if settings.planar and camera.is_distorted:
             raise NotImplementedError(
-                f"render: traversal='tiles' must have a pinhole camera, got model {camera.model!r} with distortion; "
-                "use traversal='bvh' (true rays) or camera.undistorted()"
+                f"render: response={settings.response!r} is a model of a pinhole's image plane, got a camera of model "
+                f"{camera.model!r} with distortion; use camera.undistorted(), or a response along rays "
+                "(--preset exact, fast or 3dgut)"
             )
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
         self._check_memory(gaussians, rays)
@@ -190,10 +192,11 @@ class Call:
             K = self.camera.K
             size = (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
-            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients)
+            lens = lens_of(lib, self.camera, TILE)
+            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients, lens)
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
             trimmed = not self.want & {"depth", "count"}
-            traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed)
+            traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed, lens)
         rays = self._column(p, "ray_origins"), self._column(p, "ray_directions")
         return compositor_of(
             lib, s, traversal, p, self.coefficients, *rays, want=self.want, width=self.width, couple=self.couple
