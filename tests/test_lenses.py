@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
+import dense_jacobian as dense
+import numpy as np
 import pytest
 import torch
-from scenes_random import Oracle, around_camera, camera, compare, gaussians
+from scenes_random import Oracle, around_camera, camera, compare, gaussians, relative
 from test_integrator import check
 from test_tiles import listed_gaussians
 
-from drgs import reference
+from drgs import fisher, reference, render, render_jvp, runtime
 from drgs.cameras import Camera
 from drgs.settings import RenderSettings
+from drgs.tracing.lens_rays import lens_of
 from drgs.tracing.tiles import TILE
 
 # Name -> model, coefficients, focal length as a multiple of what the pinhole of the same scene has.
@@ -100,3 +104,156 @@ def test_images_and_derivatives(rng, name, fields):
         # Of `integral` the oracle counts what lies behind the ray's origin, below the tails that the extent leaves out.
         assert errors.count <= 1 or settings.response == "integral"
         assert float((~oracle.good).double().mean()) < 0.1
+
+
+INFORMED = [
+    ("barrel", "peak", "ray"),
+    ("fisheye", "integral", "center"),
+    ("beyond", "peak", "center"),
+    ("half sphere", "integral", "ray"),
+]
+
+
+@pytest.mark.parametrize(("name", "response", "order"), INFORMED)
+def test_information(rng, name, response, order):
+    """Fisher diagonal, blocks, columns and the pose's information equal those of the oracle's dense Jacobian."""
+    settings = RenderSettings.preset("exact", response=response, order=order, background=(0.2, 0.5, 0.9))
+    for _ in range(50):
+        g, cam = gaussians(rng, 8, 4, scale=0.25), lens_camera(rng, name, (12, 10))
+        out = quietly(reference.render, g, cam, settings)
+        if not out.ambiguous.any() and out.count.max() > 1:
+            break
+    J = dense.jacobian(g, out)
+    truth = dense.squares(J)
+    found = quietly(fisher.diagonal, g, cam, settings)
+    columns = quietly(fisher.diagonal, g, cam, settings, "columns")
+    for group in dense.GROUPS:
+        assert dense.error(found[group], truth[group]) <= 1e-4, group
+        assert dense.error(columns[group], truth[group]) <= 1e-4, group
+    rows = dense.stacked(J)
+    truth = torch.einsum("pni,pnj->nij", rows, rows)
+    scale = truth.diagonal(dim1=1, dim2=2).amax(0).sqrt().clamp_min(1e-12)
+    found = quietly(fisher.blocks, g, cam, settings)
+    assert float(((found - truth) / (scale[:, None] * scale)).abs().max()) <= 1e-4
+    pose = dense.pose_jacobian(cam, out)
+    assert dense.error(quietly(fisher.pose_information, g, cam, settings), pose.T @ pose) <= 1e-4
+
+
+MOVED = [
+    ("pinhole", {"order": "ray"}),
+    ("barrel", {"order": "ray"}),
+    ("barrel", {"order": "ray", "traversal": "bvh"}),
+    ("rational", {"response": "integral", "sh_direction": "ray"}),
+    ("folded", CUTS),
+    ("fisheye", {"order": "ray"}),
+    ("half sphere", {"response": "integral", "order": "ray", "sh_direction": "ray"}),
+    ("beyond", CUTS),
+    ("beyond", {"order": "ray", "traversal": "bvh", "sh_direction": "ray"}),
+]
+LENSES["pinhole"] = ("pinhole", (), 1.0)
+
+
+@pytest.mark.parametrize(("name", "fields"), MOVED, ids=lambda f: f if isinstance(f, str) else "-".join(map(str, f)))
+def test_derivatives_by_the_lens(rng, name, fields):
+    """Reverse and forward, by focal lengths, principal point, skew and distortion: the oracle's along its rays, times
+    finite differences of these, in float64.
+    """
+    settings = RenderSettings(**fields)
+    cam = lens_camera(rng, name)
+    g = gaussians(rng, 20, 4, 3)
+    at = cam.lens_parameters
+    with torch.no_grad():
+        rays = quietly(cam.pixel_directions)
+    directions = torch.tensor(rays).requires_grad_()
+    origins = torch.tensor(cam.center).expand(directions.shape)
+    plain = Camera(K=cam.K, w2c=cam.w2c.detach(), width=cam.width, height=cam.height)
+    # The oracle normalizes no direction: a ray's length does not change.
+    unit = torch.nn.functional.normalize(directions, dim=-1)
+    truth = reference.render(g.detach(), plain, settings, rays=(origins, unit))
+    # Where a lens has no inverse, rays do not move.
+    seen = cam.project(rays.reshape(-1, 3) + cam.center)[0].reshape(*rays.shape[:2], 2)
+    columns, rows = np.meshgrid(np.arange(cam.width) + 0.5, np.arange(cam.height) + 0.5)
+    inverse = torch.tensor(np.hypot(seen[..., 0] - columns, seen[..., 1] - rows) < 1e-3)
+    assert inverse.double().mean() > 0.2
+    good = ~truth.ambiguous & inverse
+    names = ("rgb", "alpha", "depth", "features")
+    u = {k: torch.tensor(rng.normal(size=tuple(getattr(truth, k).shape))) for k in names}
+    for x in u.values():
+        x *= good.reshape(*good.shape, *[1] * (x.ndim - 2))
+        x.requires_grad_()
+    loss = sum((getattr(truth, k) * x).sum() for k, x in u.items())
+    (slope,) = torch.autograd.grad(loss, directions, create_graph=True)
+    moved = torch.zeros(len(at), *directions.shape, dtype=torch.float64)
+    for k in range(len(at)):
+        step = 1e-5 * max(abs(at[k]), 0.1 if k >= 5 else 1.0)
+        ends = [quietly(cam.with_lens(at + s * step * np.eye(len(at))[k]).pixel_directions) for s in (1, -1)]
+        moved[k] = torch.tensor((ends[0] - ends[1]) / (2 * step)) * inverse[..., None]
+    want = torch.einsum("hwc,khwc->k", slope, moved)
+
+    lens = torch.tensor(at, requires_grad=True)
+    out = quietly(render, g.detach(), cam, settings, outputs=("depth",), lens=lens)
+    for k in names:
+        torch.testing.assert_close(getattr(out, k).double()[good], getattr(truth, k)[good], rtol=1e-5, atol=1e-5)
+    sum((getattr(out, k).double() * x.detach()).sum() for k, x in u.items()).backward()
+    assert relative(lens.grad, want.detach()) < 1e-4
+    v = torch.tensor(rng.normal(size=len(at))) * (1 + abs(torch.tensor(at)))
+    (pushed,) = (torch.autograd.grad(want @ v, list(u.values()), retain_graph=True),)
+    got = quietly(render_jvp, g.detach(), cam, {"lens": v}, settings)
+    for k, x in zip(names, pushed, strict=True):
+        assert relative(getattr(got, k).double()[good], x[good]) < 1e-4, k
+
+
+def test_derivatives_by_the_lens_through_torch(rng):
+    """`torch.func` in both modes, and cameras that share a lens."""
+    cam, g = lens_camera(rng, "barrel", (9, 7)), gaussians(rng, 10, 1).detach()
+    cam = dataclasses.replace(cam, w2c=cam.w2c.detach())
+    lens = torch.tensor(cam.lens_parameters)
+    loss = lambda x: render(g, cam, lens=x).rgb.double().square().sum()  # noqa: E731
+    slope = torch.func.grad(loss)(lens)
+    v = torch.tensor(rng.normal(size=9))
+    value, pushed = torch.func.jvp(loss, (lens,), (v,))
+    assert float(pushed) == pytest.approx(float(slope @ v), rel=1e-4)
+    lens.requires_grad_()
+    both = render(g, [cam, cam], lens=lens).rgb.double().square().sum()
+    assert float(both) == pytest.approx(2 * float(value), rel=1e-6)
+    both.backward()
+    torch.testing.assert_close(lens.grad, 2 * slope, rtol=1e-5, atol=1e-8)
+    moved = render(g, cam, lens=lens.detach() * 1.01).rgb
+    assert torch.equal(moved, render(g, cam.with_lens(cam.lens_parameters * 1.01)).rgb)
+
+
+def test_what_has_no_derivative_by_the_lens(rng):
+    """Said in one line, with what to do."""
+    cam, g = camera(rng, (9, 7)), gaussians(rng, 5, 1).detach()
+    lens = torch.tensor(cam.lens_parameters)
+    with pytest.raises(NotImplementedError, match="by the lens.*'ewa'; use preset exact"):
+        render(g, cam, RenderSettings.preset("gsplat"), lens=lens)
+    with pytest.raises(ValueError, match=r"must have shape \(5,\).*got \(6,\)"):
+        render(g, cam, lens=torch.ones(6))
+    with pytest.raises(ValueError, match="lens must be"):
+        render(g, cam, lens=cam.lens_parameters)
+
+
+def test_a_lens_without_rays_is_refused(rng):
+    """Coefficients for which OpenCV finds no numbers."""
+    cam = dataclasses.replace(
+        lens_camera(rng, "barrel"), distortion=(-32.4, 125.9, 158.1, -160.2, 218.8, 6.1, -20.1, 109)
+    )
+    with pytest.raises(ValueError, match="must have a ray for each pixel, got none for .* check its coefficients"):
+        quietly(render, gaussians(rng, 5, 1), cam)
+
+
+def test_cameras_of_a_lens_share_its_table(rng):
+    """Wherever they are; another size has another one."""
+    lib = runtime.dr_types()
+    cam = lens_camera(rng, "fisheye")
+    moved = lens_camera(rng, "fisheye")
+    moved = dataclasses.replace(moved, K=cam.K)
+    assert lens_of(lib, cam, TILE) is lens_of(lib, moved, TILE)
+    assert lens_of(lib, cam.resized(13, 11), TILE) is not lens_of(lib, cam, TILE)
+    assert lens_of(lib, camera(rng), TILE) is None
+    assert [lens_of(lib, lens_camera(rng, k), TILE).wide for k in ("barrel", "fisheye", "beyond")] == [
+        False,
+        False,
+        True,
+    ]

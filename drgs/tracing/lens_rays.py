@@ -24,12 +24,11 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-import torch
 
 from drgs.cameras import Camera
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
-from drgs.tracing.pose import local_directions
+from drgs.tracing.pose import local_rays
 from drgs.tracing.primitives import Patch, Ray
 
 __all__ = ["FISHEYE", "LensRays", "lens_of"]
@@ -81,8 +80,13 @@ class LensRays:
         self.lib = lib
         self.fisheye = camera.model in FISHEYE
         self.tiles = -(-camera.width // tile)
-        d = local_directions(camera).numpy()
-        self.wide = not bool((d[:, 2] >= _NARROW).all())  # rays that are no numbers are wide, too, and meet nothing
+        d = local_rays(camera)
+        if lost := int(np.count_nonzero(~np.isfinite(d).all(1))):
+            raise ValueError(
+                f"render: camera {camera.name!r}: the {camera.model} lens must have a ray for each pixel, got none for "
+                f"{lost} of {len(d)}; check its coefficients or use camera.undistorted()"
+            )
+        self.wide = bool((d[:, 2] < _NARROW).any())
         K = camera.K
         values = d if self.wide else _pixels_of(K, d[:, :2] / d[:, 2:])
         if not self.wide:
@@ -120,20 +124,21 @@ class LensRays:
             moved = (pixels - guides).astype(np.float32)
         # float32 rounds: outwards.
         bounds = np.concatenate([np.nextafter(moved, -np.inf), -np.nextafter(moved, np.inf)], 1)
-        index = torch.from_numpy(cell[:, 1] * count[0] + cell[:, 0])[:, None].expand(-1, 4)
-        level = torch.full((int(count[0] * count[1]), 4), np.inf).scatter_reduce(
-            0, index, torch.from_numpy(bounds), "amin"
-        )
-        levels = [level.view(int(count[1]), int(count[0]), 4)]
-        while levels[-1].shape[0] * levels[-1].shape[1] > 1:
+        index = cell[:, 1] * count[0] + cell[:, 0]
+        level = np.full((4, count[0] * count[1]), np.inf, np.float32)
+        for least, x in zip(level, bounds.T, strict=True):
+            np.minimum.at(least, index, x)
+        levels = [level.reshape(4, count[1], count[0])]
+        while levels[-1][0].size > 1:
             x = levels[-1]
-            x = torch.nn.functional.pad(x, (0, 0, 0, x.shape[1] % 2, 0, x.shape[0] % 2), value=np.inf)
-            levels.append(x.view(x.shape[0] // 2, 2, x.shape[1] // 2, 2, 4).amin((1, 3)))
+            odd = ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2))
+            x = np.pad(x, odd, constant_values=np.inf)
+            levels.append(x.reshape(4, x.shape[1] // 2, 2, x.shape[2] // 2, 2).min((2, 4)))
         self.count = count
-        self.cells = lib.Float(torch.cat([x.reshape(-1) for x in levels]).numpy())
-        starts = np.cumsum([0, *(x.shape[0] * x.shape[1] for x in levels)])[:-1]
+        self.cells = lib.Float(np.concatenate([x.reshape(4, -1).T.reshape(-1) for x in levels]))
+        starts = np.cumsum([0, *(x[0].size for x in levels)])[:-1]
         self.starts = lib.UInt32(starts.astype(np.uint32))
-        self.strides = lib.UInt32(np.array([x.shape[1] for x in levels], np.uint32))
+        self.strides = lib.UInt32(np.array([x.shape[2] for x in levels], np.uint32))
         dr.make_opaque(self.cells, self.starts, self.strides)
 
     def pixels(self, guides: list[Float]) -> list[Float]:
@@ -170,15 +175,21 @@ class LensRays:
             guides[3] - lib.Float64(least[3]),
         ]
 
-    def ray(self, pinhole: list[Float], flat: UInt32, inside: Mask, carried: list[Float], basis: int) -> Ray:
+    def ray(
+        self, pinhole: list[Float], flat: UInt32, inside: Mask, carried: list[Float], basis: int, shifted: bool
+    ) -> Ray:
         """The ray of a pixel."""
         lib = self.lib
         values = [dr.gather(lib.Float, x, flat, inside) for x in self.columns]
         if self.wide:
-            return Ray(length=lib.Float(1), direction=values[:3], low=values[3:], carried=carried, basis=basis)
+            # Beyond the image there is no direction, but what follows must be numbers.
+            values[2] = dr.select(inside, values[2], 1)
+            return Ray(
+                length=lib.Float(1), direction=values[:3], low=values[3:], carried=carried, basis=basis, shifted=shifted
+            )
         x, y, *low = values
         length = _length(pinhole, x + low[0], y + low[1])
-        return Ray(x, y, length, low=low, carried=carried, basis=basis)
+        return Ray(x, y, length, low=low, carried=carried, basis=basis, shifted=shifted)
 
     def patch(self, r: list[Float], x: Int32, y: Int32) -> Patch:
         """The rays of tile (x, y), from the anchor of a record."""

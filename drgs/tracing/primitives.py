@@ -26,10 +26,11 @@ class Ray:
         x, y: Pixel position, of a pinhole ray; of a narrow lens the center of a pixel of the pinhole camera.
         length: |d| of that ray's direction with d_z = 1; 1 of a wide lens.
         carried: What a ray carries that is differentiated: SH basis values (`basis` of them), then o and d of a world
-            ray.
+            ray, or the shifts of a ray of the screen.
         basis: Number of SH basis values; 0 where colors are evaluated towards the means.
         direction: Unit direction in camera axes, of a wide lens (lens_rays.py).
         low: What float32 leaves of x and y, or of the direction, of a ray through a lens.
+        shifted: Whether the last three that are carried, which are 0, say how it moves with the lens (lens_motion.py).
     """
 
     x: Float = None
@@ -39,6 +40,7 @@ class Ray:
     basis: int = 0
     direction: list[Float] = dataclasses.field(default_factory=list)
     low: list[Float] = dataclasses.field(default_factory=list)
+    shifted: bool = False
 
 
 class Lens(Protocol):

@@ -86,6 +86,7 @@ class TileTraversal:
         self.records = records
         self.carried = carried
         self.basis = basis
+        self.shifted = len(carried) > basis
         size = self.width, self.height
         self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed, self.lens)
         self.certificate["pairs"] = self.lists.pairs
@@ -215,12 +216,12 @@ class TileTraversal:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
         carried = [dr.gather(self.lib.Float, c, flat, inside) for c in self.carried]
         if self.lens is not None:
-            return self.lens.ray(self.pinhole, flat, inside, carried, self.basis)
+            return self.lens.ray(self.pinhole, flat, inside, carried, self.basis, self.shifted)
         fx, skew, cx, fy, cy = self.pinhole
         v = (y - cy) / fy
         u = (x - cx - skew * v) / fx
         length = dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
-        return Ray(x, y, length, carried, self.basis)
+        return Ray(x, y, length, carried, self.basis, shifted=self.shifted)
 
 
 class _Band(NamedTuple):

@@ -141,7 +141,8 @@ class Peak(AlphaStrength):
         c1, c2, d, inverse = _on_screen(r, ray)
         squared = dr.fma(c1, c1, c2 * c2)
         along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
-        return squared * inverse, along * inverse * ray.length, self._u_on_screen(r, along, inverse)
+        length = ray.length + ray.carried[-1] if ray.shifted and not ray.direction else ray.length
+        return squared * inverse, along * inverse * length, self._u_on_screen(r, along, inverse)
 
     def _u_in_world(self, key: Float, d: list[Float], inverse: Float) -> Float | None:
         return None
@@ -250,14 +251,20 @@ def _on_screen(r: list[Float], ray: Ray) -> tuple[Float, Float, list[Float], Flo
 def _from_anchor(r: list[Float], ray: Ray) -> tuple[Float, Float, Float | int]:
     """Where a ray is from the anchor, (x - w x_a, y - w y_a, w): a pixel, with w = 1, or on a side of the cube."""
     ax, ay = r[layout.AX], r[layout.AY]
-    if not ray.low:
-        return ray.x - ax, ray.y - ay, 1
+    low = ray.low
+    if ray.shifted:
+        low = [a + b for a, b in zip(low, ray.carried[-3:], strict=False)] or ray.carried[-3:]
     if not ray.direction:
-        return (ray.x - ax) + ray.low[0], (ray.y - ay) + ray.low[1], 1
+        dx, dy = ray.x - ax, ray.y - ay
+        return (dx + low[0], dy + low[1], 1) if low else (dx, dy, 1)
     # A product is not rounded before it is added: where the two are nearly the same, no digit is lost.
     x, y, w = on_side(r[layout.SIDE], ray.direction)
-    x1, y1, w1 = on_side(r[layout.SIDE], ray.low)
-    return dr.fma(-ax, w, x) + dr.fma(-ax, w1, x1), dr.fma(-ay, w, y) + dr.fma(-ay, w1, y1), w
+    x1, y1, w1 = on_side(r[layout.SIDE], low)
+    return (
+        dr.fma(-ax, w, x) + dr.fma(-ax, w1, x1),
+        dr.fma(-ay, w, y) + dr.fma(-ay, w1, y1),
+        w + w1 if ray.shifted else w,
+    )
 
 
 def _times_w(c: Float, w: Float | int) -> Float:
