@@ -14,9 +14,10 @@ from test_integrator import check
 from test_tiles import listed_gaussians
 
 from drgs import fisher, reference, render, render_jvp, runtime
-from drgs.cameras import Camera
+from drgs.cameras import Camera, intrinsics
 from drgs.settings import RenderSettings
-from drgs.tracing.lens_rays import lens_of
+from drgs.tracing import tiles
+from drgs.tracing.lens_rays import LensRays, lens_of
 from drgs.tracing.tiles import TILE
 
 # Name -> model, coefficients, focal length as a multiple of what the pinhole of the same scene has.
@@ -71,6 +72,35 @@ def test_every_hit_is_listed(rng, name, response, near):
                 hit &= one.alpha > 1e-5 / 25
             for y, x in hit.nonzero().tolist():
                 assert i in listed[(y // TILE) * columns + x // TILE], (i, x, y)
+
+
+def _everywhere(self, guides):
+    """Bounds beyond any image."""
+    return [x * 0 + sign * 1e9 for sign, x in zip((-1, -1, 1, 1), guides, strict=True)]
+
+
+@pytest.mark.parametrize("anisotropy", [0.5, 2.5])
+@pytest.mark.parametrize("name", LENSES)
+def test_what_bounds_leave_out_changes_nothing(rng, monkeypatch, name, anisotropy):
+    """Listing a Gaussian only where it may be seen gives the same bits as listing it everywhere."""
+    monkeypatch.setattr(tiles, "_LARGE", 0)
+    pairs = []
+    for spread in (1.0, 8.0):
+        cam = lens_camera(rng, name, (61, 45), turn=1.0)
+        g = gaussians(rng, 40, 1, scale=0.1, spread=spread, anisotropy=anisotropy, opacity=2.5)
+        g = around_camera(g, cam).detach()
+        images = []
+        for whole in (False, True):
+            with monkeypatch.context() as patch:
+                if whole:
+                    patch.setattr(LensRays, "pixels", _everywhere)
+                    patch.setattr(tiles._Tiles, "may_hit", lambda self, x, y: self.lib.Bool(True))
+                out = quietly(render, g, cam, outputs=("count", "depth"))
+                parts = [out.rgb, out.alpha[..., None], out.depth[..., None], out.count[..., None]]
+                images.append(torch.cat(parts, -1))
+                pairs.append(out.certificate["pairs"])
+        assert torch.equal(*images)
+    assert sum(pairs[::2]) < 0.7 * sum(pairs[1::2])
 
 
 CUTS = {"extent": 3.0, "transmittance_min": 0.01, "alpha_max": 0.9999}
@@ -234,13 +264,32 @@ def test_what_has_no_derivative_by_the_lens(rng):
         render(g, cam, lens=cam.lens_parameters)
 
 
-def test_a_lens_without_rays_is_refused(rng):
-    """Coefficients for which OpenCV finds no numbers."""
-    cam = dataclasses.replace(
-        lens_camera(rng, "barrel"), distortion=(-32.4, 125.9, 158.1, -160.2, 218.8, 6.1, -20.1, 109)
-    )
-    with pytest.raises(ValueError, match="must have a ray for each pixel, got none for .* check its coefficients"):
-        quietly(render, gaussians(rng, 5, 1), cam)
+@pytest.mark.parametrize(
+    ("fields", "focal", "distortion"),
+    [
+        ({"order": "ray", "sh_direction": "ray"}, 18.0, (-1.5, 2.3, -0.6, 3.7, -35.6, 17.7, -12.2, -25.0)),
+        (CUTS, 30.0, (-11.8, -9.1, -9.3, 2.1, 0.3, 2.2, -7.6, 3.7)),
+    ],
+)
+def test_pixels_without_a_ray(rng, fields, focal, distortion):
+    """Where OpenCV finds no number the background is seen, and nothing has a derivative; elsewhere all is as ever."""
+    settings = RenderSettings(**fields, background=(0.2, 0.5, 0.9))
+    cam, g = camera(rng, (30, 24)), gaussians(rng, 20, 4, 3)
+    cam = dataclasses.replace(cam, K=intrinsics(focal, focal, 14, 13), model="opencv", distortion=distortion)
+    holes = ~np.isfinite(quietly(cam.pixel_directions)).all(-1)
+    assert 0 < holes.mean() < 0.7
+    lens = torch.tensor(cam.lens_parameters).requires_grad_()
+    out = quietly(render, g, cam, settings, outputs=("depth",), lens=lens)
+    assert (out.rgb[holes] == torch.tensor(settings.background)).all()
+    assert not out.alpha[holes].any()
+    assert not out.features[holes].any()
+    truth = quietly(reference.render, g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings)
+    good = torch.tensor(~holes) & ~truth.ambiguous
+    for name in ("rgb", "alpha", "depth", "features"):
+        torch.testing.assert_close(getattr(out, name).double()[good], getattr(truth, name)[good], rtol=1e-5, atol=1e-5)
+    out.rgb.square().sum().backward()
+    for x in (*g.parameters().values(), cam.w2c, lens):
+        assert torch.isfinite(x.grad).all()
 
 
 def test_cameras_of_a_lens_share_its_table(rng):

@@ -142,7 +142,7 @@ class Call:
             pose = rigid_pose(camera)
             local = self._moving(lens) if lens is not None else None
             if settings.traversal == "bvh" or settings.sh_direction == "ray":
-                d = (local_directions(camera) if local is None else local) @ pose[:3, :3]
+                d = (self._local() if local is None else local) @ pose[:3, :3]
                 center = -(pose[:3, 3] @ pose[:3, :3]) - origin
                 self._set_rays(center.expand(d.shape), d)
         # The world of the means is re-centered: x_world = x + origin.
@@ -169,11 +169,16 @@ class Call:
                 "render: derivatives by the lens must be of a response along rays, got "
                 f"{self.settings.response!r}; use preset exact, fast or 3dgut"
             )
-        self.motion = LensMotion(camera, local_directions(camera))
+        self.motion = LensMotion(camera, self._local())
         local = self.motion.directions(lens)
         if self.settings.traversal == "tiles":
             self.inputs["ray_shifts"] = self._move(self.motion.shifts(local, self.is_wide()))
         return local
+
+    def _local(self) -> torch.Tensor:
+        """(P, 3) directions in camera axes; where there is none, any that is a number."""
+        d = local_directions(self.camera)
+        return torch.where(torch.isfinite(d).all(1, keepdim=True), d, torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype))
 
     def is_wide(self) -> bool:
         """Whether the camera's lens is a wide one."""

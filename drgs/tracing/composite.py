@@ -192,6 +192,9 @@ class Compositor:
         """Flat images, `count` visibilities among them, from all passes."""
         lib = self.lib
         out = self._images()
+        if self.traversal.holes is not None:
+            for c, x in enumerate(self.model.background):
+                dr.scatter(out["rgb"], x, 3 * dr.arange(lib.UInt32, self.rays) + c)
         self.finals = []
         for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
             if name in want:

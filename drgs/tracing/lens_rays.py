@@ -73,6 +73,7 @@ class LensRays:
         fisheye: Guides are those of the equidistant fisheye.
         wide: Rays are directions, not pixels of a pinhole camera.
         low, high: (2,) least and largest such pixel, of narrow lenses.
+        known: (P,) 0 where OpenCV finds no ray for a pixel, but what is no number; None where there is none of these.
         size: Bytes of all tables.
     """
 
@@ -81,21 +82,20 @@ class LensRays:
         self.fisheye = camera.model in FISHEYE
         self.tiles = -(-camera.width // tile)
         d = local_rays(camera)
-        if lost := int(np.count_nonzero(~np.isfinite(d).all(1))):
-            raise ValueError(
-                f"render: camera {camera.name!r}: the {camera.model} lens must have a ray for each pixel, got none for "
-                f"{lost} of {len(d)}; check its coefficients or use camera.undistorted()"
-            )
-        self.wide = bool((d[:, 2] < _NARROW).any())
+        known = np.isfinite(d).all(1)
+        # What stands for a ray must be a number; `TileTraversal` leaves these out.
+        self.known = None if known.all() else lib.UInt32(known.astype(np.uint32))
+        self.wide = bool((d[known, 2] < _NARROW).any())
         K = camera.K
         values = d if self.wide else _pixels_of(K, d[:, :2] / d[:, 2:])
         if not self.wide:
-            self.low = np.floor(values.min(0))
-            self.high = np.floor(values.max(0))
+            self.low = np.floor(values[known].min(0, initial=0.0))
+            self.high = np.floor(values[known].max(0, initial=0.0))
         # Pixels and anchors are centers of pixels, whose difference is exact.
         first = values.astype(np.float32) if self.wide else (np.floor(values) + 0.5).astype(np.float32)
         rest = (values - first).astype(np.float32)
         self.columns = [lib.Float(np.ascontiguousarray(x)) for x in (*first.T, *rest.T)]
+        self.columns = [dr.select(dr.isfinite(x), x, 0) for x in self.columns]
         boxes = _tile_boxes(values.reshape(camera.height, camera.width, -1), tile, not self.wide)
         self.boxes = [lib.Float(np.ascontiguousarray(x)) for x in boxes.T]
         self._displacements(camera, _pixels_of(K, _equidistant(d) if self.fisheye else _on_plane(d)))

@@ -77,6 +77,7 @@ class TileTraversal:
         self.rays = width * height
         self.certificate: dict = {}
         self.lens = lens
+        self.holes = None if lens is None else lens.known
         self.pinhole = [lib.Float(v) for v in pinhole]
         dr.make_opaque(*self.pinhole)
 
@@ -189,6 +190,10 @@ class TileTraversal:
         pixels = [(x + a, y + b) for a, b in corners]
         inside = [(px < self.width) & (py < self.height) for px, py in pixels]
         flat = [py * self.width + px for px, py in pixels]
+        if self.holes is not None:
+            inside = [
+                ok & (dr.gather(lib.UInt32, self.holes, at, ok) != 0) for ok, at in zip(inside, flat, strict=True)
+            ]
         rays = [
             self._ray(lib.Float(px) + 0.5, lib.Float(py) + 0.5, f, i)
             for (px, py), f, i in zip(pixels, flat, inside, strict=True)
