@@ -140,6 +140,25 @@ class Camera:
         """Whether the lens differs from a pinhole (a fisheye with zero coefficients still does)."""
         return self.model == "opencv_fisheye" or (self.model == "opencv" and any(self.distortion))
 
+    @property
+    def lens_parameters(self) -> np.ndarray:
+        """(5 + D,) float64: fx, fy, cx, cy, skew, and the D coefficients of the distortion."""
+        K = self.K
+        return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], *self.distortion])
+
+    def with_lens(self, parameters: Any) -> Camera:
+        """The same camera with other `lens_parameters`, an array or a tensor (detached)."""
+        values = np.asarray(as_numpy(parameters), np.float64)
+        expected = 5 + len(self.distortion)
+        if values.shape != (expected,):
+            raise ValueError(
+                f"Camera.with_lens: parameters must have shape ({expected},) as lens_parameters of a {self.model} "
+                f"camera with {len(self.distortion)} coefficients, got {values.shape}; see Camera.lens_parameters"
+            )
+        fx, fy, cx, cy, skew, *distortion = values.tolist()
+        K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return dataclasses.replace(self, K=K, distortion=tuple(distortion))
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with an image of another size; K is scaled exactly. Itself if it has that size."""
         if (width, height) == (self.width, self.height):

@@ -40,6 +40,7 @@ def render(
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] | str = ("depth",),
     couple_features: bool = True,
+    lens: torch.Tensor | None = None,
 ) -> Output:
     """Render a view, or several of one size.
 
@@ -56,11 +57,13 @@ def render(
             costs nothing.
         couple_features: Whether the feature image has derivatives by all that it depends on. If not, only by
             `features`: what is learned about them moves no Gaussian (Zhou et al. 2024, Feature 3DGS).
+        lens: (5 + D,) a torch tensor in place of the cameras' `lens_parameters` (fx, fy, cx, cy, skew, distortion),
+            which is differentiated, for responses along rays. Where a lens has no inverse, rays do not move.
     Returns:
         An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
         ValueError: If a parameter is not finite, an output is unknown, or cameras differ in size.
-        NotImplementedError: If tiles are asked for with a camera that is no pinhole.
+        NotImplementedError: If a model of the image plane (`ewa`) is asked for with a camera that has distortion.
     Gradients:
         Of rgb, alpha, depth and features, with respect to means, quats, log_scales, logit_opacities, sh, features and
         the pose, in reverse mode (`backward`, `torch.func.grad`) and forward mode (`torch.func.jvp`,
@@ -73,14 +76,25 @@ def render(
     if isinstance(camera, list | tuple):
         cameras = cameras_of_one_size("render", camera)
         wanted = _wanted(outputs)
-        return _batch([_view(gaussians, each, settings, wanted, couple_features) for each in cameras])
-    return _view(gaussians, camera, settings, _wanted(outputs), couple_features)
+        return _batch([_view(gaussians, each, settings, wanted, couple_features, lens) for each in cameras])
+    return _view(gaussians, camera, settings, _wanted(outputs), couple_features, lens)
 
 
-def _view(gaussians: Scene, camera: Camera, settings: RenderSettings | None, wanted: frozenset, couple: bool) -> Output:
+def _view(
+    gaussians: Scene,
+    camera: Camera,
+    settings: RenderSettings | None,
+    wanted: frozenset,
+    couple: bool,
+    lens: torch.Tensor | None,
+) -> Output:
+    if lens is not None:
+        must_be("render", "lens", lens, torch.Tensor, "e.g. torch.tensor(camera.lens_parameters)")
+        camera = camera.with_lens(lens)
+        lens = lens.to("cpu", torch.float64)
     seen = gaussians_at("render", gaussians, camera)
     check_view("render", seen, camera, settings)
-    call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted, couple=couple)
+    call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted, couple=couple, lens=lens)
     with own_errors():
         return call.output(differentiable(call))
 
@@ -112,11 +126,12 @@ def render_jvp(
         tangents: Name -> tangent of the raw parameter, shaped like it, optionally with a leading axis K (the same
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
-            the pose, rotation first: c2w <- exp(xi) c2w. Of a `drgs.ellipsoids.DeformableScene` the names are those
-            of its `parameters()` that are floats, `camera`, and `rotations` where it has `quats`; `time`, a number: how
-            fast the time of the view passes; and `phi`, a mapping of x to the tangent of `phi.x`. So none of its own
-            may be called `camera`, `rotations`, `time`, `phi`, `w2c`, `ray_origins` or `ray_directions`. By the time
-            the derivative is the scene's own, one-sided where that has a kink (`drgs.DeformationField`).
+            the pose, rotation first: c2w <- exp(xi) c2w; `lens` (5 + D,), of the camera's `lens_parameters`. Of a
+            `drgs.ellipsoids.DeformableScene` the names are those of its `parameters()` that are floats, `camera`,
+            `lens`, and `rotations` where it has `quats`; `time`, a number: how fast the time of the view passes; and
+            `phi`, a mapping of x to the tangent of `phi.x`. So none of its own may be called `camera`, `lens`,
+            `rotations`, `time`, `phi`, `w2c`, `ray_origins`, `ray_directions` or `ray_shifts`. By the time the
+            derivative is the scene's own, one-sided where that has a kink (`drgs.DeformationField`).
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried
         through one traversal. They have no graph: nothing differentiates a tangent.
@@ -135,7 +150,8 @@ def render_jvp(
     # The tangents are given: a graph of torch would lead nowhere.
     want = _wanted(outputs) & {"depth"}
     timed = "time" in tangents and camera.time is not None
-    call = Call(seen.detach(), camera, settings, want, scene=scene, couple=couple_features, timed=timed)
+    lens = torch.from_numpy(camera.lens_parameters) if "lens" in tangents else None
+    call = Call(seen.detach(), camera, settings, want, scene=scene, couple=couple_features, timed=timed, lens=lens)
     with own_errors():
         return push_forward(call, tangents)
 

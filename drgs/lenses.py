@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-__all__ = ["distort_opencv", "fisheye_directions", "fisheye_polynomial", "undistort_opencv"]
+__all__ = ["distort_opencv", "distorted", "fisheye_directions", "fisheye_polynomial", "undistort_opencv"]
 
 
 def distort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
     """Image-plane points (P,2) through OpenCV's radial and tangential model."""
+    return np.stack(distorted(*plane.T, distortion), axis=-1)
+
+
+def distorted(x: Any, y: Any, distortion: tuple) -> tuple[Any, Any]:
+    """Both coordinates of `distort_opencv`; of arrays, or of tensors, whose graph is kept."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *([0.0] * (8 - len(distortion))))
-    x, y = plane.T
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    moved_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return moved_x, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
 def undistort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
@@ -40,8 +41,8 @@ def undistort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.nda
     return result.reshape(-1, 2)
 
 
-def fisheye_polynomial(angle: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted angle and its derivative for an angle (radians) to the axis."""
+def fisheye_polynomial(angle: Any, distortion: tuple) -> tuple[Any, Any]:
+    """Distorted angle and its derivative for an angle (radians) to the axis; of arrays, or of tensors."""
     k1, k2, k3, k4 = distortion
     a2 = angle * angle
     value = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))

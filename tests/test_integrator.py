@@ -440,12 +440,12 @@ def ref_like(ref):
 
 @pytest.mark.parametrize("model", ["opencv", "opencv_fisheye"])
 def test_distorted_cameras(rng, model):
-    """`bvh` follows the lens; tiles refuse and say what to do."""
+    """`bvh` follows the lens (tiles: test_lenses.py); a model of the image plane is refused, and what to do is said."""
     cam = camera(rng, (9, 7))
     bent = Camera(K=cam.K, w2c=cam.w2c, width=9, height=7, model=model, distortion=(0.1, -0.05, 0.01, 0.02))
     g = gaussians(rng, 12, 4, 5)
-    with pytest.raises(NotImplementedError, match="traversal='bvh'.*undistorted"):
-        render(g, bent)
+    with pytest.raises(NotImplementedError, match="'ewa' is a model of a pinhole.*undistorted.*exact, fast or 3dgut"):
+        render(g, bent, RenderSettings.preset("gsplat"))
     settings = RenderSettings(order="ray", traversal="bvh", extent=4.0, sh_direction="ray")
     check(compare(g, bent, settings, Oracle(g, bent, settings, rng)))
 

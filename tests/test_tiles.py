@@ -27,7 +27,8 @@ def _scene(g, cam, settings):
     lib = runtime.dr_types()
     compositor, (record, *_) = call.prepare({n: to_drjit(lib, x) for n, x in call.inputs.items()})
     projected = compositor.traversal.projected
-    lists = build(lib, projected, settings, cam.width, cam.height, pack_records(lib, record))
+    lens = compositor.traversal.lens
+    lists = build(lib, projected, settings, cam.width, cam.height, pack_records(lib, record), lens=lens)
     dr.eval(lists.index, lists.start, lists.end)
     return projected, lists
 
@@ -36,6 +37,12 @@ def _listed(lists):
     """Tile -> list of Gaussians, in order."""
     start, end, index = (np.asarray(x.numpy()) for x in (lists.start, lists.end, lists.index))
     return [index[a:b].tolist() for a, b in zip(start, end, strict=True)]
+
+
+def listed_gaussians(g, cam, settings):
+    """Lists of a view's tiles, and how many of these are in a row."""
+    lists = _scene(g, cam, settings)[1]
+    return _listed(lists), lists.columns
 
 
 @pytest.mark.parametrize("response", ["peak", "integral", "ewa"])
@@ -157,7 +164,7 @@ def test_tiles_left_out_change_nothing(rng, monkeypatch, fields, anisotropy):
         for whole in (False, True):
             with monkeypatch.context() as patch:
                 if whole:
-                    patch.setattr(tiles._Tiles, "may_hit", lambda self, dx, dy: self.lib.Bool(True))
+                    patch.setattr(tiles._Tiles, "may_hit", lambda self, x, y: self.lib.Bool(True))
                 out = render(g.detach(), cam, settings, outputs=("count", "depth"))
                 images.append(
                     torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None], out.count[..., None]], -1)

@@ -62,6 +62,7 @@ class BvhTraversal:
         self.settings = settings
         self.projected = projected
         self.rays = rays
+        self.holes = None
         self.certificate: dict = {}
 
     def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:

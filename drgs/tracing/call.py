@@ -17,13 +17,15 @@ from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.composite import Arguments, Composite, Compositor, compositor_of
+from drgs.tracing.lens_motion import LensMotion
+from drgs.tracing.lens_rays import lens_of
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
-from drgs.tracing.tiles import TileTraversal
+from drgs.tracing.tiles import TILE, TileTraversal
 from drgs.tracing.walk import Traversal
 
 __all__ = ["OF_VIEW", "Call", "Output", "numbers"]
 
-OF_VIEW = ("w2c", "ray_origins", "ray_directions")  # inputs that follow from the pose
+OF_VIEW = ("w2c", "ray_origins", "ray_directions", "ray_shifts")  # inputs that follow from the pose and the lens
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,6 +65,7 @@ class Call:
         scene: The scene that the Gaussians are of, if derivatives by its parameters are wanted instead of by theirs.
         timed: Whether derivatives by the scene's time are wanted, too.
         couple: The argument `couple_features` of `render`.
+        lens: The camera's `lens_parameters`, if derivatives by them are wanted.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
             `time`, `w2c` (12 floats), rays where they are traced.
@@ -70,6 +73,7 @@ class Call:
         shape: Shape of the images: (H, W), or that of the rays.
         extra: Outputs without a derivative, after `trace`.
         certificate: What becomes `Output.certificate`, after `trace`.
+        motion: How rays move with the lens, if derivatives by it are wanted.
     """
 
     def __init__(
@@ -82,6 +86,7 @@ class Call:
         scene: DeformableScene | None = None,
         couple: bool = True,
         timed: bool = False,
+        lens: torch.Tensor | None = None,
     ):
         self.lib = runtime.dr_types()
         self.settings = settings
@@ -89,10 +94,11 @@ class Call:
         self.want = want
         must_be("render", "couple_features", couple, bool, "True or False")
         self.couple = couple
-        if settings.traversal == "tiles" and camera.is_distorted:
+        if settings.planar and camera.is_distorted:
             raise NotImplementedError(
-                f"render: traversal='tiles' must have a pinhole camera, got model {camera.model!r} with distortion; "
-                "use traversal='bvh' (true rays) or camera.undistorted()"
+                f"render: response={settings.response!r} is a model of a pinhole's image plane, got a camera of model "
+                f"{camera.model!r} with distortion; use camera.undistorted(), or a response along rays "
+                "(--preset exact, fast or 3dgut)"
             )
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
         self._check_memory(gaussians, rays)
@@ -134,8 +140,9 @@ class Call:
         else:
             self.shape = (camera.height, camera.width)
             pose = rigid_pose(camera)
+            local = self._moving(lens) if lens is not None else None
             if settings.traversal == "bvh" or settings.sh_direction == "ray":
-                d = local_directions(camera) @ pose[:3, :3]
+                d = (self._local() if local is None else local) @ pose[:3, :3]
                 center = -(pose[:3, 3] @ pose[:3, :3]) - origin
                 self._set_rays(center.expand(d.shape), d)
         # The world of the means is re-centered: x_world = x + origin.
@@ -153,6 +160,30 @@ class Call:
         gradients = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians.parameters().values())
         needed = memory.frame_bytes(pixels, self.settings, width, gradients)
         memory.require("render", needed, size, "render a smaller one", self.home.type == "cuda")
+
+    def _moving(self, lens: torch.Tensor) -> torch.Tensor:
+        """(P, 3) directions in camera axes that move with the lens, which tiles are told as shifts."""
+        camera = self.camera
+        if self.settings.planar:
+            raise NotImplementedError(
+                "render: derivatives by the lens must be of a response along rays, got "
+                f"{self.settings.response!r}; use preset exact, fast or 3dgut"
+            )
+        self.motion = LensMotion(camera, self._local())
+        local = self.motion.directions(lens)
+        if self.settings.traversal == "tiles":
+            self.inputs["ray_shifts"] = self._move(self.motion.shifts(local, self.is_wide()))
+        return local
+
+    def _local(self) -> torch.Tensor:
+        """(P, 3) directions in camera axes; where there is none, any that is a number."""
+        d = local_directions(self.camera)
+        return torch.where(torch.isfinite(d).all(1, keepdim=True), d, torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype))
+
+    def is_wide(self) -> bool:
+        """Whether the camera's lens is a wide one."""
+        table = lens_of(self.lib, self.camera, TILE)
+        return table is not None and table.wide
 
     def _set_rays(self, o, d):
         if self.settings.traversal == "bvh":
@@ -190,11 +221,12 @@ class Call:
             K = self.camera.K
             size = (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
-            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients)
+            lens = lens_of(lib, self.camera, TILE)
+            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients, lens)
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
             trimmed = not self.want & {"depth", "count"}
-            traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed)
-        rays = self._column(p, "ray_origins"), self._column(p, "ray_directions")
+            traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed, lens)
+        rays = [self._column(p, name) for name in OF_VIEW[1:]]
         return compositor_of(
             lib, s, traversal, p, self.coefficients, *rays, want=self.want, width=self.width, couple=self.couple
         )
@@ -247,7 +279,7 @@ class Call:
 def _check_names(parameters: dict) -> None:
     """Refuse a scene's parameter that has the name of what belongs to the view: their tangents would be mixed."""
     for name in parameters:
-        if name in (*OF_VIEW, "camera", "rotations", "time", "phi"):
+        if name in (*OF_VIEW, "camera", "lens", "rotations", "time", "phi"):
             raise ArgumentError(
                 f"scene.parameters(): names must not be those of the view or of rotations, got {name!r}; rename "
                 f"it, e.g. {name + '_of_scene'!r}"

@@ -46,6 +46,7 @@ def compositor_of(
     coefficients: int,
     origins: list[Float] | None = None,
     directions: list[Float] | None = None,
+    shifts: list[Float] | None = None,
     want: frozenset = frozenset(),
     width: int = 0,
     couple: bool = True,
@@ -58,6 +59,7 @@ def compositor_of(
         coefficients: SH coefficients in `p["sh"]`.
         origins, directions: Three (P,) columns each, unit directions, both in the world of the means. Needed where rays
             carry something: themselves through a world, an SH basis where colors are evaluated along them.
+        shifts: Three (P,) columns, `LensMotion.shifts`, where rays of the screen move with the lens.
     """
     along_ray = settings.sh_direction == "ray"
     basis: list[Float] = []
@@ -71,6 +73,8 @@ def compositor_of(
         assert origins is not None
         assert directions is not None
         carried += [*origins, *directions]
+    elif shifts is not None:
+        carried += shifts
     compositor = Compositor(lib, settings, traversal, want, width, len(basis), couple)
     # Casts: parameters may be float64, where means are; hits are composited in float32.
     sh = lib.Float(p["sh"]) if along_ray else None
@@ -139,7 +143,7 @@ class Compositor:
             record: Columns (N,) of floats, laid out as `records` says.
             sh: Flat (N K 3) when SH are evaluated along rays, else None.
             features: Flat (N D) or None.
-            carried: Columns (rays,): SH basis values, then o and d of world rays.
+            carried: Columns (rays,): SH basis values, then o and d of world rays or shifts of others.
             keep: The adjoint may follow.
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
@@ -188,6 +192,9 @@ class Compositor:
         """Flat images, `count` visibilities among them, from all passes."""
         lib = self.lib
         out = self._images()
+        if self.traversal.holes is not None:
+            for c, x in enumerate(self.model.background):
+                dr.scatter(out["rgb"], x, 3 * dr.arange(lib.UInt32, self.rays) + c)
         self.finals = []
         for name, kind in (("median", lib.Float), ("count", lib.UInt32)):
             if name in want:

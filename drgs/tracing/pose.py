@@ -9,7 +9,7 @@ import torch
 
 from drgs.cameras import Camera, rigid
 
-__all__ = ["rigid_pose", "local_directions", "quaternion_product", "shifted", "turned", "twisted"]
+__all__ = ["rigid_pose", "local_directions", "local_rays", "quaternion_product", "shifted", "turned", "twisted"]
 
 
 def rigid_pose(camera: Camera) -> torch.Tensor:
@@ -36,8 +36,13 @@ def shifted(pose: torch.Tensor, origin: torch.Tensor) -> torch.Tensor:
 
 def local_directions(camera: Camera) -> torch.Tensor:
     """(H * W, 3) float64 unit directions in camera axes, distortion included."""
+    return torch.from_numpy(local_rays(camera))
+
+
+def local_rays(camera: Camera) -> np.ndarray:
+    """What `local_directions` gives, as an array."""
     identity = dataclasses.replace(camera, w2c=np.eye(4))
-    return torch.from_numpy(np.asarray(identity.pixel_directions(), np.float64).reshape(-1, 3))
+    return np.asarray(identity.pixel_directions(), np.float64).reshape(-1, 3)
 
 
 def twisted(pose: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ Everything about Gaussians is per-Gaussian work, done once a view in float64 and
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 
@@ -15,7 +15,7 @@ from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.records import dot
 
-__all__ = ["Activated", "Projected", "Ray", "Screen", "SeenColor"]
+__all__ = ["Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "SeenColor"]
 
 
 @dataclasses.dataclass
@@ -23,11 +23,14 @@ class Ray:
     """One ray a lane.
 
     Attributes:
-        x, y: Pixel position, of a pinhole ray.
-        length: |d| of that ray's direction with d_z = 1.
+        x, y: Pixel position, of a pinhole ray; of a narrow lens the center of a pixel of the pinhole camera.
+        length: |d| of that ray's direction with d_z = 1; 1 of a wide lens.
         carried: What a ray carries that is differentiated: SH basis values (`basis` of them), then o and d of a world
-            ray.
+            ray, or the shifts of a ray of the screen.
         basis: Number of SH basis values; 0 where colors are evaluated towards the means.
+        direction: Unit direction in camera axes, of a wide lens (lens_rays.py).
+        low: What float32 leaves of x and y, or of the direction, of a ray through a lens.
+        shifted: Whether the last three that are carried, which are 0, say how it moves with the lens (lens_motion.py).
     """
 
     x: Float = None
@@ -35,6 +38,22 @@ class Ray:
     length: Float = None
     carried: list[Float] = dataclasses.field(default_factory=list)
     basis: int = 0
+    direction: list[Float] = dataclasses.field(default_factory=list)
+    low: list[Float] = dataclasses.field(default_factory=list)
+    shifted: bool = False
+
+
+class Lens(Protocol):
+    """What bounds on the image ask of a lens (lens_rays.py).
+
+    Attributes:
+        fisheye: Guides are those of the equidistant fisheye; else pixels of the pinhole camera.
+    """
+
+    fisheye: bool
+
+    def pixels(self, guides: list[Float]) -> list[Float]:
+        """Bounds of the pixels whose guides are within bounds."""
 
 
 class Screen(NamedTuple):
@@ -43,7 +62,10 @@ class Screen(NamedTuple):
     Attributes:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
         width, height: Size of the image, in pixels.
-        x, y: (N,) each Gaussian's anchor: the pixel center that its record is expanded around.
+        x, y: (N,) each Gaussian's anchor: the pixel center that its record is expanded around; on a side of the cube
+            the place where it is, from -1 to 1.
+        lens: The lens, if there is one.
+        side: (N,) the side of the cube, 0, 1 or 2 for x, y and z, that the anchor is on; None of what is no wide lens.
     """
 
     pinhole: list[Float]
@@ -51,6 +73,46 @@ class Screen(NamedTuple):
     height: int
     x: Float
     y: Float
+    lens: Lens | None = None
+    side: Float | Any = None
+
+    def axes(self) -> tuple[list[Float], list[Float], list[Float]]:
+        """Three vectors in camera axes: the direction of a ray changes by so much in x and y, from that at the anchor
+        on.
+        """
+        fx, skew, cx, fy, cy = self.pinhole
+        if self.side is None:
+            yn = (self.y - cy) / fy
+            anchor = [(self.x - cx - skew * yn) / fx, yn, type(yn)(1)]
+            return [dr.rcp(fx), type(fx)(0), type(fx)(0)], [-skew / (fx * fy), dr.rcp(fy), type(fx)(0)], anchor
+        unit = [dr.select(self.side == k, type(fx)(1), 0) for k in range(3)]
+        dx = [unit[2], unit[0], unit[1]]
+        dy = [unit[1], unit[2], unit[0]]
+        return dx, dy, [self.x * a + self.y * b + c for a, b, c in zip(dx, dy, unit, strict=True)]
+
+
+class Patch(NamedTuple):
+    """The rays of a tile, as a record sees them: (x, y, w) within a box.
+
+    Attributes:
+        dx, dy, w: The middle of the box, from w times the anchor; w is 1 but for wide lenses.
+        half: How far it reaches in x, y and, for wide lenses, w; there from 0 on, not from the anchor.
+        anchor: The record's, for wide lenses.
+    """
+
+    dx: Float
+    dy: Float
+    w: Float | int
+    half: tuple
+    anchor: tuple | Any = None
+
+    def spread(self, a: Float, b: Float, c: Float) -> Float:
+        """The most that a dx + b dy + c w differs from what it is in the middle."""
+        hx, hy, *hw = self.half
+        if not hw:
+            return hx * (abs(a) + abs(b)) if hx is hy else dr.fma(hx, abs(a), hy * abs(b))
+        ax, ay = self.anchor
+        return dr.fma(hx, abs(a), dr.fma(hy, abs(b), hw[0] * abs(c - a * ax - b * ay)))
 
 
 class SeenColor(NamedTuple):

@@ -12,6 +12,7 @@ import drjit as dr
 
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib
+from drgs.tracing.lens_rays import LensRays, on_side
 from drgs.tracing.primitives import Activated, Projected, Screen
 from drgs.tracing.records import ALPHA
 from drgs.tracing.responses import Response, response_of
@@ -28,8 +29,9 @@ def project_screen(
     width: int,
     height: int,
     coefficients: int,
+    lens: LensRays | None = None,
 ) -> Projected:
-    """Screen records of a pinhole camera.
+    """Screen records of a camera.
 
     Args:
         lib: Dr.Jit types of the backend.
@@ -39,35 +41,54 @@ def project_screen(
         settings: Settings of the render, with traversal `tiles`.
         width, height: Size of the image, in pixels.
         coefficients: SH coefficients in `p["sh"]`.
+        lens: The camera's, if it is no pinhole.
     Returns:
         Records, depth keys and bounds of all N Gaussians.
     """
     Float = lib.Float
     response = response_of(settings)
     g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
-    fx, skew, cx, fy, cy = pinhole
-    # The anchor: pixel center nearest to the projected mean, on the screen; the center of it for z <= 0. It is where
-    # the record is expanded around, which changes no value: hence no derivative. A mean nearer to the camera plane than
-    # 1e-9 of its distance counts as on it.
-    zd = dr.detach(g.center[2])
-    cd = dr.detach(g.center)
-    front = zd > 1e-9 * (abs(cd[0]) + abs(cd[1]))
-    iz = dr.select(front, 1 / dr.select(front, zd, 1), 0)
-    px = dr.select(front, fx * (cd[0] * iz) + skew * (cd[1] * iz) + cx, cx)
-    py = dr.select(front, fy * (cd[1] * iz) + cy, cy)
-    # Into the image: around an anchor far outside, the record would lose digits at the pixels that are looked at.
-    ax = dr.clip(dr.floor(px), 0, width - 1) + 0.5
-    ay = dr.clip(dr.floor(py), 0, height - 1) + 0.5
-    shape, bounds, alive, frame = response.project(g, Screen(pinhole, width, height, ax, ay))
+    screen = _screen(lib, dr.detach(g.center), pinhole, width, height, lens)
+    shape, bounds, alive, frame = response.project(g, screen)
     distance = g.distance()
-    record = [Float(ax), Float(ay), *[Float(x) for x in shape]]
+    record = [Float(screen.x), Float(screen.y), *[Float(x) for x in shape]]
     record += [Float(0)] * (ALPHA - len(record))
     record += _common(lib, g, response, coefficients)
+    if screen.side is not None:
+        record += [Float(screen.side)]
     if settings.near > 0:
-        alive &= zd > settings.near
+        alive &= dr.detach(g.center[2]) > settings.near
     # Keys order hits, and an order has no derivative.
     key = dr.detach(g.center[2] if settings.depth_key == "z" else distance)
     return Projected(record, Float(key), [Float(b) for b in bounds], alive, frame=frame)
+
+
+def _screen(lib: Lib, c: list[Float], pinhole: list[Float], width: int, height: int, lens: LensRays | None) -> Screen:
+    """The screen with the anchor of every Gaussian, given the means `c` in camera axes.
+
+    The anchor is where the record is expanded around, which changes no value: hence no derivative.
+    """
+    fx, skew, cx, fy, cy = pinhole
+    if lens is not None and lens.wide:
+        # On the side of the cube that the mean is seen through; a mean at the camera center is seen nowhere.
+        size = [abs(x) for x in c]
+        side = dr.select(size[0] > dr.maximum(size[1], size[2]), 0, dr.select(size[1] > size[2], 1, 2))
+        x, y, w = on_side(side, c)
+        w = dr.select(w != 0, w, 1)
+        # Where float32 holds it: it is read from the record.
+        x, y = (lib.Float64(lib.Float(v / w)) for v in (x, y))
+        return Screen(pinhole, width, height, x, y, lens, lib.Float(side))
+    # The pixel center nearest to the projected mean, on the screen; the center of it for z <= 0. A mean nearer to the
+    # camera plane than 1e-9 of its distance counts as on it.
+    front = c[2] > 1e-9 * (abs(c[0]) + abs(c[1]))
+    iz = dr.select(front, 1 / dr.select(front, c[2], 1), 0)
+    px = dr.select(front, fx * (c[0] * iz) + skew * (c[1] * iz) + cx, cx)
+    py = dr.select(front, fy * (c[1] * iz) + cy, cy)
+    # Into the image: around an anchor far outside, the record would lose digits at the pixels that are looked at.
+    (low_x, low_y), (high_x, high_y) = ((0, 0), (width - 1, height - 1)) if lens is None else (lens.low, lens.high)
+    ax = dr.clip(dr.floor(px), low_x, high_x) + 0.5
+    ay = dr.clip(dr.floor(py), low_y, high_y) + 0.5
+    return Screen(pinhole, width, height, ax, ay, lens)
 
 
 def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coefficients: int) -> Projected:

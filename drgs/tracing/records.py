@@ -1,7 +1,7 @@
 """What hits read of a Gaussian in one view: records, floats side by side in one buffer.
 
-`projection.py` and the responses fill them, the loops over hits read them. A record is of the screen (pinhole cameras,
-traversal `tiles`) or of the world (any ray, `bvh`).
+`projection.py` and the responses fill them, the loops over hits read them. A record is of the screen (cameras of any
+lens, traversal `tiles`) or of the world (any ray, `bvh`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ __all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "load_record", "
 # Layout of a screen record (floats). ALPHA holds the opacity, or what stands for it in the response (its `strength`).
 RECORD = 24
 AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)
+SIDE = 22  # of the cube, under a wide lens (lens_rays.py)
 # A world record: mean (3), W by rows (9), opacity, extent^2, rgb (3); padded to the same stride.
 W_MEAN = 0
 W_ROWS = 3

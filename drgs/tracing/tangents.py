@@ -39,6 +39,7 @@ def _columns(call: Call, tangents: dict) -> tuple[list[dict], bool]:
     if "quats" in shapes:
         shapes["rotations"] = (shapes["quats"][0], 3)
     shapes["camera"] = (6,)
+    shapes["lens"] = call.camera.lens_parameters.shape
     lengths = set()
     given = {}
     for name, x in tangents.items():
@@ -67,6 +68,15 @@ def _column(call: Call, given: dict) -> dict:
     if "rotations" in given:
         q = call.inputs["quats"].to(torch.float64)
         column["quats"] = column.get("quats", 0) + 0.5 * quaternion_product(given["rotations"].to(call.home), q)
+    if "lens" in given:
+        lens = torch.from_numpy(call.camera.lens_parameters.copy())
+        local, moved = torch.func.jvp(call.motion.directions, (lens,), (given["lens"].cpu(),))
+        if "ray_shifts" in call.inputs:
+            shifts = lambda directions: call.motion.shifts(directions, call.is_wide())  # noqa: E731
+            column["ray_shifts"] = torch.func.jvp(shifts, (local,), (moved,))[1].to(call.home)
+        if "ray_directions" in call.inputs:
+            turn = rigid_pose(call.camera).detach()[:3, :3]  # numbers: where the derivative is taken
+            column["ray_directions"] = (moved @ turn).to(call.home)
     if "camera" in given:
         twist = given["camera"]
         w2c = rigid_pose(call.camera).detach()  # numbers: where the derivative is taken
@@ -76,7 +86,8 @@ def _column(call: Call, given: dict) -> dict:
         origin = torch.linalg.solve(w2c[:3, :3], w2c_there[:, 3] - w2c[:3, 3])
         column["w2c"] = shifted(change, origin).to(call.home)
         if "ray_directions" in call.inputs:
-            column["ray_directions"] = turned(twist[:3], call.inputs["ray_directions"])
+            turning = turned(twist[:3], call.inputs["ray_directions"])
+            column["ray_directions"] = column.get("ray_directions", 0) + turning
         if "ray_origins" in call.inputs:
             o = call.inputs["ray_origins"] + origin.to(call.home)
             column["ray_origins"] = turned(twist[:3], o) + twist[3:].to(call.home)

@@ -1,4 +1,4 @@
-"""Which Gaussians a pinhole tile must look at, and the walk of its pixels along that list.
+"""Which Gaussians a tile must look at, and the walk of its pixels along that list.
 
 A frame is cut into 8x8-pixel tiles. Every Gaussian is listed in each tile of its screen bounds, where these are large
 only in those in which a pixel may be hit; tiles are grouped and ordered by one sort of packed 64-bit keys. `center`
@@ -22,7 +22,8 @@ from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.kernels import HitModel
-from drgs.tracing.primitives import Projected, Ray
+from drgs.tracing.lens_rays import LensRays
+from drgs.tracing.primitives import Patch, Projected, Ray
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
 from drgs.tracing.rows import MemoryBudget, SortedHits
@@ -44,10 +45,11 @@ _LARGE = 8  # tiles of a box, on average
 
 
 class TileTraversal:
-    """The pixels of a pinhole camera, each along the list of its tile; a `Traversal`.
+    """The pixels of a camera, each along the list of its tile; a `Traversal`.
 
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
+        lens: The camera's, if it is no pinhole.
         trimmed: Leave tails out, in `ray` order, whose opacities add up to `_TAILS` at most in a pixel.
     """
 
@@ -62,6 +64,7 @@ class TileTraversal:
         width: int,
         height: int,
         trimmed: bool,
+        lens: LensRays | None = None,
     ) -> None:
         self.lib = lib
         self.settings = settings
@@ -73,6 +76,8 @@ class TileTraversal:
         self.height = height
         self.rays = width * height
         self.certificate: dict = {}
+        self.lens = lens
+        self.holes = None if lens is None else lens.known
         self.pinhole = [lib.Float(v) for v in pinhole]
         dr.make_opaque(*self.pinhole)
 
@@ -82,8 +87,9 @@ class TileTraversal:
         self.records = records
         self.carried = carried
         self.basis = basis
+        self.shifted = len(carried) > basis
         size = self.width, self.height
-        self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed)
+        self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed, self.lens)
         self.certificate["pairs"] = self.lists.pairs
         self.budget = MemoryBudget(_HELD if replayed else 0)
         if self.settings.order == "ray":
@@ -184,6 +190,10 @@ class TileTraversal:
         pixels = [(x + a, y + b) for a, b in corners]
         inside = [(px < self.width) & (py < self.height) for px, py in pixels]
         flat = [py * self.width + px for px, py in pixels]
+        if self.holes is not None:
+            inside = [
+                ok & (dr.gather(lib.UInt32, self.holes, at, ok) != 0) for ok, at in zip(inside, flat, strict=True)
+            ]
         rays = [
             self._ray(lib.Float(px) + 0.5, lib.Float(py) + 0.5, f, i)
             for (px, py), f, i in zip(pixels, flat, inside, strict=True)
@@ -209,12 +219,14 @@ class TileTraversal:
 
     def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
+        carried = [dr.gather(self.lib.Float, c, flat, inside) for c in self.carried]
+        if self.lens is not None:
+            return self.lens.ray(self.pinhole, flat, inside, carried, self.basis, self.shifted)
         fx, skew, cx, fy, cy = self.pinhole
         v = (y - cy) / fy
         u = (x - cx - skew * v) / fx
         length = dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
-        carried = [dr.gather(self.lib.Float, c, flat, inside) for c in self.carried]
-        return Ray(x, y, length, carried, self.basis)
+        return Ray(x, y, length, carried, self.basis, shifted=self.shifted)
 
 
 class _Band(NamedTuple):
@@ -267,6 +279,7 @@ def build(
     height: int,
     record: Float,
     trimmed: bool = False,
+    lens: LensRays | None = None,
 ) -> Lists:
     """List the Gaussians of each tile.
 
@@ -275,6 +288,7 @@ def build(
         projected: `Projected` of the view.
         record: Flat record buffer.
         trimmed: Leave tails out.
+        lens: The camera's, if it is no pinhole.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     x0, y0, x1, y1 = projected.bounds
@@ -317,8 +331,8 @@ def build(
     # boxes hold few, and looking for them costs more than they do.
     large = pairs > _LARGE * int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
     box = [dr.gather(lib.Int32, b, order) for b in (tx0, tx1, ty0, ty1)]
-    loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.EXT2 + 1)]
-    tiles = _Tiles(lib, settings, loaded)
+    loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.RECORD)]
+    tiles = _Tiles(lib, settings, loaded, lens=lens)
     _emit(lib, keys, gaussian, amount, offset, box, columns, tiles, large)
     if large:
         kept = dr.compress(keys != _NOWHERE)
@@ -332,10 +346,18 @@ def build(
     dr.eval(tile, index)
     _ranges(lib, tile, start, end)
     lists = Lists(index, start, end, columns, rows, pairs)
-    return _shorter(lib, lists, tile, settings, record, count) if trimmed else lists
+    return _shorter(lib, lists, tile, settings, record, count, lens) if trimmed else lists
 
 
-def _shorter(lib: Lib, lists: Lists, tile: UInt32, settings: RenderSettings, record: Float, count: int) -> Lists:
+def _shorter(
+    lib: Lib,
+    lists: Lists,
+    tile: UInt32,
+    settings: RenderSettings,
+    record: Float,
+    count: int,
+    lens: LensRays | None,
+) -> Lists:
     """Shorter lists: an extent that bounds the sum of the tails of all Gaussians is longer than a tile needs, which
     lists few of them. Beyond the extent a Gaussian has at most the opacity 1e-5 / N (projection.py); beyond a squared
     one that is less by c, exp(c / 2) times as much, so that n tails add up to _TAILS where c = 2 ln(_TAILS N / 1e-5 n).
@@ -344,13 +366,14 @@ def _shorter(lib: Lib, lists: Lists, tile: UInt32, settings: RenderSettings, rec
         tile: (pairs,) of each entry.
         record: Flat record buffer.
         count: N.
+        lens: The camera's, if it is no pinhole.
     """
     listed = lib.Float(lists.end - lists.start)
     cut = dr.maximum(2 * dr.log(_TAILS / 1e-5 * count / dr.maximum(listed, 1)), 0)
     loaded = load_record(lib, record, lists.index, lib.Bool(True))
-    tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile))
-    dx, dy = tiles.center(lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns))
-    kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & tiles.may_hit(dx, dy))
+    tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile), lens)
+    x, y = lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns)
+    kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & tiles.may_hit(x, y))
     start = dr.zeros(lib.UInt32, dr.width(listed))
     end = dr.zeros(lib.UInt32, dr.width(listed))
     if dr.width(kept) == 0:
@@ -389,10 +412,19 @@ class _Tiles:
     Args:
         loaded: The first entries of each lane's record.
         cut: What is taken off squared extents.
+        lens: The camera's, if it is no pinhole.
     """
 
-    def __init__(self, lib: Lib, settings: RenderSettings, loaded: list[Float], cut: Float | int = 0) -> None:
+    def __init__(
+        self,
+        lib: Lib,
+        settings: RenderSettings,
+        loaded: list[Float],
+        cut: Float | int = 0,
+        lens: LensRays | None = None,
+    ) -> None:
         self.lib = lib
+        self.lens = lens
         self.r = loaded
         self.response = response_of(settings)
         self.limit = loaded[layout.EXT2] - cut
@@ -402,15 +434,18 @@ class _Tiles:
             # What float32 rounds must not lose a hit: 1e-4 is a hundred times as much.
             self.limit = dr.minimum(self.limit, needed + 1e-4 * abs(needed) + 1e-4)
 
-    def center(self, x: Int32, y: Int32) -> tuple[Float, Float]:
-        """Center of tile (x, y) from the anchor, in pixels."""
+    def patch(self, x: Int32, y: Int32) -> Patch:
+        """The rays of tile (x, y)."""
+        if self.lens is not None:
+            return self.lens.patch(self.r, x, y)
         at = (self.lib.Float(v) + 0.5 for v in (x, y))
         dx, dy = (v * TILE - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
-        return dx, dy
+        half = 0.5 * (TILE - 1)
+        return Patch(dx, dy, 1, (half, half))
 
-    def may_hit(self, dx: Float, dy: Float) -> Mask:
-        """False only where no pixel center of the tile around there has a hit."""
-        return self.response.may_hit(self.r, dx, dy, 0.5 * (TILE - 1), self.limit)
+    def may_hit(self, x: Int32, y: Int32) -> Mask:
+        """False only where no pixel center of tile (x, y) has a hit."""
+        return self.response.may_hit(self.r, self.patch(x, y), self.limit)
 
 
 def _emit(
@@ -430,9 +465,8 @@ def _emit(
     def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
         """Write one pair, and step to the next tile of the box, row by row."""
         tile = lib.UInt32(y * columns + x)
-        dx, dy = tiles.center(x, y)
         key = (lib.UInt64(tile) << 32) | lib.UInt64(gaussian)
-        dr.scatter(keys, key, offset + k, tiles.may_hit(dx, dy) if large else True)
+        dr.scatter(keys, key, offset + k, tiles.may_hit(x, y) if large else True)
         wrap = x >= x1
         return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)
 

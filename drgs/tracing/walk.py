@@ -330,12 +330,14 @@ class Traversal(Protocol):
         world: Their records are world records.
         rays: How many there are, in the order of the pixels.
         certificate: What the traversal says of its lists, after `start`.
+        holes: (rays,) UInt32, 0 for pixels that have no ray and show the background; None if all have one.
     """
 
     projected: Projected
     world: bool
     rays: int
     certificate: dict
+    holes: UInt32 | None
 
     def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
         """Build lists or proxies from the record buffer.

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from drgs.settings import RESPONSES, RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask
-from drgs.tracing.primitives import Activated, Projected, Ray, Screen
+from drgs.tracing.primitives import Activated, Patch, Projected, Ray, Screen
 
 __all__ = ["RESPONSES", "Response", "response_of"]
 
@@ -65,8 +65,8 @@ class Response(Protocol):
     def least_strength(self, alpha_min: float) -> float:
         """Least strength exp(-rho^2 / 2) of a hit whose opacity reaches alpha_min."""
 
-    def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
-        """False only where no ray within `half` pixels of (dx, dy), from the anchor, hits with rho^2 <= limit."""
+    def may_hit(self, r: list[Float], patch: Patch, limit: Float) -> Mask:
+        """False only where no ray of the patch hits with rho^2 <= limit."""
 
 
 def response_of(settings: RenderSettings) -> Response:

@@ -13,7 +13,7 @@ import drjit as dr
 
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Lib, Mask
-from drgs.tracing.primitives import Activated, Projected, Ray, Screen
+from drgs.tracing.primitives import Activated, Patch, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
 from drgs.tracing.responses.peak import AlphaStrength, deviation
 
@@ -100,9 +100,9 @@ class Ewa(AlphaStrength):
 
     # -- once a tile -------------------------------------------------------------------------------------------------
 
-    def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
+    def may_hit(self, r: list[Float], patch: Patch, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution; 1.0001 is more than float32 rounds."""
-        return ~(deviation(r, dx, dy, half) > 1.0001 * limit)
+        return ~(deviation(r, patch) > 1.0001 * limit)
 
 
 EWA = Ewa()

@@ -12,6 +12,10 @@ anchor is the pixel center nearest to the projected mean, where C_a is small. A 
 no projection: there any anchor will do, because such a Gaussian reaches the picture only if it is within a few standard
 deviations of the camera, where nothing is large.
 
+Under a lens a ray is d = x d_x + y d_y + w d_a, from the anchor on: a point between pixels, w = 1, or, of a lens that
+sees wide, a direction on the side of a cube around the camera that the mean is seen through, (d_x, d_y) its axes
+(lens_rays.py). All of the above is linear in (x, y, w), and rho^2 does not depend on the length of d.
+
 Derivatives. With y = S^-1 R^T x the ray meets its peak at p (|p|^2 = rho^2, p perpendicular to d'), u = t* |d'|, and
 e = d' / |d'|. As p minimizes the distance, moving along the ray changes nothing, and
 
@@ -28,8 +32,10 @@ import drjit as dr
 
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Lib, Mask
-from drgs.tracing.primitives import Activated, Projected, Ray, Screen
+from drgs.tracing.lens_rays import on_side
+from drgs.tracing.primitives import Activated, Patch, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
+from drgs.tracing.silhouettes import silhouette
 
 __all__ = ["PEAK", "AlphaStrength", "Peak", "approach", "deviation", "entry", "times"]
 
@@ -69,9 +75,7 @@ class Peak(AlphaStrength):
 
     def project(self, g: Activated, screen: Screen) -> tuple[list[Float], list[Float], Mask, tuple]:
         """The 15 numbers of rho^2, t* and |d'| around the anchor, and the bounds of the extent ellipsoid."""
-        fx, skew, cx, fy, cy = screen.pinhole
-        dx = [dr.rcp(fx), type(fx)(0), type(fx)(0)]
-        dy = [-skew / (fx * fy), dr.rcp(fy), type(fx)(0)]
+        dx, dy, da = screen.axes()
         inverse = [dr.rcp(s) for s in g.scale]
         volume = inverse[0] * inverse[1] * inverse[2]
         cofactor = [s * volume for s in g.scale]
@@ -80,8 +84,6 @@ class Peak(AlphaStrength):
         def local(v: list[Float], weight: list[Float]) -> list[Float]:  # diag(weight) R^T v, from camera axes
             return [weight[k] * (f[0][k] * v[0] + f[1][k] * v[1] + f[2][k] * v[2]) for k in range(3)]
 
-        yn = (screen.y - cy) / fy
-        da = [(screen.x - cx - skew * yn) / fx, yn, type(yn)(1)]
         d = local(da, inverse)
         norm = dr.sqrt(dot(d, d))
         unit = dr.rcp(norm)
@@ -101,7 +103,7 @@ class Peak(AlphaStrength):
         f3 = cross(f1, f2)
         h = _scaled(local(g.center, inverse), unit)
         numbers = [*r, e2, e3, e4, dot(f2, Dy), dot(f3, Dy), dot(f1, h), dot(f2, h), dot(f3, h), norm]
-        return numbers, *_silhouette(g, screen), (g.rotation, g.scale, (u, v), (f1, f2, f3))
+        return numbers, *silhouette(g, screen), (g.rotation, g.scale, (u, v), (f1, f2, f3))
 
     def extras(self, lib: Lib, projected: Projected, moved: list[list[Float]] | None) -> list[Float]:
         """What the closed forms need of the frame, see `extra`."""
@@ -139,7 +141,8 @@ class Peak(AlphaStrength):
         c1, c2, d, inverse = _on_screen(r, ray)
         squared = dr.fma(c1, c1, c2 * c2)
         along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
-        return squared * inverse, along * inverse * ray.length, self._u_on_screen(r, along, inverse)
+        length = ray.length + ray.carried[-1] if ray.shifted and not ray.direction else ray.length
+        return squared * inverse, along * inverse * length, self._u_on_screen(r, along, inverse)
 
     def _u_in_world(self, key: Float, d: list[Float], inverse: Float) -> Float | None:
         return None
@@ -170,20 +173,20 @@ class Peak(AlphaStrength):
 
     # -- once a tile -------------------------------------------------------------------------------------------------
 
-    def may_hit(self, r: list[Float], dx: Float, dy: Float, half: float, limit: Float) -> Mask:
+    def may_hit(self, r: list[Float], patch: Patch, limit: Float) -> Mask:
         """False only where rho^2 <= limit has no solution, or (if only peaks in front count) all of it is behind."""
-        d = _direction(r, dx, dy)
-        slopes = (r[layout.E2], r[layout.E3]), (r[layout.E4], r[layout.E5]), (0.0, r[layout.E6])
-        most = [abs(v) + half * (abs(a) + abs(b)) for v, (a, b) in zip(d, slopes, strict=True)]
+        d = _direction(r, patch.dx, patch.dy, patch.w)
+        slopes = (r[layout.E2], r[layout.E3], 1), (r[layout.E4], r[layout.E5], 0), (0.0, r[layout.E6], 0)
+        most = [abs(v) + patch.spread(*slope) for v, slope in zip(d, slopes, strict=True)]
         length2 = dr.fma(most[0], most[0], dr.fma(most[1], most[1], most[2] * most[2]))
         # 1.0001 and 1e-6: float32 rounds what is compared by less.
-        met = ~(deviation(r, dx, dy, half) > 1.0001 * limit * length2)
+        met = ~(deviation(r, patch) > 1.0001 * limit * length2)
         if self.front_only:
             h = r[layout.H1], r[layout.H2], r[layout.H3]
             along = [a * b for a, b in zip(h, d, strict=True)]
             rise = [sum(a * b[k] for a, b in zip(h, slopes, strict=True)) for k in range(2)]
             rounding = 1e-6 * sum(abs(x) for x in along)
-            met &= ~(sum(along) + half * (abs(rise[0]) + abs(rise[1])) + rounding <= 0)
+            met &= ~(sum(along) + patch.spread(rise[0], rise[1], h[0]) + rounding <= 0)
         return met
 
 
@@ -199,14 +202,15 @@ def entry(r: list[Float], ray: Ray) -> Float:
     return t0 - dot(a, d) * inverse - dr.sqrt(half)
 
 
-def deviation(r: list[Float], dx: Float, dy: Float, half: float) -> Float:
-    """Least (c1^2 + c2^2) of the record within `half` pixels of (dx, dy), rounding taken off."""
+def deviation(r: list[Float], patch: Patch) -> Float:
+    """Least (c1^2 + c2^2) of the record within a patch, rounding taken off."""
     L = layout
 
-    def least(a: Float, b: Float, c: Float) -> Float:  # of |a x + b y + c|
-        parts = a * dx, b * dy, c
-        rounding = 1e-6 * (abs(parts[0]) + abs(parts[1]) + abs(c))  # a few units in the last place of each part
-        return dr.maximum(abs(parts[0] + parts[1] + parts[2]) - half * (abs(a) + abs(b)) - rounding, 0)
+    def least(a: Float, b: Float, c: Float) -> Float:  # of |a x + b y + c w|
+        parts = a * patch.dx, b * patch.dy, _times_w(c, patch.w)
+        # A few units in the last place of each part.
+        rounding = 1e-6 * (abs(parts[0]) + abs(parts[1]) + abs(parts[2]))
+        return dr.maximum(abs(parts[0] + parts[1] + parts[2]) - patch.spread(a, b, c) - rounding, 0)
 
     m1 = least(r[L.R11], r[L.R12], r[L.R13])
     m2 = least(r[L.R21], r[L.R22], r[L.R23])
@@ -235,19 +239,43 @@ def times(extra: list[Float], which: int, x: list[Float]) -> list[Float]:
 
 
 def _on_screen(r: list[Float], ray: Ray) -> tuple[Float, Float, list[Float], Float]:
-    """The two parts of o' x d' of a pinhole ray, d' in its own frame, and 1 / |d'|^2."""
+    """The two parts of o' x d' of a ray of the screen, d' in its own frame, and 1 / |d'|^2."""
     L = layout
-    dx, dy = ray.x - r[L.AX], ray.y - r[L.AY]
-    c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, r[L.R13]))
-    c2 = dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, r[L.R23]))
-    d = _direction(r, dx, dy)
+    dx, dy, w = _from_anchor(r, ray)
+    c1 = dr.fma(r[L.R11], dx, dr.fma(r[L.R12], dy, _times_w(r[L.R13], w)))
+    c2 = dr.fma(r[L.R21], dx, dr.fma(r[L.R22], dy, _times_w(r[L.R23], w)))
+    d = _direction(r, dx, dy, w)
     return c1, c2, d, dr.rcp(dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2])))
 
 
-def _direction(r: list[Float], dx: Float, dy: Float) -> list[Float]:
-    """The three parts of d' at (dx, dy) from the anchor, along (f1, f2, f3)."""
+def _from_anchor(r: list[Float], ray: Ray) -> tuple[Float, Float, Float | int]:
+    """Where a ray is from the anchor, (x - w x_a, y - w y_a, w): a pixel, with w = 1, or on a side of the cube."""
+    ax, ay = r[layout.AX], r[layout.AY]
+    low = ray.low
+    if ray.shifted:
+        low = [a + b for a, b in zip(low, ray.carried[-3:], strict=False)] or ray.carried[-3:]
+    if not ray.direction:
+        dx, dy = ray.x - ax, ray.y - ay
+        return (dx + low[0], dy + low[1], 1) if low else (dx, dy, 1)
+    # A product is not rounded before it is added: where the two are nearly the same, no digit is lost.
+    x, y, w = on_side(r[layout.SIDE], ray.direction)
+    x1, y1, w1 = on_side(r[layout.SIDE], low)
+    return (
+        dr.fma(-ax, w, x) + dr.fma(-ax, w1, x1),
+        dr.fma(-ay, w, y) + dr.fma(-ay, w1, y1),
+        w + w1 if ray.shifted else w,
+    )
+
+
+def _times_w(c: Float, w: Float | int) -> Float:
+    """c w, and c itself where w is 1."""
+    return c if isinstance(w, int) else c * w
+
+
+def _direction(r: list[Float], dx: Float, dy: Float, w: Float | int) -> list[Float]:
+    """The three parts of d' at (dx, dy) from w times the anchor, along (f1, f2, f3)."""
     L = layout
-    return [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, 1)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
+    return [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, w)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
 
 
 def _local(r: list[Float], ray: Ray) -> tuple[Float, list[Float], list[Float], Float]:
@@ -303,48 +331,6 @@ def _perpendicular(a: list[Float], n: list[Float]) -> list[Float]:
         here = size[k] == largest
         result.append(dr.select(here, -(n[i] * a[i] + n[j] * a[j]) / dr.select(here, n[k], 1), a[k]))
     return result
-
-
-def _silhouette(g: Activated, screen: Screen) -> tuple[list[Float], Mask]:
-    """Screen bounds of the extent ellipsoid, exact where it lies in front of the camera plane, and which are there.
-
-    The rays that touch the ellipsoid {c, extent^2 Sigma} are a cone; a plane through the camera with normal n is
-    tangent to it where n^T (extent^2 Sigma - c c^T) n = 0. Bounds only say where to look, hence no derivative.
-    """
-    fx, skew, cx, fy, cy = screen.pinhole
-    f = g.from_local
-    extent = g.listed_extent()
-    c = dr.detach(g.center)  # for bounds, as sigma
-    e2 = extent * extent
-
-    def sigma(a: int, b: int) -> Float:
-        # Bounds have no derivative.
-        return e2 * sum(dr.detach(f[a][k] * f[b][k] * g.scale[k] * g.scale[k]) for k in range(3))
-
-    szz = sigma(2, 2)
-    q22 = szz - c[2] * c[2]
-    # The ellipsoid meets the camera plane, but for rounding: it is unbounded on the screen.
-    inside = q22 >= -1e-9 * (c[2] * c[2])
-    behind = ~inside & (c[2] < 0)
-    den = dr.select(inside, -1, q22)
-
-    def axis(k: int) -> tuple[Float, Float]:
-        q = sigma(k, 2) - c[k] * c[2]
-        root = dr.sqrt(dr.maximum(q * q - (sigma(k, k) - c[k] * c[k]) * den, 0)) / -den
-        return q / den, root
-
-    mx, rx = axis(0)
-    my, ry = axis(1)
-    grow_x = abs(fx) * rx + abs(skew) * ry
-    x = fx * mx + skew * my + cx
-    y = fy * my + cy
-    pad = 1e-3  # px; rounding of float32 bounds
-    bounds = [x - grow_x - pad, y - abs(fy) * ry - pad, x + grow_x + pad, y + abs(fy) * ry + pad]
-    full = [0.0, 0.0, float(screen.width), float(screen.height)]
-    bounds = [dr.select(inside, edge, b) for edge, b in zip(full, bounds, strict=True)]
-    # Wholly behind the camera plane at this extent: no peak in front, and what integral would add there is below
-    # the tail that the extent leaves out.
-    return bounds, ~behind & (extent > 0)
 
 
 def _scaled(a: list[Float], s: Float) -> list[Float]:
