@@ -886,7 +886,7 @@ def test_what_is_almost_a_data_set(neu3d, tmp_path):
         (lambda p: write_dnerf(p, {"train": (0.0, float("nan"), 1.0)}), "", "time must be a finite number"),
         (lambda p: write_dnerf(p, {"train": (0.0, None, 1.0)}), "", "must have a time, 1 have none"),
         (lambda p: None, "--times 0", "times must be a whole number"),
-        (lambda p: None, "--exposure auto", "exposure must be off where views are chosen on the way or things move"),
+        (lambda p: None, "--poses auto", "poses must be fixed where things move, got auto"),
         (lambda p: None, "--transients mask", "transients must be keep where things move, got mask"),
         (lambda p: None, "--test-cameras cam00,cam9", "must be among cam00, cam01, cam02, cam03, got 'cam9'"),
     ],
