@@ -64,7 +64,7 @@ def fitted(
     """
     dataset = load(DATA / scene)
     train, test = split_of(dataset, config)
-    frames = load_frames(train, config.data.max_pixels, config.data.mask)
+    frames = load_frames(train, config.data.max_pixels, config.data.mask, config.data.undistort)
     trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
     parts = trainer.parts
     trainer.parts = dataclasses.replace(parts, terms=[*parts.terms, *terms(frames)])

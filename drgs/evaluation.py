@@ -74,7 +74,9 @@ def evaluate_run(
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
-    frames = load_frames(views, _most_pixels(views, config.data.max_pixels, scale), config.data.mask)
+    frames = load_frames(
+        views, _most_pixels(views, config.data.max_pixels, scale), config.data.mask, config.data.undistort
+    )
     names = file_names([frame.name for frame in frames])
     kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
     claimed.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
@@ -93,7 +95,8 @@ def evaluate_run(
         told = refined_scores(scene, frames, config.settings) if split == "test" and scale == 1 else {}
         moved = displacement([stated[view.name] for view in train], [view.camera for view in train])
         refined = {"poses": {**moved, **told}}
-    wanted = renderers_to_measure(config.renderers, config.settings, renderer)
+    lenses = config.data.undistort == "off"
+    wanted = renderers_to_measure(config.renderers, config.settings, renderer, lenses)
     renderers = through_renderers(scene, frames, wanted, split)
     return write_metrics(
         run,

@@ -184,8 +184,10 @@ def _fit(
     if plan and parts is None:
         plan.check_blocks({"semantic": taught is not None, "deformation": motion is not None})
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
-    frames = plan.frames() if plan else load_frames(train, config.data.max_pixels, config.data.mask)
-    held_out = load_frames(test, config.data.max_pixels, config.data.mask)
+    frames = (
+        plan.frames() if plan else load_frames(train, config.data.max_pixels, config.data.mask, config.data.undistort)
+    )
+    held_out = load_frames(test, config.data.max_pixels, config.data.mask, config.data.undistort)
     if taught and taught.embeddings:
         from drgs.fitting.segments import check_references
 
@@ -260,7 +262,7 @@ def _fit(
         renderers=metrics.through_renderers(
             scene,
             held_out or trainer.photographs(),
-            renderers_to_measure(config.renderers, config.settings),
+            renderers_to_measure(config.renderers, config.settings, lenses=config.data.undistort == "off"),
             "test" if held_out else "train",
             metrics.RENDERERS_VIEWS,
         ),

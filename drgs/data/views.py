@@ -41,6 +41,7 @@ class View:
         camera_name: Name of the camera that took it, as `cam03`, where a data set has several synchronous cameras;
             else empty.
         frame: The frame of a video, where the photograph is one; `image_path` is None then.
+        keeps_lens: Images and what belongs to them are as they were taken, of `camera` itself, not undistorted.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
@@ -58,6 +59,17 @@ class View:
     semantics: Semantics | None = dataclasses.field(default=None, repr=False)
     camera_name: str = ""
     frame: VideoFrame | None = None
+    keeps_lens: bool = False
+
+    @property
+    def shown_camera(self) -> Camera:
+        """The camera of `image`, `mask` and so on, at the size of the photograph."""
+        return self.camera if self.keeps_lens else self.camera.undistorted()
+
+    @property
+    def _is_bent(self) -> bool:
+        """Whether there is a lens to be taken out."""
+        return self.camera.is_distorted and not self.keeps_lens
 
     @property
     def has_image(self) -> bool:
@@ -83,7 +95,7 @@ class View:
     def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
         """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted, area-resized.
 
-        The result belongs to `camera.undistorted().resized(width, height)`.
+        The result belongs to `shown_camera.resized(width, height)`.
 
         Args:
             width, height: Pixels; the camera's own size if left out.
@@ -123,7 +135,7 @@ class View:
             alpha = data[..., 3]
             data = data[..., :3] * data[..., 3:] + (1 - data[..., 3:]) * np.asarray(self.background, dtype=np.float32)
             alpha = alpha if alpha.min() < 1 else None
-        if self.camera.is_distorted:
+        if self._is_bent:
             columns, rows, unseen = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             data = np.clip(data, 0.0, 1.0)  # cubic interpolation overshoots at edges
@@ -208,11 +220,11 @@ class View:
         values = used_map(self.teacher_path)
         if self.semantics is not None:
             self.semantics.check_map(values, self.teacher_path, self.camera)
-        return undistorted_map(values, self.camera) if self.camera.is_distorted else values
+        return undistorted_map(values, self.camera) if self._is_bent else values
 
     def _unseen(self) -> np.ndarray | None:
         """(H,W) bool: pixels of the undistorted image that the photo did not see; None if it saw all."""
-        return lens_maps(self.camera)[2] if self.camera.is_distorted else None
+        return lens_maps(self.camera)[2] if self._is_bent else None
 
     def _size(self, width: int | None, height: int | None) -> tuple[int, int]:
         return width or self.camera.width, height or self.camera.height
@@ -230,7 +242,7 @@ class View:
         import cv2
 
         data = nearest_resized(data, (self.camera.width, self.camera.height), path)
-        if self.camera.is_distorted:
+        if self._is_bent:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return data

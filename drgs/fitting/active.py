@@ -433,7 +433,7 @@ class ActiveViews:
         stated = self.views[index].camera
         self.views[index] = view = self.views[index].checked()
         self._sizes[stated.width, stated.height] = view.camera.width, view.camera.height
-        return load_frames([view], self._config.data.max_pixels, self._config.data.mask)[0]
+        return load_frames([view], self._config.data.max_pixels, self._config.data.mask, self._config.data.undistort)[0]
 
     def _camera(self, index: int) -> Camera:
         """The camera of a candidate, as its frame would have it."""

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from drgs.fitting.renderers import AUTO, check_renderers, named_renderers
+from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
 from drgs.guards.arguments import check_fields
 from drgs.guards.records import Record, ways_of
 from drgs.information.choices import POLICIES, check_named
@@ -50,6 +50,7 @@ __all__ = [
     "SkyboxUse",
     "Start",
     "TransientUse",
+    "UndistortUse",
     "recorded_config",
 ]
 
@@ -62,6 +63,7 @@ Restart = Literal["auto", "always", "never"]
 Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
 PoseUse = Literal["fixed", "auto", "refined"]
+UndistortUse = Literal["on", "off"]
 SkyboxUse = Literal["off", "auto", "on"]
 TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
@@ -103,6 +105,8 @@ class DataConfig(Record):
         mask: Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files,
             valid where undistorted photographs have empty corners; ignore reads none. With object and auto nothing is
             where a photograph's own alpha channel is transparent, either.
+        undistort: Take lenses out of photographs (on), or fit them as they were taken (off), with renderers that follow
+            rays through the lens (--for drgs, exact, fast or 3dgut).
         exposure: Multiply what is rendered for a photograph by its own gain of R, G and B: none (off), those that
             initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
         poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
@@ -120,6 +124,7 @@ class DataConfig(Record):
     test_cameras: tuple[str, ...] | None = None
     times: int = 40
     mask: MaskUse = "auto"
+    undistort: UndistortUse = "on"
     exposure: ExposureUse = "off"
     poses: PoseUse = "fixed"
     skybox: SkyboxUse = "auto"
@@ -509,6 +514,8 @@ class FitConfig(Record):
     def __post_init__(self) -> None:
         check_fields("fit", self, {"max_steps": _COUNT, "seed": (0, 2**31 - 1)})  # a seed is what COLMAP takes
         check_renderers(self.renderers, self.settings)
+        if self.data.undistort == "off":
+            _check_lenses(self)
 
     def difference(self, other: FitConfig) -> tuple[str, Any, Any] | None:
         """The first field whose value in `other` makes another fit, and both values as JSON has them.
@@ -522,6 +529,19 @@ class FitConfig(Record):
             for config in (self, other)
         )
         return _difference(mine, theirs)
+
+
+def _check_lenses(config: FitConfig) -> None:
+    """Refuse what does not work on photographs as they were taken."""
+    drawn = planar_of(config.renderers, config.settings)
+    if drawn:
+        raise ValueError(
+            f"fit: undistort off must have renderers along rays alone, got {', '.join(drawn)}; use --for drgs, or "
+            "--undistort on"
+        )
+    for problem, name in ((config.data.poses != "fixed", "--poses fixed"), (config.selection, "--views all")):
+        if problem:
+            raise ValueError(f"fit: undistort off must have {name}, got another; drop it, or use --undistort on")
 
 
 def _difference(mine: dict, theirs: dict) -> tuple[str, Any, Any] | None:

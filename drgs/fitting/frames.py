@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -93,14 +93,18 @@ def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> 
     )
 
 
-def load_frames(views: list[View], max_pixels: int, mask: str = "auto") -> list[Frame]:
+def load_frames(
+    views: list[View], max_pixels: int, mask: str = "auto", undistort: Literal["on", "off"] = "on"
+) -> list[Frame]:
     """Decode, undistort and reduce photographs (area average) to at most `max_pixels` pixels each.
 
     Args:
         views: Whatever their sizes; those whose image has not been looked at yet are checked now.
         max_pixels: Pixels of one image at most; smaller ones keep their size.
         mask: Use of masks, as `DataConfig` has it.
+        undistort: Whether lenses are taken out, likewise.
     """
+    views = [dataclasses.replace(view, keeps_lens=undistort == "off") for view in views]
     with Bar("photographs", len(views)) as bar:
         return _frames(views, max_pixels, mask, bar)
 
@@ -118,7 +122,7 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
         frames.append(
             Frame(
                 name=view.name,
-                camera=dataclasses.replace(view.camera.undistorted().resized(width, height), name=view.name),
+                camera=dataclasses.replace(view.shown_camera.resized(width, height), name=view.name),
                 pixels=store(image),
                 mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
                 is_object=mask == "object" or (mask == "auto" and view.mask_path is not None),

@@ -22,6 +22,7 @@ __all__ = [
     "check_renderers",
     "named_renderers",
     "own_preset",
+    "planar_of",
     "renderers_to_measure",
 ]
 
@@ -91,13 +92,24 @@ def own_preset(names: Sequence[str]) -> str:
     return "fast" if "fast" in meant else meant[0]
 
 
-def renderers_to_measure(names: Sequence[str], settings: RenderSettings, asked: str | None = None) -> dict:
+def planar_of(names: Sequence[str], settings: RenderSettings) -> list[str]:
+    """The presets among what a fit's `renderers` and settings mean that are models of a pinhole's image plane."""
+    named = named_renderers(names, settings)
+    meant = _MEANINGS.get(named[0], named)
+    drawn = [name for name in meant if RenderSettings.preset(name).planar]
+    return drawn or [settings.response] * settings.planar
+
+
+def renderers_to_measure(
+    names: Sequence[str], settings: RenderSettings, asked: str | None = None, lenses: bool = False
+) -> dict:
     """Name -> settings of the renderers that a fit is measured with, beside its own.
 
     Args:
         names: The fit's `renderers`.
         settings: Its own settings; all have their background.
         asked: A preset, or `all`; None: those that the fit is for, and what viewers draw with.
+        lenses: Photographs have lenses: without models of a pinhole's image plane, unless it is one that was asked for.
     """
     background = settings.background
     if asked is None:
@@ -107,6 +119,8 @@ def renderers_to_measure(names: Sequence[str], settings: RenderSettings, asked: 
     else:
         wanted = ANY if asked == "all" else (asked,)
     found = {name: RenderSettings.preset(name, background=background) for name in wanted}
+    if lenses and asked in (None, "all"):
+        found = {name: x for name, x in found.items() if not x.planar}
     if settings in found.values():
         return found
     name, differences = settings.nearest_preset()

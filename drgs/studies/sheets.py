@@ -80,7 +80,9 @@ def _frame(run: LoadedRun, name: str | None) -> tuple[Frame, int]:
     views = [view for view in test if name is None or view.name == name]
     if not views:
         raise ValueError(f"comparison_sheet: view must be one of {', '.join(v.name for v in test)}, got {name!r}")
-    frame = load_frames([views[len(views) // 2].checked()], config.data.max_pixels, config.data.mask)[0]
+    frame = load_frames(
+        [views[len(views) // 2].checked()], config.data.max_pixels, config.data.mask, config.data.undistort
+    )[0]
     return frame, len(run.classes) if run.classes is not None else 0
 
 
