@@ -1,0 +1,174 @@
+"""What a lens costs on tiles, and what fits gain that see photographs as they were taken.
+
+    python benchmarks/lenses.py [--scenes street banana] [--seeds 2] [--page]
+    python benchmarks/lenses.py --times
+
+Fits with and without --undistort, both seen on the held-out photographs as they were taken and on undistorted ones:
+one row a fit in benchmarks/lenses.jsonl, and the table of docs/real-data.md. `--times` measures a frame of the wolf
+through three lenses, in turn in one process, and writes the other table. Scenes are captures by name, or folders. One
+thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import statistics
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from clocks import interleaved  # noqa: E402
+from fits import fitted, psnr_by_renderer  # noqa: E402
+from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
+
+import drgs  # noqa: E402
+from drgs.cameras import Camera, intrinsics, look_at  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "lenses.jsonl"
+TIMES = ROOT / "benchmarks" / "lenses.json"
+PAGE = ROOT / "docs" / "real-data.md"
+SCENES = ("street", "banana")
+SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
+KEY = ("scene", "undistort", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
+WOLF = DATA / "splats" / "wolf" / "wolf.ply"
+WIDTH, HEIGHT = 480, 320
+TURNS = 9
+
+
+def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
+    """One fit for `fast`, and its held-out photographs, undistorted (on) and as they were taken (off)."""
+    fast = RenderSettings.preset("fast")
+    config = FitConfig.of(
+        settings=fast,
+        renderers=("fast",),
+        undistort=undistort,
+        skybox="off",
+        seed=seed,
+        test_offset=offset,
+        **SIZE,
+    )
+    done = fitted(scene, config)
+    psnr = {}
+    for use in ("on", "off"):
+        frames = load_frames(done.test, config.data.max_pixels, config.data.mask, use)
+        psnr[use] = psnr_by_renderer(done.gaussians, frames, {"fast": fast})["fast"]
+    return {
+        **dict(zip(KEY, (Path(scene).name, undistort, seed, offset, *SIZE.values()), strict=True)),
+        "psnr": psnr,
+        "seconds": done.process_seconds,
+        **ran(),
+    }
+
+
+def table(found: list[dict]) -> str:
+    """Held-out PSNR of both fits of each capture and seed."""
+    lines = ["| capture, seed (held out) | fitted to | seen as taken | seen undistorted | seconds |"]
+    lines += ["|---|---|---|---|---|"]
+    words = {"on": "undistorted photographs", "off": "photographs as taken"}
+    for row in sorted(found, key=lambda row: (row["scene"], row["seed"], row["undistort"])):
+        cells = [f"{row['scene']}, {row['seed']} ({len(row['psnr']['on'])})", words[row["undistort"]]]
+        for use in ("off", "on"):
+            cells.append(f"{statistics.mean(row['psnr'][use]):.2f} / {min(row['psnr'][use]):.2f}")
+        lines.append(f"| {' | '.join(cells)} | {row['seconds']:.0f} |")
+    return "\n".join(lines)
+
+
+def cameras(center: np.ndarray, reach: float) -> dict[str, Camera]:
+    """A camera before the wolf, with three lenses of one focal length."""
+    w2c = look_at(center + np.array([0.36, -0.24, -2.28]) * reach, center, (0, -1, 0))
+    focal = 1.1 * WIDTH
+    pinhole = Camera(intrinsics(focal, focal, WIDTH / 2 + 3, HEIGHT / 2 - 5), w2c, WIDTH, HEIGHT)
+    return {
+        "pinhole": pinhole,
+        "opencv": dataclasses.replace(pinhole, model="opencv", distortion=(-0.1, 0.02, 1e-3, -5e-4)),
+        "fisheye": dataclasses.replace(pinhole, model="opencv_fisheye", distortion=(0.03, -0.01, 0.004, -0.001)),
+    }
+
+
+def frame(g: drgs.Gaussians, camera: Camera, settings: RenderSettings, backward: bool):
+    """A frame, with or without the gradients of its sum of squares."""
+    leaves = {name: x.detach().clone().requires_grad_(backward) for name, x in g.parameters().items()}
+    moving = g.replace(**leaves)
+
+    def run() -> None:
+        with torch.set_grad_enabled(backward):
+            out = drgs.render(moving, camera, settings, outputs=())
+        if backward:
+            out.rgb.square().sum().backward()
+            for leaf in leaves.values():
+                leaf.grad = None
+
+    return run
+
+
+def times() -> dict:
+    """Milliseconds of a frame, by preset, with and without gradients, and by lens."""
+    g = drgs.load_ply(WOLF)
+    means = g.means.detach().numpy()
+    center = np.median(means, 0)
+    views = cameras(center, float(np.quantile(np.linalg.norm(means - center, axis=1), 0.9)))
+    found = []
+    for preset in ("fast", "3dgut", "exact"):
+        for backward in (False, True):
+            runs = {name: frame(g, view, RenderSettings.preset(preset), backward) for name, view in views.items()}
+            took = interleaved(runs, TURNS, time.process_time)
+            found.append({"preset": preset, "backward": backward, "ms": {name: 1000 * x for name, x in took.items()}})
+    return {"gaussians": len(g), "times": found, **ran()}
+
+
+def times_table(result: dict) -> str:
+    """Milliseconds of a pinhole's frame, and what lenses take over it."""
+    lines = ["| preset | | pinhole | `opencv` | `opencv_fisheye` |", "|---|---|---|---|---|"]
+    for row in result["times"]:
+        plain = row["ms"]["pinhole"]
+        ratios = [f"{row['ms'][name] / plain:.2f}" for name in ("opencv", "fisheye")]
+        what = "image and gradients" if row["backward"] else "image"
+        lines.append(f"| `{row['preset']}` | {what} | {plain:.0f} ms | {' | '.join(ratios)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures, or folders")
+    parser.add_argument("--seeds", type=int, default=2, choices=range(1, len(UNITS) + 1))
+    parser.add_argument("--times", action="store_true", help="measure what lenses cost, fit nothing")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the tables of what there is")
+    args = parser.parse_args()
+    if args.times:
+        TIMES.write_text(json.dumps(times(), indent=1) + "\n")
+    done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
+    for scene in [] if args.page or args.times else args.scenes:
+        for seed, offset in UNITS[: args.seeds]:
+            for undistort in ("on", "off"):
+                if (Path(scene).name, undistort, seed, offset, *SIZE.values()) not in done:
+                    row = measured(scene, undistort, seed, offset)
+                    add_row(ROWS, row)
+                    print(
+                        scene, undistort, seed, {use: statistics.mean(x) for use, x in row["psnr"].items()}, flush=True
+                    )
+    texts = {"lenses": table(read_rows(ROWS))}
+    if TIMES.exists():
+        texts["lens_times"] = times_table(json.loads(TIMES.read_text()))
+    for name, text in texts.items():
+        print(text)
+        fill_between(PAGE, name, text)
+
+
+if __name__ == "__main__":
+    main()
