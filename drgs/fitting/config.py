@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
 from drgs.guards.arguments import check_fields
-from drgs.guards.records import Record, ways_of
+from drgs.guards.records import Record, first_difference, ways_of
 from drgs.information.choices import POLICIES, check_named
 from drgs.information.prior import Prior
 from drgs.information.scoring import Scoring
@@ -528,7 +528,7 @@ class FitConfig(Record):
             ).to_json()
             for config in (self, other)
         )
-        return _difference(mine, theirs)
+        return first_difference(mine, theirs)
 
 
 def _check_lenses(config: FitConfig) -> None:
@@ -542,18 +542,6 @@ def _check_lenses(config: FitConfig) -> None:
     for problem, name in ((config.data.poses != "fixed", "--poses fixed"), (config.selection, "--views all")):
         if problem:
             raise ValueError(f"fit: undistort off must have {name}, got another; drop it, or use --undistort on")
-
-
-def _difference(mine: dict, theirs: dict) -> tuple[str, Any, Any] | None:
-    """The first key, in the innermost objects, with other values."""
-    for name, x in mine.items():
-        y = theirs[name]
-        if isinstance(x, dict) and isinstance(y, dict):
-            if found := _difference(x, y):
-                return found
-        elif x != y:
-            return name, x, y
-    return None
 
 
 # ------------------------------------------------------- as it was written before the records, for one release

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 
-__all__ = ["TRANSIENT", "Record", "hints_of", "nearest", "part_of", "stated", "texts_of", "ways_of"]
+__all__ = ["TRANSIENT", "Record", "first_difference", "hints_of", "nearest", "part_of", "stated", "texts_of", "ways_of"]
 
 TRANSIENT: Mapping[str, Any] = {"transient": True}
 """Metadata of a field that is found out at run time: no file holds it, and nobody names it among those of a record."""
@@ -217,3 +217,15 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _plain(x) for key, x in value.items()}
     return [_plain(x) for x in value] if isinstance(value, list | tuple) else value
+
+
+def first_difference(mine: dict, theirs: dict) -> tuple[str, Any, Any] | None:
+    """The first key, in the innermost of two JSON objects of the same keys, with other values, and both values."""
+    for name, x in mine.items():
+        y = theirs[name]
+        if isinstance(x, dict) and isinstance(y, dict):
+            if found := first_difference(x, y):
+                return found
+        elif x != y:
+            return name, x, y
+    return None
