@@ -44,6 +44,7 @@ FITS: dict[str, tuple[str, dict]] = {
     "bonsai, rates of 3DGS": ("bonsai", {**BONSAI, **RATES_OF_3DGS}),
     "bonsai, 9,000 steps": ("bonsai", {**BONSAI, "max_gaussians": 120_000, "max_steps": 9_000}),
     "lego": ("lego", LEGO),
+    "lego, for fast": ("lego", {**LEGO, "renderers": ("fast",)}),
     "lego, rates of 3DGS": ("lego", {**LEGO, **RATES_OF_3DGS}),
 }
 # PSNR that others print of all photographs at this size; of `lego` at twice the width and height.
