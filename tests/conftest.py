@@ -173,25 +173,16 @@ def rendered(monkeypatch):
 
 
 @pytest.fixture
-def whole_and_resumed(tmp_path, monkeypatch):
+def whole_and_resumed(tmp_path):
     """Runs of one fit: without a stop, and stopped before step `at`, then resumed."""
+    from resuming import stopped_and_resumed
+
     from drgs.files import Run
-    from drgs.train import Trainer, fit
+    from drgs.train import fit
 
     def runs(dataset, settings, at):
         fit(dataset, tmp_path / "whole", settings, progress=False)
-        step = Trainer.step
-
-        def stopped(self):
-            if self.step_index == at:
-                raise KeyboardInterrupt
-            return step(self)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Trainer, "step", stopped)
-            with pytest.raises(KeyboardInterrupt):
-                fit(dataset, tmp_path / "parts", settings, progress=False)
-        fit(dataset, tmp_path / "parts", settings, progress=False, resume=True)
+        stopped_and_resumed(lambda: dataset, tmp_path / "parts", settings, at)
         return Run(tmp_path / "whole"), Run(tmp_path / "parts")
 
     return runs

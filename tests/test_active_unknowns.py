@@ -10,6 +10,7 @@ import dense_jacobian as dense
 import numpy as np
 import pytest
 import torch
+from resuming import stopped_and_resumed
 from test_active import Killed, config, lazily, plan, without_times
 from test_data import save, write_image
 from test_nuisances import exposure_columns, projected
@@ -325,7 +326,7 @@ def test_auto_begins_when_a_photograph_differs(even, tmp_path, capsys):
     told = capsys.readouterr().err
     assert "off, all have the same for now" in told
     assert "each has its own from step 8 on" in told
-    stopped(tmp_path / "data", tmp_path / "again", settings, 14)
+    stopped_and_resumed(lambda: lazily(tmp_path / "data"), tmp_path / "again", settings, 14)
     same_run(tmp_path / "run", tmp_path / "again")
 
 
@@ -357,24 +358,8 @@ def test_auto_ends_when_more_photographs_say_otherwise(even, tmp_path, monkeypat
     assert ["nuisances" in pick for pick in picks] == [True, True, False]
     assert "estimated" not in Run(tmp_path / "run").config()
     assert "networks" not in load_state(tmp_path / "run" / "state.safetensors")[1]
-    stopped(even, tmp_path / "again", settings, 10)
+    stopped_and_resumed(lambda: lazily(even), tmp_path / "again", settings, 10)
     same_run(tmp_path / "run", tmp_path / "again")
-
-
-def stopped(folder, run, settings, at):
-    """The fit, killed before a step, then resumed."""
-    whole = Trainer.step
-
-    def killed(self):
-        if self.step_index == at:
-            raise Killed
-        return whole(self)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "step", killed)
-        with pytest.raises(Killed):
-            fit(lazily(folder), run, settings, progress=False)
-    fit(lazily(folder), run, settings, progress=False, resume=True)
 
 
 def same_run(a, b):
@@ -396,7 +381,7 @@ def test_a_killed_fit_goes_on_with_gains_and_poses(uneven, tmp_path, moment):
     )
     fit(lazily(uneven), tmp_path / "a", settings, progress=False)
     if moment == "between picks":
-        stopped(uneven, tmp_path / "b", settings, 10)
+        stopped_and_resumed(lambda: lazily(uneven), tmp_path / "b", settings, 10)
     else:
         state = Trainer.state
 
