@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from resuming import stopped_and_resumed
 from test_active_unknowns import same_run
 from test_dynamic_fit import FAST, TIMES, _small_field, config  # noqa: F401  (a fixture)
 
@@ -19,7 +20,7 @@ from drgs.files import Run, load_state
 from drgs.fitting.config import SelectionConfig
 from drgs.fitting.records import fit_record
 from drgs.integrator import render
-from drgs.train import Trainer, fit
+from drgs.train import fit
 
 CAMERAS = 5
 LOGS = np.random.default_rng(2).normal(0, 0.15, (CAMERAS, len(TIMES), 3))
@@ -84,7 +85,7 @@ def test_each_frame_has_its_own_gain(dataset, tmp_path):
     assert recorded["exposure"]["components"] == 1
     assert fit_record(Run(tmp_path / "run")).estimated == ("exposure",)
     tensors, header = load_state(tmp_path / "run" / "state.safetensors")
-    assert header["networks"] == ["exposure", "deformation.grid", "deformation.mlp"]
+    assert header["networks"] == ["deformation.grid", "deformation.mlp", "exposure"]
     assert np.abs(tensors["exposure.parameter.log_gains"].numpy() - truth(names)).max() < 0.03
 
 
@@ -111,7 +112,7 @@ def test_learned_gains_go_on_in_either_stage(dataset, whole_and_resumed, at):
     assert runs[0].config()["exposure"] == runs[1].config()["exposure"]
 
 
-def test_frames_that_join_get_their_gains(dataset, tmp_path, monkeypatch):
+def test_frames_that_join_get_their_gains(dataset, tmp_path):
     """An active fit at later times: a frame that is picked has its gain beside the others', and exposure is eliminated
     from what all of them tell about the field; killed and resumed it ends in the same bits.
     """
@@ -123,18 +124,7 @@ def test_frames_that_join_get_their_gains(dataset, tmp_path, monkeypatch):
     assert np.abs(np.log(list(gains.values())) - truth(list(gains))).max() < 0.03
     picks = json.loads((tmp_path / "a" / "selection.json").read_text())["picks"]
     assert all(pick["nuisances"]["eliminate"] == ["exposure"] for pick in picks)
-    step = Trainer.step
-
-    def stopped(self):
-        if self.step_index == picks[1]["step"]:
-            raise KeyboardInterrupt
-        return step(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "step", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            fit(dataset, tmp_path / "b", how, progress=False)
-    fit(dataset, tmp_path / "b", how, progress=False, resume=True)
+    stopped_and_resumed(lambda: dataset, tmp_path / "b", how, picks[1]["step"])
     same_run(tmp_path / "a", tmp_path / "b")
 
 

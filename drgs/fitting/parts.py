@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Parts", "means_rate", "parts_of", "with_exposure", "with_poses", "with_skybox", "without_exposure"]
 
-_BEFORE = ("decoder",)  # networks that come before the gains of photographs
-
 
 @dataclasses.dataclass(frozen=True)
 class Parts:
@@ -109,10 +107,7 @@ def with_exposure(
     network = exposure_network(
         frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
     )
-    # At one place whenever they come: the networks of a checkpoint have an order.
-    first = [other for other in parts.networks if other.name in _BEFORE]
-    rest = [other for other in parts.networks if other.name not in _BEFORE]
-    return dataclasses.replace(parts, networks=[*first, network, *rest], exposure=network.module)
+    return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
 
 
 def without_exposure(parts: Parts) -> Parts:

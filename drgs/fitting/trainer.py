@@ -286,7 +286,7 @@ class Trainer:
             "extent": self.extent,
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
-            **({"networks": [network.name for network in self.parts.networks]} if self.parts.networks else {}),
+            **({"networks": sorted(network.name for network in self.parts.networks)} if self.parts.networks else {}),
             **({"skybox": self.rows.skybox} if self.rows.skybox else {}),
             **(self.motion.header() if self.motion is not None else {}),
             **found,
@@ -336,8 +336,8 @@ class Trainer:
         if motion is not None and motion.has_begun(rows):
             parts = motion.restored(rows, parts, header, where)
         trainer = cls(config, frames, rows, extent, parts, motion)
-        was = header.get("networks", [])
-        now = [network.name for network in trainer.parts.networks]
+        was = sorted(header.get("networks", []))
+        now = sorted(network.name for network in trainer.parts.networks)
         if was != now:
             raise ValueError(
                 f"{where}: --resume must continue the same fit, networks were {was} and are {now}; "
