@@ -50,6 +50,15 @@ WIDTH, HEIGHT = 480, 320
 TURNS = 9
 
 
+def cropped(camera: Camera) -> float:
+    """Share of a photograph's pixels that its undistorted image does not show."""
+    there = camera.undistorted()
+    points = camera.center + camera.pixel_directions().reshape(-1, 3)
+    pixels, _ = there.project(points)
+    inside = ((pixels >= 0) & (pixels <= (there.width, there.height))).all(1)
+    return 1 - float(inside.mean())
+
+
 def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
     """One fit for `fast`, and its held-out photographs, undistorted (on) and as they were taken (off)."""
     fast = RenderSettings.preset("fast")
@@ -70,6 +79,7 @@ def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
     return {
         **dict(zip(KEY, (Path(scene).name, undistort, seed, offset, *SIZE.values()), strict=True)),
         "psnr": psnr,
+        "cropped": statistics.mean(cropped(view.camera) for view in done.test),
         "seconds": done.process_seconds,
         **ran(),
     }
@@ -77,11 +87,15 @@ def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
 
 def table(found: list[dict]) -> str:
     """Held-out PSNR of both fits of each capture and seed."""
-    lines = ["| capture, seed (held out) | fitted to | seen as taken | seen undistorted | seconds |"]
-    lines += ["|---|---|---|---|---|"]
+    lines = ["| capture, seed (held out) | cropped | fitted to | seen as taken | seen undistorted | seconds |"]
+    lines += ["|---|---|---|---|---|---|"]
     words = {"on": "undistorted photographs", "off": "photographs as taken"}
     for row in sorted(found, key=lambda row: (row["scene"], row["seed"], row["undistort"])):
-        cells = [f"{row['scene']}, {row['seed']} ({len(row['psnr']['on'])})", words[row["undistort"]]]
+        cells = [
+            f"{row['scene']}, {row['seed']} ({len(row['psnr']['on'])})",
+            f"{row['cropped']:.1%}",
+            words[row["undistort"]],
+        ]
         for use in ("off", "on"):
             cells.append(f"{statistics.mean(row['psnr'][use]):.2f} / {min(row['psnr'][use]):.2f}")
         lines.append(f"| {' | '.join(cells)} | {row['seconds']:.0f} |")
