@@ -26,7 +26,7 @@ from fits import fitted, psnr_by_renderer  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.fitting.resolution import FULL  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
@@ -59,7 +59,7 @@ def measured(scene: str, trained: str, num_downscales: int, steps: int, size: di
         **size,
     )
     fit = fitted(scene, config)
-    held_out = load_frames(fit.test, config.data.max_pixels)
+    held_out = frames_for(fit.test, config.data)
     psnr = psnr_by_renderer(fit.gaussians, held_out, {own: RenderSettings.preset(own)})
     first = fit.frames[0].camera
     return {

@@ -31,7 +31,7 @@ from where import UNITS, add_row, ran, read_rows  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.frames import Frame, load_frames  # noqa: E402
+from drgs.fitting.frames import Frame, frames_for  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
 from drgs.integrator import Output, render  # noqa: E402
 from drgs.metrics import psnr  # noqa: E402
@@ -90,7 +90,7 @@ def measured(scene: str, weight: float, seed: int, offset: int) -> dict:
     config = FitConfig.of(renderers=("any",), seed=seed, test_offset=offset, skybox="off", **SIZE)
     fit = fitted(scene, config, lambda frames: [Consistency(frames, weight, seed)] if weight else [])
     chosen = np.unique(np.linspace(0, len(fit.test) - 1, MOST).round().astype(int))
-    held_out = load_frames([fit.test[i] for i in chosen], config.data.max_pixels)
+    held_out = frames_for([fit.test[i] for i in chosen], config.data)
     renderers = renderers_to_measure(("any",), config.settings, "all")
     alike = []
     for frame in held_out:

@@ -25,7 +25,7 @@ from fits import fitted, psnr_by_renderer  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
@@ -56,7 +56,7 @@ def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
     fit = fitted(scene, config)
     renderers = {name: RenderSettings.preset(name) for name in SEEN}
     psnr = {
-        scale: psnr_by_renderer(fit.gaussians, load_frames(fit.test, pixels * scale**2), renderers, MOST)
+        scale: psnr_by_renderer(fit.gaussians, frames_for(fit.test, config.data, pixels * scale**2), renderers, MOST)
         for scale in SCALES
     }
     return {

@@ -14,7 +14,7 @@ from where import DATA
 from drgs.data import Dataset, View, load
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
-from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import LossTerm
 from drgs.fitting.start import start
 from drgs.metrics import through_renderers
@@ -64,7 +64,7 @@ def fitted(
     """
     dataset = load(DATA / scene)
     train, test = split_of(dataset, config)
-    frames = load_frames(train, config.data.max_pixels, config.data.mask, config.data.undistort)
+    frames = frames_for(train, config.data)
     trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
     parts = trainer.parts
     trainer.parts = dataclasses.replace(parts, terms=[*parts.terms, *terms(frames)])

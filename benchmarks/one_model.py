@@ -28,7 +28,7 @@ from fits import fitted, psnr_by_renderer  # noqa: E402
 from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
@@ -54,7 +54,7 @@ def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> di
     for step, seconds in enumerate(fit.step_seconds):
         took.setdefault(schedule.settings_at(step), []).append(seconds)
     renderers = renderers_to_measure(names, config.settings, "all")
-    psnr = psnr_by_renderer(fit.gaussians, load_frames(fit.test, config.data.max_pixels), renderers)
+    psnr = psnr_by_renderer(fit.gaussians, frames_for(fit.test, config.data), renderers)
     names_of = {RenderSettings.preset(name): name for name in PRESETS}
     step_ms = {names_of[settings]: 1000 * statistics.median(each) for settings, each in took.items()}
     average = sum(step_ms[names_of[settings]] * len(each) for settings, each in took.items()) / config.max_steps

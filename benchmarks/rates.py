@@ -27,7 +27,7 @@ from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
@@ -79,7 +79,7 @@ def measured(scene: str, rates: str, steps: int) -> dict:
     renderers = renderers_to_measure(config.renderers, config.settings, "all")
     return {
         **dict(zip(KEY, (scene, rates, steps, *SIZE.values()), strict=True)),
-        "psnr": psnr_by_renderer(done.gaussians, load_frames(done.test, config.data.max_pixels), renderers),
+        "psnr": psnr_by_renderer(done.gaussians, frames_for(done.test, config.data), renderers),
         "seconds": done.process_seconds,
         **ran(),
     }

@@ -55,7 +55,7 @@ from where import add_row, ran, read_rows  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import Run, load_ply  # noqa: E402
-from drgs.fitting.frames import Frame, load_dataset, load_frames  # noqa: E402
+from drgs.fitting.frames import Frame, frames_for, load_dataset  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.renderers import ANY  # noqa: E402
 from drgs.integrator import render  # noqa: E402
@@ -368,7 +368,7 @@ def held_out(folder: Path, count: int) -> list[Frame]:
     dataset = load_dataset(record.data, record.config)
     _, test = split_of(dataset, record.config)
     chosen = [test[round((i + 0.5) * len(test) / count - 0.5)] for i in range(min(count, len(test)))]
-    return load_frames(chosen, record.config.data.max_pixels)
+    return frames_for(chosen, record.config.data)
 
 
 def measured(

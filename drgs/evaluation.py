@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from drgs.display.pictures import file_names
-from drgs.fitting.frames import load_dataset, load_frames
+from drgs.fitting.frames import frames_for, load_dataset
 from drgs.fitting.poses import displacement
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
@@ -74,9 +74,7 @@ def evaluate_run(
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
-    frames = load_frames(
-        views, _most_pixels(views, config.data.max_pixels, scale), config.data.mask, config.data.undistort
-    )
+    frames = frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale))
     names = file_names([frame.name for frame in frames])
     kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
     claimed.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)

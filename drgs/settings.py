@@ -109,7 +109,7 @@ class RenderSettings:
             camera on)), `ewa` (the rasterizers' projected covariance), or a name that was added to `RESPONSES`.
         order: `center` (one depth per Gaussian and view), `ray` (exact order of (t*, index) on each ray) or `entry`
             (Mitsuba's order of entry points, `bvh` only).
-        traversal: `tiles` (cameras, the fast path) or `bvh` (Mitsuba's acceleration structure, any ray).
+        traversal: `tiles` (the pixels of a camera, the fast path) or `bvh` (Mitsuba's acceleration structure, any ray).
         depth_key: Key of `order="center"`: `distance` to the camera center or camera-space `z`.
         extent: Cut-off radius in standard deviations; None is the adaptive radius sqrt(2 ln max(alpha_i N / 1e-5, 1))
             that bounds the sum of all N truncated tails by 1e-5; order `ray` on tiles leaves out as much as 5e-6 more

@@ -40,7 +40,7 @@ from drgs.fitting.config import (
     SelectionConfig,
 )
 from drgs.fitting.exposure import NETWORK as EXPOSURE
-from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.photographs import check_photographs, estimated_of, join, photographs_record
 from drgs.fitting.poses import CAMERAS, POSE_NETWORK
@@ -184,10 +184,8 @@ def _fit(
     if plan and parts is None:
         plan.check_blocks({"semantic": taught is not None, "deformation": motion is not None})
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
-    frames = (
-        plan.frames() if plan else load_frames(train, config.data.max_pixels, config.data.mask, config.data.undistort)
-    )
-    held_out = load_frames(test, config.data.max_pixels, config.data.mask, config.data.undistort)
+    frames = plan.frames() if plan else frames_for(train, config.data)
+    held_out = frames_for(test, config.data)
     if taught and taught.embeddings:
         from drgs.fitting.segments import check_references
 

@@ -80,8 +80,8 @@ def test_a_fit_through_the_lens(bent, tmp_path, whole_and_resumed):
         ({"renderers": ("any",)}, "renderers along rays alone, got inria, gsplat; use --for drgs"),
         ({"renderers": ("auto",)}, "renderers along rays alone, got inria, gsplat; use --for drgs"),
         ({"renderers": ("fast", "gsplat")}, "got gsplat; use --for drgs"),
-        ({"renderers": ("fast",), "poses": "refined"}, "must have --poses fixed"),
-        ({"renderers": ("fast",), "selection": SelectionConfig(initial=2, add=1)}, "must have --views all"),
+        ({"renderers": ("fast",), "poses": "refined"}, "must have poses fixed, got refined; drop --poses"),
+        ({"renderers": ("fast",), "selection": SelectionConfig(initial=2, add=1)}, "must have --views all, got active"),
         ({"renderers": ("fast",), "undistort": "yes"}, "undistort must be"),
     ],
 )

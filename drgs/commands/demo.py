@@ -24,7 +24,7 @@ from drgs.data import load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
-from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr_of
 from drgs.guards.outputs import Claim, claim
 from drgs.integrator import render
@@ -168,7 +168,7 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
     fitted = fit(dataset, out_dir / "run", config, progress=progress)
     lap("fit", start)
     g, mean = fitted.gaussians, fitted.metrics["mean"]
-    frames = load_frames(dataset.split()[1], config.data.max_pixels, config.data.mask, config.data.undistort)
+    frames = frames_for(dataset.split()[1], config.data)
     say(
         f"2. Fit: {len(g)} Gaussians, {plan.steps} steps in {fitted.seconds:.0f} s; {len(frames)} views that it never "
         f"saw: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}, FLIP {mean['flip']:.3f}"

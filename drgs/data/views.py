@@ -93,9 +93,9 @@ class View:
         return dataclasses.replace(self, camera=camera, is_checked=True)
 
     def image(self, width: int | None = None, height: int | None = None) -> np.ndarray:
-        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), undistorted, area-resized.
+        """(H,W,3) float32 in [0,1] as stored (no transfer function applied), area-resized.
 
-        The result belongs to `shown_camera.resized(width, height)`.
+        It is undistorted unless `keeps_lens`: it belongs to `shown_camera.resized(width, height)`.
 
         Args:
             width, height: Pixels; the camera's own size if left out.

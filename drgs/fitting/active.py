@@ -28,7 +28,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.config import recorded_config
-from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.timetable import Timetable
 from drgs.sizes import at_most, resized_alike
 
@@ -433,7 +433,7 @@ class ActiveViews:
         stated = self.views[index].camera
         self.views[index] = view = self.views[index].checked()
         self._sizes[stated.width, stated.height] = view.camera.width, view.camera.height
-        return load_frames([view], self._config.data.max_pixels, self._config.data.mask, self._config.data.undistort)[0]
+        return frames_for([view], self._config.data)[0]
 
     def _camera(self, index: int) -> Camera:
         """The camera of a candidate, as its frame would have it."""

@@ -539,9 +539,11 @@ def _check_lenses(config: FitConfig) -> None:
             f"fit: undistort off must have renderers along rays alone, got {', '.join(drawn)}; use --for drgs, or "
             "--undistort on"
         )
-    for problem, name in ((config.data.poses != "fixed", "--poses fixed"), (config.selection, "--views all")):
-        if problem:
-            raise ValueError(f"fit: undistort off must have {name}, got another; drop it, or use --undistort on")
+    if config.data.poses != "fixed":
+        poses = config.data.poses
+        raise ValueError(f"fit: undistort off must have poses fixed, got {poses}; drop --poses, or use --undistort on")
+    if config.selection:
+        raise ValueError("fit: undistort off must have --views all, got active; use it, or --undistort on")
 
 
 # ------------------------------------------------------- as it was written before the records, for one release

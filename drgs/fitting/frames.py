@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -18,9 +18,9 @@ from drgs.sizes import reduced_size
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset, View
-    from drgs.fitting.config import FitConfig
+    from drgs.fitting.config import DataConfig, FitConfig, MaskUse, UndistortUse
 
-__all__ = ["Frame", "load_dataset", "load_frames"]
+__all__ = ["Frame", "frames_for", "load_dataset", "load_frames"]
 
 _Map = Callable[[], torch.Tensor]
 _Labels = Callable[[], np.ndarray]
@@ -93,8 +93,19 @@ def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> 
     )
 
 
+def frames_for(views: list[View], data: DataConfig, max_pixels: int | None = None) -> list[Frame]:
+    """Photographs as a fit with this configuration sees them.
+
+    Args:
+        views: As of `load_frames`.
+        data: What of photographs is used, and how.
+        max_pixels: Pixels of one image at most, if others than those of the fit.
+    """
+    return load_frames(views, max_pixels or data.max_pixels, data.mask, data.undistort)
+
+
 def load_frames(
-    views: list[View], max_pixels: int, mask: str = "auto", undistort: Literal["on", "off"] = "on"
+    views: list[View], max_pixels: int, mask: MaskUse = "auto", undistort: UndistortUse = "on"
 ) -> list[Frame]:
     """Decode, undistort and reduce photographs (area average) to at most `max_pixels` pixels each.
 

@@ -14,7 +14,7 @@ from drgs.display import pictures
 from drgs.features.pictures import FeatureColors, label_picture
 from drgs.features.segmentation import classify
 from drgs.files import Run
-from drgs.fitting.frames import load_dataset, load_frames
+from drgs.fitting.frames import frames_for, load_dataset
 from drgs.fitting.records import load_run
 from drgs.integrator import render
 
@@ -80,9 +80,7 @@ def _frame(run: LoadedRun, name: str | None) -> tuple[Frame, int]:
     views = [view for view in test if name is None or view.name == name]
     if not views:
         raise ValueError(f"comparison_sheet: view must be one of {', '.join(v.name for v in test)}, got {name!r}")
-    frame = load_frames(
-        [views[len(views) // 2].checked()], config.data.max_pixels, config.data.mask, config.data.undistort
-    )[0]
+    frame = frames_for([views[len(views) // 2].checked()], config.data)[0]
     return frame, len(run.classes) if run.classes is not None else 0
 
 

@@ -65,6 +65,8 @@ def lens_of(lib: Lib, camera: Camera, tile: int) -> LensRays | None:
 class LensRays:
     """The rays of a lens, by pixel and by tile, and its table of displacements.
 
+    To make them takes about a second a million pixels, once for all cameras of a lens (`lens_of`).
+
     Args:
         lib: Dr.Jit types of the backend.
         camera: Its pose plays no role.
