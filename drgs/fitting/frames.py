@@ -97,7 +97,7 @@ def frames_for(views: list[View], data: DataConfig, max_pixels: int | None = Non
     """Photographs as a fit with this configuration sees them.
 
     Args:
-        views: As of `load_frames`.
+        views: Whatever their sizes; those whose image has not been looked at yet are checked now.
         data: What of photographs is used, and how.
         max_pixels: Pixels of one image at most, if others than those of the fit.
     """
