@@ -30,6 +30,8 @@ from drgs.guards.camera_checks import (
     IMAGE_MAX,
     as_numpy,
     check_proportions,
+    check_shutter,
+    check_turn,
     checked_distortion,
     checked_intrinsics,
     checked_pose,
@@ -44,6 +46,7 @@ from drgs.lenses import (
     undistort_opencv,
 )
 from drgs.runtime import uncompiled
+from drgs.shutters import BY_COLUMN, FORWARD, line_poses, line_times, turn_between
 
 __all__ = [
     "Camera",
@@ -62,6 +65,7 @@ _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded
 # An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
 _INVERSE_TOLERANCE = 1e-3
 _SHOWN = 80  # characters of a name in messages
+_SHUTTER_ROUNDS = 30  # of pose and line in turn, until a point is on the line that sees it
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +87,12 @@ class Camera:
         name: Name in messages and of files.
         time: Time at which the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets),
             or None where that does not matter.
+        shutter: One of `drgs.shutters.SHUTTERS`: `global`, or which way lines of the image are exposed while the camera
+            moves from w2c to w2c_end, e.g. `rolling_top_to_bottom`.
+        w2c_end: (4,4) world to camera when the last line is exposed, as w2c; None of a global shutter. The pose of each
+            line is between the two: shutters.py.
     Raises:
-        ValueError: K, w2c, size, model, distortion or time is not what it must be.
+        ValueError: K, w2c, size, model, distortion, time or shutter is not what it must be.
     """
 
     K: np.ndarray
@@ -95,6 +103,8 @@ class Camera:
     distortion: tuple[float, ...] = ()
     name: str = ""
     time: float | None = None
+    shutter: str = "global"
+    w2c_end: Any = None
 
     @uncompiled
     def __post_init__(self) -> None:
@@ -102,12 +112,17 @@ class Camera:
         where = f"Camera {self.name[:_SHOWN]!r}" if self.name else "Camera"
         put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 (the dataclass is frozen)
         put("K", checked_intrinsics(where, self.K))
-        pose = checked_pose(where, self.w2c)
-        if not is_tensor(self.w2c):
+        check_shutter(where, self.shutter, self.w2c_end)
+        for name in ("w2c", *(["w2c_end"] if self.is_rolling else [])):
+            pose = checked_pose(where, getattr(self, name), name)
+            if is_tensor(getattr(self, name)):
+                continue
             if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > _ROUNDING:
                 pose = pose.copy()
                 pose[:3, :3], pose[:3, 3] = rigid(pose)
-            put("w2c", read_only(pose))
+            put(name, read_only(pose))
+        if self.is_rolling:
+            check_turn(where, float(np.linalg.norm(turn_between(self._rigid()[0], self._rigid("w2c_end")[0]))))
         for axis in ("width", "height"):
             value = getattr(self, axis)
             is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
@@ -139,6 +154,11 @@ class Camera:
     def is_distorted(self) -> bool:
         """Whether the lens differs from a pinhole (a fisheye with zero coefficients still does)."""
         return self.model == "opencv_fisheye" or (self.model == "opencv" and any(self.distortion))
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether lines of the image are exposed one after the other, each from a pose of its own."""
+        return self.shutter != "global"
 
     @property
     def lens_parameters(self) -> np.ndarray:
@@ -173,15 +193,35 @@ class Camera:
         return dataclasses.replace(self, model="pinhole", distortion=())
 
     def pixel_directions(self) -> np.ndarray:
-        """(H,W,3) float64 unit world directions through the pixel centers, lens included.
+        """(H,W,3) float64 unit world directions through the pixel centers, lens and shutter included.
 
         Warns, with their number, about pixels that the lens model cannot undistort.
         """
+        local = self.local_directions()
+        # Not `@`: the threads of NumPy's BLAS spin for 25 ms after it, on the cores that render next.
+        if not self.is_rolling:
+            return np.einsum("hwk,jk->hwj", local, self.c2w[:3, :3])
+        turns = self._line_poses()[:, :3, :3]
+        return np.einsum("hwk,wkj->hwj" if self.shutter in BY_COLUMN else "hwk,hkj->hwj", local, turns)
+
+    def pixel_origins(self) -> np.ndarray:
+        """(H,W,3) float64 points that the rays of `pixel_directions` start from: the camera center, of a rolling
+        shutter that of each line.
+        """
+        if not self.is_rolling:
+            return np.broadcast_to(self.center, (self.height, self.width, 3))
+        poses = self._line_poses()
+        centers = -np.einsum("tkj,tk->tj", poses[:, :3, :3], poses[:, :3, 3])
+        by_line = centers[None] if self.shutter in BY_COLUMN else centers[:, None]
+        return np.broadcast_to(by_line, (self.height, self.width, 3))
+
+    def local_directions(self) -> np.ndarray:
+        """(H,W,3) float64 unit directions through the pixel centers in camera axes, lens included; warns as
+        `pixel_directions`.
+        """
         columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
-        # Not `@`: the threads of NumPy's BLAS spin for 25 ms after it, on the cores that render next.
-        directions = np.einsum("pk,jk->pj", self._camera_directions(pixels), self.c2w[:3, :3])
-        return directions.reshape(self.height, self.width, 3)
+        return self._camera_directions(pixels).reshape(self.height, self.width, 3)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points, lens included.
@@ -190,11 +230,26 @@ class Camera:
             points: (P,3) world points.
         Returns:
             pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses, which may
-            see behind themselves.
+            see behind themselves. Of a rolling shutter, where a line sees the point at the pose that it has itself; z
+            is of that pose.
         """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         rotation, translation = self._rigid()
-        local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ rotation.T + translation
-        return self._project_local(local), local[:, 2]
+        if not self.is_rolling:
+            local = points @ rotation.T + translation
+            return self._project_local(local), local[:, 2]
+        start, end = (_homogeneous(*self._rigid(name)) for name in ("w2c", "w2c_end"))
+        along = self.width if self.shutter in BY_COLUMN else self.height
+        times = np.full(len(points), 0.5)
+        for _ in range(_SHUTTER_ROUNDS):
+            poses = line_poses(start, end, times)
+            local = np.einsum("pjk,pk->pj", poses[:, :3, :3], points) + poses[:, :3, 3]
+            pixels = self._project_local(local)
+            line = pixels[:, 0 if self.shutter in BY_COLUMN else 1] - 0.5
+            found = line / (along - 1) if along > 1 else np.full(len(points), 0.5)
+            found = found if self.shutter in FORWARD else 1 - found
+            times = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), times)
+        return pixels, local[:, 2]
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
         """A Mitsuba `perspective` sensor as a dictionary for `mi.load_dict` (box filter, one sample a pixel).
@@ -212,6 +267,8 @@ class Camera:
         problem = None
         if self.is_distorted:
             problem = f"an undistorted camera, got model {self.model}; use camera.undistorted()"
+        elif self.is_rolling:
+            problem = f"a global shutter, got {self.shutter}; trace camera.pixel_origins() and pixel_directions()"
         elif self.K[0, 1] != 0.0:
             problem = f"zero skew, got {self.K[0, 1]:g}; trace camera.pixel_directions()"
         elif abs(fx / fy - 1.0) * self.height / 2 > 0.1:
@@ -239,10 +296,16 @@ class Camera:
             "sampler": {"type": "independent", "sample_count": 1},
         }
 
-    def _rigid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (3,3) and translation (3,) of w2c in float64 (detached)."""
-        w2c = as_numpy(self.w2c).astype(np.float64)
-        return rigid(w2c) if is_tensor(self.w2c) else (w2c[:3, :3], w2c[:3, 3])
+    def _rigid(self, name: str = "w2c") -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3,3) and translation (3,) of w2c, or of w2c_end, in float64 (detached)."""
+        pose = getattr(self, name)
+        w2c = as_numpy(pose).astype(np.float64)
+        return rigid(w2c) if is_tensor(pose) else (w2c[:3, :3], w2c[:3, 3])
+
+    def _line_poses(self) -> np.ndarray:
+        """(T,4,4) float64 poses of the lines of a rolling shutter (detached)."""
+        start, end = (_homogeneous(*self._rigid(name)) for name in ("w2c", "w2c_end"))
+        return line_poses(start, end, line_times(self.shutter, self.width, self.height))
 
     def _camera_directions(self, pixels: np.ndarray) -> np.ndarray:
         """(P,3) unit directions in the camera's frame through pixels (P,2)."""
@@ -289,6 +352,14 @@ class Camera:
 
 
 # -------------------------------------------------- poses
+
+
+def _homogeneous(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """(4,4) of a rotation and a translation."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = translation
+    return pose
 
 
 def rigid(w2c: Any) -> tuple[Any, Any]:

@@ -41,6 +41,7 @@ def render(
     outputs: tuple[str, ...] | str = ("depth",),
     couple_features: bool = True,
     lens: torch.Tensor | None = None,
+    rays: torch.Tensor | np.ndarray | None = None,
 ) -> Output:
     """Render a view, or several of one size.
 
@@ -59,11 +60,16 @@ def render(
             `features`: what is learned about them moves no Gaussian (Zhou et al. 2024, Feature 3DGS).
         lens: (5 + D,) a torch tensor in place of the cameras' `lens_parameters` (fx, fy, cx, cy, skew, distortion),
             which is differentiated, for responses along rays. Where a lens has no inverse, rays do not move.
+        rays: (H, W, 6) origin and direction of each pixel, world frame, differentiable, instead of those of the camera,
+            which still says whose z and distance count, and from where colors are seen; for responses along rays. A
+            direction of 0 is no ray: its pixel shows the background. Best where origins lie close together: lists of
+            tiles are for all of them.
     Returns:
         An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
         ValueError: If a parameter is not finite, an output is unknown, or cameras differ in size.
-        NotImplementedError: If a model of the image plane (`ewa`) is asked for with a camera that has distortion.
+        NotImplementedError: If a model of the image plane (`ewa`) is asked for with a camera that has distortion or a
+            rolling shutter, or with rays.
     Gradients:
         Of rgb, alpha, depth and features, with respect to means, quats, log_scales, logit_opacities, sh, features and
         the pose, in reverse mode (`backward`, `torch.func.grad`) and forward mode (`torch.func.jvp`,
@@ -76,8 +82,8 @@ def render(
     if isinstance(camera, list | tuple):
         cameras = cameras_of_one_size("render", camera)
         wanted = _wanted(outputs)
-        return _batch([_view(gaussians, each, settings, wanted, couple_features, lens) for each in cameras])
-    return _view(gaussians, camera, settings, _wanted(outputs), couple_features, lens)
+        return _batch([_view(gaussians, each, settings, wanted, couple_features, lens, rays) for each in cameras])
+    return _view(gaussians, camera, settings, _wanted(outputs), couple_features, lens, rays)
 
 
 def _view(
@@ -87,6 +93,7 @@ def _view(
     wanted: frozenset,
     couple: bool,
     lens: torch.Tensor | None,
+    rays: torch.Tensor | np.ndarray | None,
 ) -> Output:
     if lens is not None:
         must_be("render", "lens", lens, torch.Tensor, "e.g. torch.tensor(camera.lens_parameters)")
@@ -94,7 +101,8 @@ def _view(
         lens = lens.to("cpu", torch.float64)
     seen = gaussians_at("render", gaussians, camera)
     check_view("render", seen, camera, settings)
-    call = Call(seen, camera, settings or RenderSettings.preset("exact"), wanted, couple=couple, lens=lens)
+    settings = settings or RenderSettings.preset("exact")
+    call = Call(seen, camera, settings, wanted, couple=couple, lens=lens, pixel_rays=rays)
     with own_errors():
         return call.output(differentiable(call))
 
@@ -115,23 +123,26 @@ def render_jvp(
     settings: RenderSettings | None = None,
     outputs: tuple[str, ...] | str = ("depth",),
     couple_features: bool = True,
+    rays: torch.Tensor | np.ndarray | None = None,
 ) -> Output:
     """Forward mode: how a view changes along tangents of its parameters.
 
         moved = drgs.render_jvp(g, camera, {"camera": torch.eye(6)}).rgb  # (6, H, W, 3): by each twist of the pose
 
     Args:
-        gaussians, camera, settings, outputs, couple_features: Arguments of `render` (median depth, count and visibility
-            have no tangent).
+        gaussians, camera, settings, outputs, couple_features, rays: Arguments of `render` (median depth, count and
+            visibility have no tangent).
         tangents: Name -> tangent of the raw parameter, shaped like it, optionally with a leading axis K (the same
             for all names). Names: `means`, `quats`, `log_scales`, `logit_opacities`, `sh`, `features`;
             `rotations` (N, 3), a world-frame left perturbation R <- exp([w]x) R; `camera` (6,), a world-frame twist of
-            the pose, rotation first: c2w <- exp(xi) c2w; `lens` (5 + D,), of the camera's `lens_parameters`. Of a
-            `drgs.ellipsoids.DeformableScene` the names are those of its `parameters()` that are floats, `camera`,
-            `lens`, and `rotations` where it has `quats`; `time`, a number: how fast the time of the view passes; and
-            `phi`, a mapping of x to the tangent of `phi.x`. So none of its own may be called `camera`, `lens`,
-            `rotations`, `time`, `phi`, `w2c`, `ray_origins`, `ray_directions` or `ray_shifts`. By the time the
-            derivative is the scene's own, one-sided where that has a kink (`drgs.DeformationField`).
+            the pose, rotation first: c2w <- exp(xi) c2w, of a rolling shutter of the first line's, and `camera_end`
+            (6,) of the last line's; `lens` (5 + D,), of the camera's `lens_parameters`; `rays` (H, W, 6) where these
+            are given, which `camera` does not move. Of a `drgs.ellipsoids.DeformableScene` the names are those of its
+            `parameters()` that are floats, `camera`, `lens`, and `rotations` where it has `quats`; `time`, a number:
+            how fast the time of the view passes; and `phi`, a mapping of x to the tangent of `phi.x`. So none of its
+            own may be called `camera`, `camera_end`, `lens`, `rays`, `rotations`, `time`, `phi`, `w2c`, `ray_origins`,
+            `ray_directions` or `ray_shifts`. By the time the derivative is the scene's own, one-sided where that has a
+            kink (`drgs.DeformationField`).
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried
         through one traversal. They have no graph: nothing differentiates a tangent.
@@ -151,7 +162,17 @@ def render_jvp(
     want = _wanted(outputs) & {"depth"}
     timed = "time" in tangents and camera.time is not None
     lens = torch.from_numpy(camera.lens_parameters) if "lens" in tangents else None
-    call = Call(seen.detach(), camera, settings, want, scene=scene, couple=couple_features, timed=timed, lens=lens)
+    call = Call(
+        seen.detach(),
+        camera,
+        settings,
+        want,
+        scene=scene,
+        couple=couple_features,
+        timed=timed,
+        lens=lens,
+        pixel_rays=rays,
+    )
     with own_errors():
         return push_forward(call, tangents)
 

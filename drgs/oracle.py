@@ -106,8 +106,8 @@ class OracleRays:
     """The rays to render, in the frame that the Gaussians' origin is 0 of; P of them.
 
     Attributes:
-        rotation: (3, 3) of w2c, and
-        center: (3,) of the camera; None without a camera, and then nobody reads them.
+        rotation: (3, 3) of w2c, of a rolling shutter in the middle of the exposure, and
+        center: (3,) of that camera; None without a camera, and then nobody reads them.
         origins: (P, 3) world units.
         directions: (P, 3) unit length.
         pixels: (P, 2) pixel centers; 0 for rays of no camera.
@@ -120,6 +120,11 @@ class OracleRays:
     directions: torch.Tensor
     pixels: torch.Tensor
     shape: tuple[int, ...]
+
+
+_COLUMNS = ("rolling_left_to_right", "rolling_right_to_left")
+_BACKWARD = ("rolling_bottom_to_top", "rolling_right_to_left")
+_GLOBAL = {"shutter": "global", "w2c_end": None}
 
 
 def sh_basis(dirs: torch.Tensor, K: int) -> torch.Tensor:
@@ -196,7 +201,9 @@ def scale_and_shift(cam: Any) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def camera_rays(cam: Any, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixel centers (H*W, 2) and world directions (H*W, 3)."""
+    """Pixel centers (H*W, 2) and directions (H*W, 3) in camera axes; of a lens by the camera's, whose pose `rotation`
+    undoes.
+    """
     v, u = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (cam.height, cam.width))
     u, v = u.repeat(cam.height), v.repeat_interleave(cam.width)  # rows of the image
     if getattr(cam, "model", "pinhole") == "pinhole":
@@ -205,8 +212,40 @@ def camera_rays(cam: Any, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.T
         local = torch.cat([plane, torch.ones_like(u)[:, None]], dim=-1)
     else:
         # The lens acts in the camera frame: only the rotation out of it carries the pose gradient.
-        local = float64(cam.pixel_directions()).reshape(-1, 3) @ rotation.detach().T
-    return torch.stack([u, v], dim=-1), local @ rotation
+        still = cam if getattr(cam, "shutter", "global") == "global" else dataclasses.replace(cam, **_GLOBAL)
+        local = float64(still.pixel_directions()).reshape(-1, 3) @ rotation.detach().T
+    return torch.stack([u, v], dim=-1), local
+
+
+def rolling_poses(cam: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rotation (P, 3, 3) and translation (P, 3) of w2c for each pixel of a rolling shutter, and, last, in the middle of
+    the exposure: rotations by slerp of unit quaternions, translations linearly (shutters.py).
+    """
+    (R0, t0), (R1, t1) = (rigid(float64(pose)) for pose in (cam.w2c, cam.w2c_end))
+    row, column = torch.meshgrid(
+        *(torch.arange(n, dtype=torch.float64) for n in (cam.height, cam.width)), indexing="ij"
+    )
+    line, count = (column, cam.width) if cam.shutter in _COLUMNS else (row, cam.height)
+    times = line / (count - 1) if count > 1 else torch.full_like(line, 0.5)
+    times = 1 - times if cam.shutter in _BACKWARD else times
+    times = torch.cat([times.reshape(-1), torch.tensor([0.5], dtype=torch.float64)])
+    turn = R1 @ R0.T
+    # The quaternion of a turn by less than half a circle has a positive first entry.
+    w = (1 + turn.diagonal().sum()).sqrt() / 2
+    v = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (4 * w)
+    squared = (v * v).sum()
+    still = squared.detach() < 1e-16  # no turn: slerp is linear there
+    length = torch.where(still, 1.0, squared).sqrt()
+    half = torch.atan2(length, w) * times
+    w = torch.where(still, torch.ones_like(times), half.cos())
+    x, y, z = (torch.where(still, times * c, half.sin() * c / length) for c in v)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    turns = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    return turns @ R0, (1 - times)[:, None] * t0 + times[:, None] * t1
 
 
 def cull_near(
@@ -272,11 +311,22 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
     offset = float64(getattr(g, "origin", (0, 0, 0)))
     rotation: torch.Tensor | Any = None  # Any: no camera, no pose, and then nobody reads it
     center: torch.Tensor | Any = None
-    if cam is not None:
+    rolling = cam is not None and getattr(cam, "shutter", "global") != "global"
+    if rolling:
+        turns, translations = rolling_poses(cam)
+        rotation = turns[-1]
+        center = -rotation.T @ translations[-1] - offset
+    elif cam is not None:
         rotation, translation = rigid(float64(cam.w2c))
         center = -rotation.T @ translation - offset
     if rays is None:
-        pixels, directions = camera_rays(cam, rotation)
+        pixels, local = camera_rays(cam, rigid(float64(cam.w2c))[0])
+        if rolling:
+            directions = torch.einsum("pj,pjk->pk", local, turns[:-1])
+            origins = -torch.einsum("pj,pjk->pk", translations[:-1], turns[:-1]) - offset
+        else:
+            directions = local @ rotation
+            origins = center.expand_as(directions)
         shape = (cam.height, cam.width)
         if window is not None:
             x, y, width, height = window
@@ -288,8 +338,7 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
                 )
             shape = (height, width)
             inside = inside.reshape(-1)
-            pixels, directions = pixels[inside], directions[inside]
-        origins = center.expand_as(directions)
+            pixels, origins, directions = pixels[inside], origins[inside], directions[inside]
     else:
         if window is not None:
             raise ValueError("window: must come with a camera's own rays, got rays; choose among them instead")

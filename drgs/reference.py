@@ -116,8 +116,12 @@ def render(
             f"reference.render: response must be one of {', '.join(_FORMS)}, got {s.response!r}; add its equations to "
             "reference._FORMS"
         )
-    if s.planar and (rays is not None or getattr(cam, "model", "pinhole") != "pinhole"):
-        raise ValueError("reference.render: 'ewa' needs a pinhole camera, got rays, undistort")
+    if s.planar and (
+        rays is not None
+        or getattr(cam, "model", "pinhole") != "pinhole"
+        or getattr(cam, "shutter", "global") != "global"
+    ):
+        raise ValueError("reference.render: 'ewa' needs a pinhole camera, got a lens, a rolling shutter or rays")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
     scene = activate(g, s)

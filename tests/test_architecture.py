@@ -19,6 +19,7 @@ FLOORS: list[tuple[set[str], str]] = [
             "llvm_target",
             "machine",
             "lenses",
+            "shutters",
             "information.prior",
             "information.chain",
             "information.determinants",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drgs.guards.arguments import ArgumentError, kind_of
+from drgs.shutters import SHUTTERS
 
 __all__ = [
     "IMAGE_MAX",
@@ -16,6 +17,8 @@ __all__ = [
     "check_distance",
     "check_handedness",
     "check_proportions",
+    "check_shutter",
+    "check_turn",
     "checked_distortion",
     "checked_intrinsics",
     "checked_pose",
@@ -33,6 +36,7 @@ _FOCAL_MIN = 1e-4
 _FOCAL_MAX = 1e6
 _DISTANCE_MAX = 1e15
 _DISTORTION_MAX = 1e6
+_TURN_MAX = math.radians(170)  # of a camera within an exposure
 
 
 def is_tensor(value: Any) -> bool:
@@ -98,11 +102,31 @@ def check_proportions(where: str, K: np.ndarray, size: tuple[int, int]) -> None:
             )
 
 
-def checked_pose(where: str, w2c: Any) -> np.ndarray:
+def check_shutter(where: str, shutter: Any, w2c_end: Any) -> None:
+    """A shutter that exists, with a second pose if and only if it is a rolling one."""
+    if shutter not in SHUTTERS:
+        raise ValueError(f"{where}: shutter must be one of {', '.join(SHUTTERS)}, got {shutter!r}; choose one")
+    if (shutter == "global") != (w2c_end is None):
+        raise ValueError(
+            f"{where}: w2c_end must be there for rolling shutters, and for no other, got shutter {shutter!r} and "
+            f"{'no' if w2c_end is None else 'a'} second pose; change one of them"
+        )
+
+
+def check_turn(where: str, angle: float) -> None:
+    """Between the poses of a shutter, so many radians apart, there is one shortest way."""
+    if not angle <= _TURN_MAX:
+        raise ValueError(
+            f"{where}: w2c_end must be turned against w2c by at most {math.degrees(_TURN_MAX):.0f} degrees, got "
+            f"{math.degrees(angle):.0f}; give shorter exposures"
+        )
+
+
+def checked_pose(where: str, w2c: Any, name: str = "w2c") -> np.ndarray:
     """(4,4) float64 w2c, read-only, finite, a rotation and a translation."""
-    w2c = _numbers(where, "w2c", w2c)
+    w2c = _numbers(where, name, w2c)
     if w2c.shape != (4, 4):
-        raise ValueError(f"{where}: w2c must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1")
+        raise ValueError(f"{where}: {name} must have shape (4, 4), got {w2c.shape}; append the row 0 0 0 1")
     if not np.isfinite(w2c).all():
         row, column = np.argwhere(~np.isfinite(w2c))[0]
         raise ValueError(
@@ -110,7 +134,7 @@ def checked_pose(where: str, w2c: Any) -> np.ndarray:
         )
     check_distance(where, w2c)
     if np.abs(w2c[3] - (0, 0, 0, 1)).max() > _ROW_TOLERANCE:
-        raise ValueError(f"{where}: the last row of w2c must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
+        raise ValueError(f"{where}: the last row of {name} must be 0 0 0 1, got {w2c[3].tolist()}; is it transposed?")
     rotation = w2c[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > _ROTATION_TOLERANCE:

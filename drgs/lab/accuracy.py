@@ -121,15 +121,20 @@ def twist_basis() -> torch.Tensor:
     return basis
 
 
-def pose_gradient(cam: Camera, gradient: torch.Tensor) -> torch.Tensor:
+def pose_gradient(w2c: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
     """(6,) the part of a gradient of w2c along the world twists c2w <- exp(xi) c2w."""
-    change = -cam.w2c.detach() @ twist_basis()  # the directions are constants: the pose's own graph has no part in them
+    change = -w2c.detach() @ twist_basis()  # the directions are constants: the pose's own graph has no part in them
     return (change * gradient).sum((1, 2))
 
 
 def leaves(g: Gaussians, cam: Camera) -> dict[str, torch.Tensor]:
     """Everything that is differentiated, by group name."""
-    return {**g.parameters(), "camera": cam.w2c}
+    return {**g.parameters(), **_poses(cam)}
+
+
+def _poses(cam: Camera) -> dict[str, torch.Tensor]:
+    """The poses of a camera by the names that tangents have: one, or two of a rolling shutter."""
+    return {"camera": cam.w2c} | ({"camera_end": cam.w2c_end} if cam.is_rolling else {})
 
 
 def inner(a: Mapping[str, torch.Tensor], b: Mapping[str, torch.Tensor]) -> float:
@@ -173,17 +178,19 @@ class Oracle:
             self.u[name] = torch.tensor(rng.normal(size=tuple(x.shape))) * mask
             self.u[name].requires_grad_()
         self.v = {name: torch.tensor(rng.normal(size=tuple(x.shape))) for name, x in g.parameters().items()}
-        self.v["camera"] = torch.tensor(rng.normal(size=6))
+        self.v |= {name: torch.tensor(rng.normal(size=6)) for name in _poses(cam)}
         # J^T u is linear in u: differentiating <v, J^T u> by u gives J v.
         loss = sum((images[name] * u).sum() for name, u in self.u.items())
         groups = leaves(g, cam)
         back = _grad(loss, groups, create_graph=True)
         # Tangents are constants: with the pose's graph, the second differentiation below would go through it again.
-        change = {**self.v, "camera": -cam.w2c.detach() @ (self.v["camera"][:, None, None] * twist_basis()).sum(0)}
+        change = dict(self.v)
+        for name, pose in _poses(cam).items():
+            change[name] = -pose.detach() @ (self.v[name][:, None, None] * twist_basis()).sum(0)
         self.push = _grad(sum((back[name].double() * change[name]).sum() for name in back), self.u)
         # The graph has served; kept, it would hold every intermediate of the oracle for as long as this object lives.
         self.back = {n: x.detach().double() for n, x in back.items()}
-        self.back["camera"] = pose_gradient(cam, self.back["camera"])
+        self.back |= {name: pose_gradient(pose, self.back[name]) for name, pose in _poses(cam).items()}
         self.u = {name: u.detach() for name, u in self.u.items()}  # it was a variable to get J v, and is a number now
 
 
@@ -197,11 +204,11 @@ def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: boo
 def gradients(
     g: Gaussians, cam: Camera, out: Output | reference.ReferenceOutput, u: Mapping[str, torch.Tensor]
 ) -> dict[str, torch.Tensor]:
-    """float64 gradient of sum <u, image> by group, `camera` as a twist."""
+    """float64 gradient of sum <u, image> by group, `camera` and `camera_end` as twists."""
     # Sums over an image in float64: in float32 they lose more digits than the gradients are compared by.
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
     found = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
-    return {**found, "camera": pose_gradient(cam, found["camera"])}
+    return found | {name: pose_gradient(pose, found[name]) for name, pose in _poses(cam).items()}
 
 
 @dataclasses.dataclass

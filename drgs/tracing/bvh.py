@@ -53,16 +53,19 @@ class BvhTraversal:
 
     Args:
         rays: Number of rays; origin and direction are the last six floats that they carry.
+        holes: (rays,) 0 for what is no ray; None if all are.
     """
 
     world = True
 
-    def __init__(self, lib: Lib, settings: RenderSettings, projected: Projected, rays: int) -> None:
+    def __init__(
+        self, lib: Lib, settings: RenderSettings, projected: Projected, rays: int, holes: UInt32 | None = None
+    ) -> None:
         self.lib = lib
         self.settings = settings
         self.projected = projected
         self.rays = rays
-        self.holes = None
+        self.holes = holes
         self.certificate: dict = {}
 
     def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
@@ -87,6 +90,8 @@ class BvhTraversal:
         lib, s = self.lib, self.settings
         ray = self._ray(self.order)
         inside = lib.Bool(bool(self.rays))
+        if self.holes is not None:
+            inside = dr.gather(lib.UInt32, self.holes, self.order) != 0
         stream = _ProxyStream(lib, self.proxies, ray, s.order)
         part = Part(
             lib,

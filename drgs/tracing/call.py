@@ -16,14 +16,18 @@ from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.derivatives import check_has_numbers
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
+from drgs.tracing.arrays import UInt32
 from drgs.tracing.composite import Arguments, Composite, Compositor, compositor_of
+from drgs.tracing.free_rays import FreeRays
 from drgs.tracing.lens_motion import LensMotion
 from drgs.tracing.lens_rays import lens_of
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
+from drgs.tracing.primitives import Screen
+from drgs.tracing.shutter import rolling_view
 from drgs.tracing.tiles import TILE, TileTraversal
 from drgs.tracing.walk import Traversal
 
-__all__ = ["OF_VIEW", "Call", "Output", "numbers"]
+__all__ = ["OF_VIEW", "Call", "Output", "checked_pixel_rays", "numbers"]
 
 OF_VIEW = ("w2c", "ray_origins", "ray_directions", "ray_shifts")  # inputs that follow from the pose and the lens
 
@@ -66,6 +70,7 @@ class Call:
         timed: Whether derivatives by the scene's time are wanted, too.
         couple: The argument `couple_features` of `render`.
         lens: The camera's `lens_parameters`, if derivatives by them are wanted.
+        pixel_rays: (H, W, 6) origin and direction of each pixel, in the world, instead of those that the camera has.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
             `time`, `w2c` (12 floats), rays where they are traced.
@@ -73,7 +78,10 @@ class Call:
         shape: Shape of the images: (H, W), or that of the rays.
         extra: Outputs without a derivative, after `trace`.
         certificate: What becomes `Output.certificate`, after `trace`.
+        pixel_rays: Float64 of the argument.
         motion: How rays move with the lens, if derivatives by it are wanted.
+        free: Pixels have rays without a common origin.
+        origin: (3,) float64, what was taken off the world: x_world = x + origin.
     """
 
     def __init__(
@@ -87,6 +95,7 @@ class Call:
         couple: bool = True,
         timed: bool = False,
         lens: torch.Tensor | None = None,
+        pixel_rays: torch.Tensor | np.ndarray | None = None,
     ):
         self.lib = runtime.dr_types()
         self.settings = settings
@@ -100,12 +109,22 @@ class Call:
                 f"{camera.model!r} with distortion; use camera.undistorted(), or a response along rays "
                 "(--preset exact, fast or 3dgut)"
             )
+        self.free = camera is not None and (pixel_rays is not None or camera.is_rolling)
+        if settings.planar and self.free:
+            raise NotImplementedError(
+                f"render: response={settings.response!r} is a model of a pinhole's image plane, got "
+                f"{'rays' if pixel_rays is not None else 'a rolling shutter'}; use a response along rays "
+                "(--preset exact, fast or 3dgut)"
+            )
+        self.pixel_rays = None if pixel_rays is None else numbers("render", "rays", pixel_rays)
+        self.table: FreeRays | None = None
+        self.holes: UInt32 | None = None
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
         self._check_memory(gaussians, rays)
         gaussians.validate("render")
         self.device = gaussians.means.device
         middle = None
-        if settings.traversal == "bvh" and gaussians.means.dtype == torch.float64 and len(gaussians):
+        if (settings.traversal == "bvh" or self.free) and gaussians.means.dtype == torch.float64 and len(gaussians):
             # World records are float32, so a world far from 0 is moved there; where to has no derivative.
             middle = gaussians.means.detach().mean(0)
             origin = np.asarray(gaussians.origin, np.float64) + [float(x) for x in middle]
@@ -127,7 +146,7 @@ class Call:
         self.count = len(gaussians)
         self.coefficients = gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
-        origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
+        self.origin = origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
         if rays is not None:
             o, d = checked_rays(*rays, settings)
             self.shape = tuple(d.shape[:-1])
@@ -141,11 +160,12 @@ class Call:
             self.shape = (camera.height, camera.width)
             pose = rigid_pose(camera)
             local = self._moving(lens) if lens is not None else None
-            if settings.traversal == "bvh" or settings.sh_direction == "ray":
-                d = (self._local() if local is None else local) @ pose[:3, :3]
+            if self.free:
+                pose = self._set_free_rays(pose, local)
+            elif settings.traversal == "bvh" or settings.sh_direction == "ray":
+                d = (self.local_directions() if local is None else local) @ pose[:3, :3]
                 center = -(pose[:3, 3] @ pose[:3, :3]) - origin
                 self._set_rays(center.expand(d.shape), d)
-        # The world of the means is re-centered: x_world = x + origin.
         self.inputs["w2c"] = self._move(shifted(pose, origin))
         self.pixels = int(np.prod(self.shape))
         self.extra = {}
@@ -169,24 +189,58 @@ class Call:
                 "render: derivatives by the lens must be of a response along rays, got "
                 f"{self.settings.response!r}; use preset exact, fast or 3dgut"
             )
-        self.motion = LensMotion(camera, self._local())
+        self.motion = LensMotion(camera, self.local_directions())
         local = self.motion.directions(lens)
-        if self.settings.traversal == "tiles":
+        if self.settings.traversal == "tiles" and not self.free:
             self.inputs["ray_shifts"] = self._move(self.motion.shifts(local, self.is_wide()))
         return local
 
-    def _local(self) -> torch.Tensor:
+    def local_directions(self) -> torch.Tensor:
         """(P, 3) directions in camera axes; where there is none, any that is a number."""
+        return self._local_and_known()[0]
+
+    def _local_and_known(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same, and where there is one, (P, 1)."""
         d = local_directions(self.camera)
-        return torch.where(torch.isfinite(d).all(1, keepdim=True), d, torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype))
+        known = torch.isfinite(d).all(1, keepdim=True)
+        return torch.where(known, d, torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype)), known
 
     def is_wide(self) -> bool:
         """Whether the camera's lens is a wide one."""
         table = lens_of(self.lib, self.camera, TILE)
         return table is not None and table.wide
 
+    def _set_free_rays(self, start: torch.Tensor, local: torch.Tensor | None) -> torch.Tensor:
+        """Set rays of their own for all pixels, and return the pose whose depths count.
+
+        Args:
+            start: (3, 4) pose of the camera; of a rolling shutter that of the first line.
+            local: (P, 3) directions in camera axes that move with the lens, if they do.
+        """
+        camera = self.camera
+        if self.pixel_rays is None:
+            found, known = self._local_and_known()
+            ends = start, rigid_pose(camera, "w2c_end")
+            pose, o, d = rolling_view(camera, *ends, found if local is None else local)
+        else:
+            pose = start
+            o, d, known = checked_pixel_rays(self.pixel_rays, camera)
+        o = o - self.origin
+        self._set_rays(o, d)
+        # Where rays are is a number: lists have no derivative.
+        seen_from = shifted(pose, self.origin).reshape(3, 4)
+        o, d, known, seen_from = (
+            runtime.unwrapped(x.detach(), lambda x: x.cpu().numpy()) for x in (o, d, known, seen_from)
+        )
+        if not known.all():
+            self.holes = self.lib.UInt32(known[:, 0].astype(np.uint32))
+            d = np.where(known, d, np.nan)
+        if self.settings.traversal == "tiles":
+            self.table = FreeRays(self.lib, camera, TILE, o, d, seen_from, self.holes)
+        return pose
+
     def _set_rays(self, o, d):
-        if self.settings.traversal == "bvh":
+        if self.settings.traversal == "bvh" or self.free:
             self.inputs["ray_origins"] = self._move(o)
         self.inputs["ray_directions"] = self._move(d)
 
@@ -216,13 +270,17 @@ class Call:
             from drgs.tracing.bvh import BvhTraversal  # the only one that needs Mitsuba
 
             projected = projection.project_world(lib, p, p["w2c"], s, self.coefficients)
-            traversal: Traversal = BvhTraversal(lib, s, projected, self.pixels)
+            traversal: Traversal = BvhTraversal(lib, s, projected, self.pixels, self.holes)
         else:
             K = self.camera.K
             size = (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
-            lens = lens_of(lib, self.camera, TILE)
-            projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients, lens)
+            lens = self.table or lens_of(lib, self.camera, TILE)
+            if self.table is not None:
+                screen = Screen(pinhole, *size, None, None, lens)
+                projected = projection.project_world(lib, p, p["w2c"], s, self.coefficients, screen)
+            else:
+                projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients, lens)
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
             trimmed = not self.want & {"depth", "count"}
             traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed, lens)
@@ -279,7 +337,7 @@ class Call:
 def _check_names(parameters: dict) -> None:
     """Refuse a scene's parameter that has the name of what belongs to the view: their tangents would be mixed."""
     for name in parameters:
-        if name in (*OF_VIEW, "camera", "lens", "rotations", "time", "phi"):
+        if name in (*OF_VIEW, "camera", "camera_end", "lens", "rays", "rotations", "time", "phi"):
             raise ArgumentError(
                 f"scene.parameters(): names must not be those of the view or of rotations, got {name!r}; rename "
                 f"it, e.g. {name + '_of_scene'!r}"
@@ -294,6 +352,33 @@ def numbers(where: str, name: str, x) -> torch.Tensor:
         return torch.as_tensor(x).to(torch.float64)
     except (TypeError, ValueError, RuntimeError):
         raise ArgumentError(f"{where}: {name} must be an array of numbers, got {kind_of(x)}") from None
+
+
+def checked_pixel_rays(x: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Float64 origins and unit directions (P, 3) of a caller's rays, and where there is one, (P, 1).
+
+    Raises:
+        ValueError: If there is not one ray a pixel, or a number is not finite; a direction of 0 is no ray.
+    """
+    expected = (camera.height, camera.width, 6)
+    if tuple(x.shape) != expected:
+        raise ValueError(
+            f"render: rays must have shape {expected}, an origin and a direction for each pixel of the camera, got "
+            f"{tuple(x.shape)}; give the camera their size"
+        )
+    bad = ~torch.isfinite(x.detach()).all(-1)  # a check has no derivative
+    if bool(bad.any()):
+        at = bad.nonzero()[0].tolist()
+        raise ValueError(
+            f"render: rays must be finite, got {x.detach()[tuple(at)].tolist()} at pixel {at}; a direction of 0 is "
+            "no ray"
+        )
+    o, d = x.reshape(-1, 6).split(3, 1)
+    squared = (d * d).sum(1, keepdim=True)
+    there = squared.detach() > 0  # whether a pixel has a ray has no derivative
+    # What stands for a ray must be one.
+    forward = torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype, device=d.device)
+    return o, torch.where(there, d / torch.where(there, squared, 1.0).sqrt(), forward), there
 
 
 def checked_rays(origins, directions, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:

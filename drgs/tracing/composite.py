@@ -164,7 +164,7 @@ class Compositor:
         chunks = range(joint, self.width, CHUNK)
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
         # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
-        share = 4 if self.settings.order == "center" and not view.world and not self.basis else 1
+        share = 4 if self.settings.order == "center" and self.settings.traversal == "tiles" and not self.basis else 1
         weighed = self.width > joint
         self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
         out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))

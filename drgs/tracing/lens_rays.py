@@ -5,7 +5,7 @@ A lens only says which ray each pixel has. Everything here is made from that tab
 where its inverse is an approximation, too.
 
 A hit (responses/peak.py) is a linear function of the ray's direction around an anchor. Narrow lenses, all of whose rays
-are less than `_NARROW` off the axis, have pixels of the pinhole camera with the same K: a pixel's ray is a point of
+are less than `NARROW` off the axis, have pixels of the pinhole camera with the same K: a pixel's ray is a point of
 that image, and w = 1. Wide ones have directions d; a Gaussian's anchor is on the side of a cube around the camera that
 its mean is seen through, and (x, y, w) are the components of d along that side's axes. Either is kept in two floats, of
 which the first is subtracted from the anchor (or from w times it, in one rounding) exactly.
@@ -31,11 +31,21 @@ from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.pose import local_rays
 from drgs.tracing.primitives import Patch, Ray
 
-__all__ = ["FISHEYE", "LensRays", "lens_of"]
+__all__ = [
+    "FISHEYE",
+    "NARROW",
+    "LensRays",
+    "equidistant",
+    "lens_of",
+    "on_plane",
+    "on_side",
+    "pixels_of",
+    "tile_boxes",
+]
 
 FISHEYE = ("opencv_fisheye",)
 """Models whose guides are those of the equidistant fisheye; those of others are pixels of the pinhole camera."""
-_NARROW = 0.17  # least d_z of a narrow lens: 80 degrees
+NARROW = 0.17  # least d_z of a narrow lens: 80 degrees
 _CELL = 4  # pixels, about, of the least cells of a table of displacements
 _MOST_CELLS = 1024  # in a row of it
 _HELD = 256 << 20  # bytes of tables that are kept for the next view
@@ -79,6 +89,9 @@ class LensRays:
         size: Bytes of all tables.
     """
 
+    world = False
+    reach = 0.0
+
     def __init__(self, lib: Lib, camera: Camera, tile: int) -> None:
         self.lib = lib
         self.fisheye = camera.model in FISHEYE
@@ -87,9 +100,9 @@ class LensRays:
         known = np.isfinite(d).all(1)
         # What stands for a ray must be a number; `TileTraversal` leaves these out.
         self.known = None if known.all() else lib.UInt32(known.astype(np.uint32))
-        self.wide = bool((d[known, 2] < _NARROW).any())
+        self.wide = bool((d[known, 2] < NARROW).any())
         K = camera.K
-        values = d if self.wide else _pixels_of(K, d[:, :2] / d[:, 2:])
+        values = d if self.wide else pixels_of(K, d[:, :2] / d[:, 2:])
         if not self.wide:
             self.low = np.floor(values[known].min(0, initial=0.0))
             self.high = np.floor(values[known].max(0, initial=0.0))
@@ -98,14 +111,14 @@ class LensRays:
         rest = (values - first).astype(np.float32)
         self.columns = [lib.Float(np.ascontiguousarray(x)) for x in (*first.T, *rest.T)]
         self.columns = [dr.select(dr.isfinite(x), x, 0) for x in self.columns]
-        boxes = _tile_boxes(values.reshape(camera.height, camera.width, -1), tile, not self.wide)
+        boxes = tile_boxes(values.reshape(camera.height, camera.width, -1), tile, not self.wide)
         self.boxes = [lib.Float(np.ascontiguousarray(x)) for x in boxes.T]
-        self._displacements(camera, _pixels_of(K, _equidistant(d) if self.fisheye else _on_plane(d)))
+        self.set_displacements(camera, pixels_of(K, equidistant(d) if self.fisheye else on_plane(d)))
         dr.make_opaque(*self.columns, *self.boxes)
         arrays = [*self.columns, *self.boxes, self.cells]
         self.size = 4 * sum(dr.width(x) for x in arrays)
 
-    def _displacements(self, camera: Camera, guides: np.ndarray) -> None:
+    def set_displacements(self, camera: Camera, guides: np.ndarray) -> None:
         """Make the table of least and largest displacements from guides (P, 2) to pixels."""
         lib = self.lib
         size = np.array([camera.width, camera.height], np.float64)
@@ -221,13 +234,13 @@ def _length(pinhole: list[Float], x: Float, y: Float) -> Float:
     return dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
 
 
-def _on_plane(d: np.ndarray) -> np.ndarray:
+def on_plane(d: np.ndarray) -> np.ndarray:
     """(P, 2) of directions on the plane z = 1."""
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         return d[:, :2] / d[:, 2:]
 
 
-def _equidistant(d: np.ndarray) -> np.ndarray:
+def equidistant(d: np.ndarray) -> np.ndarray:
     """(P, 2) of directions under the equidistant fisheye: as far from 0 as they are from the axis, in radians."""
     radius = np.hypot(d[:, 0], d[:, 1])
     turn = np.arctan2(d[:, 1], d[:, 0])
@@ -235,13 +248,13 @@ def _equidistant(d: np.ndarray) -> np.ndarray:
     return np.stack([angle * np.cos(turn), angle * np.sin(turn)], 1)
 
 
-def _pixels_of(K: np.ndarray, plane: np.ndarray) -> np.ndarray:
+def pixels_of(K: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """(P, 2) of K times points of a plane."""
     x = K[0, 0] * plane[:, 0] + K[0, 1] * plane[:, 1] + K[0, 2]
     return np.stack([x, K[1, 1] * plane[:, 1] + K[1, 2]], 1)
 
 
-def _tile_boxes(values: np.ndarray, tile: int, centers: bool) -> np.ndarray:
+def tile_boxes(values: np.ndarray, tile: int, centers: bool) -> np.ndarray:
     """(tiles, 2 C) float32 middle of what the pixels of each tile have, and how far it reaches from there.
 
     Args:

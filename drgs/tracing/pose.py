@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import torch
 
@@ -12,9 +10,11 @@ from drgs.cameras import Camera, rigid
 __all__ = ["rigid_pose", "local_directions", "local_rays", "quaternion_product", "shifted", "turned", "twisted"]
 
 
-def rigid_pose(camera: Camera) -> torch.Tensor:
-    """(3, 4) of w2c in float64, as the rigid motion that it means; a copy of an array, which may be read-only."""
-    w2c = camera.w2c
+def rigid_pose(camera: Camera, name: str = "w2c") -> torch.Tensor:
+    """(3, 4) of w2c, or of w2c_end, in float64, as the rigid motion that it means; a copy of an array, which may be
+    read-only.
+    """
+    w2c = getattr(camera, name)
     if not isinstance(w2c, torch.Tensor):
         return torch.tensor(w2c).to(torch.float64)[:3]
     # The camera has checked it, but an optimizer may have moved it since. A check has no derivative.
@@ -41,8 +41,7 @@ def local_directions(camera: Camera) -> torch.Tensor:
 
 def local_rays(camera: Camera) -> np.ndarray:
     """What `local_directions` gives, as an array."""
-    identity = dataclasses.replace(camera, w2c=np.eye(4))
-    return np.asarray(identity.pixel_directions(), np.float64).reshape(-1, 3)
+    return camera.local_directions().reshape(-1, 3)
 
 
 def twisted(pose: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:

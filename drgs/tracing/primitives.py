@@ -48,9 +48,11 @@ class Lens(Protocol):
 
     Attributes:
         fisheye: Guides are those of the equidistant fisheye; else pixels of the pinhole camera.
+        reach: How far off the camera center rays start at most, in scene units; 0 if all start there.
     """
 
     fisheye: bool
+    reach: float
 
     def pixels(self, guides: list[Float]) -> list[Float]:
         """Bounds of the pixels whose guides are within bounds."""

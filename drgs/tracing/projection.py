@@ -16,6 +16,7 @@ from drgs.tracing.lens_rays import LensRays, on_side
 from drgs.tracing.primitives import Activated, Projected, Screen
 from drgs.tracing.records import ALPHA
 from drgs.tracing.responses import Response, response_of
+from drgs.tracing.silhouettes import silhouette
 
 __all__ = ["project_screen", "project_world"]
 
@@ -91,10 +92,20 @@ def _screen(lib: Lib, c: list[Float], pinhole: list[Float], width: int, height: 
     return Screen(pinhole, width, height, ax, ay, lens)
 
 
-def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coefficients: int) -> Projected:
+def project_world(
+    lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coefficients: int, screen: Screen | None = None
+) -> Projected:
     """World records for arbitrary rays: mean, W = S^-1 R^T, opacity, extent^2, color.
 
-    Arguments are those of `project_screen`; `bounds` of what is returned is None.
+    Args:
+        lib: Dr.Jit types of the backend.
+        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh.
+        w2c: Float64 of width 12, the upper rows of the world-to-camera matrix; differentiable.
+        settings: Settings of the render.
+        coefficients: SH coefficients in `p["sh"]`.
+        screen: The image that bounds are wanted on, of the camera of w2c; its lens says where its rays are.
+    Returns:
+        Records, depth keys, and either bounds or, without a screen, the ellipsoids of the extents.
     """
     Float = lib.Float
     response = response_of(settings)
@@ -110,11 +121,14 @@ def project_world(lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coeff
     if settings.near > 0:
         alive &= z > settings.near
     key = z if settings.depth_key == "z" else distance
+    frame = g.rotation, g.scale, None, None
+    if screen is not None:
+        bounds, seen = silhouette(g, screen)
+        return Projected(record, Float(key), [Float(b) for b in bounds], alive & seen, frame=frame)
     # The proxies of `bvh` may stop where alpha_min cuts, unless it is their entry points that order the hits. They
     # only say which hits to look at, hence no derivative.
     extent = dr.detach(g.extent) if settings.order == "entry" else g.listed_extent()
     ellipsoids = [dr.detach(x) for x in [*g.mean, *g.quat, *[dr.detach(s) * extent for s in g.scale]]]
-    frame = g.rotation, g.scale, None, None
     return Projected(record, Float(key), None, alive & (extent > 0), ellipsoids, frame)
 
 

@@ -53,14 +53,21 @@ def silhouette(g: Activated, screen: Screen) -> tuple[list[Float], Mask]:
     """Bounds x0, y0, x1, y1 in pixels of the extent ellipsoid, and which are there.
 
     Of a pinhole they are exact where the ellipsoid lies in front of the camera plane; of a lens they are the pixels
-    whose rays lie in such a box, or about it (lens_rays.py).
+    whose rays lie in such a box, or about it (lens_rays.py). Rays that start up to `Lens.reach` off the camera center
+    meet the ellipsoid where rays from the center meet what is as near to it: a larger ellipsoid holds that.
     """
     fx, skew, cx, fy, cy = screen.pinhole
     extent = g.listed_extent()
-    axes = [[dr.detach(x * s) * extent for x, s in zip(row, g.scale, strict=True)] for row in g.from_local]
-    center = dr.detach(g.center)
     lens = screen.lens
-    seen = _on_plane(g, extent)
+    half_axes = [dr.detach(s) * extent for s in g.scale]  # bounds have no derivative
+    if lens is not None and lens.reach:
+        half_axes = _grown(half_axes, dr.opaque(type(fx), lens.reach))
+        axes = [[dr.detach(x) * a for x, a in zip(row, half_axes, strict=True)] for row in g.from_local]
+        seen = _on_plane(g, type(fx)(1), half_axes)
+    else:
+        axes = [[dr.detach(x * s) * extent for x, s in zip(row, g.scale, strict=True)] for row in g.from_local]
+        seen = _on_plane(g, extent, g.scale)
+    center = dr.detach(g.center)
     if lens is not None and lens.fisheye:
         low, high = _fisheye(center, axes, seen)
         middle = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
@@ -87,15 +94,26 @@ def _in_pixels(screen: Screen, middle: list[Float], half: list[Float]) -> list[F
     return [x - grow_x - _PAD, y - abs(fy) * half[1] - _PAD, x + grow_x + _PAD, y + abs(fy) * half[1] + _PAD]
 
 
-def _on_plane(g: Activated, extent: Float) -> _Plane:
-    """The box on the plane z = 1."""
+def _grown(half_axes: list[Float], reach: Float) -> list[Float]:
+    """Half axes a of an ellipsoid that holds all that is within `reach` = r of one.
+
+    a^2 (1 + 1 / p) + r^2 (1 + p) holds it for every p > 0, by the Cauchy-Schwarz inequality for support functions; with
+    p = |a| / r it grows least where the ellipsoid is round.
+    """
+    size = dr.sqrt(dot(half_axes, half_axes))
+    ratio = reach / dr.maximum(size, 1e-30)
+    return [dr.sqrt(a * a * (1 + ratio) + reach * (reach + size)) for a in half_axes]
+
+
+def _on_plane(g: Activated, extent: Float, scale: list[Float]) -> _Plane:
+    """The box on the plane z = 1, of ellipsoids with half axes `extent` times `scale`."""
     f = g.from_local
     c = dr.detach(g.center)  # for bounds, as sigma
     e2 = extent * extent
 
     def sigma(a: int, b: int) -> Float:
         # Bounds have no derivative.
-        return e2 * sum(dr.detach(f[a][k] * f[b][k] * g.scale[k] * g.scale[k]) for k in range(3))
+        return e2 * sum(dr.detach(f[a][k] * f[b][k] * scale[k] * scale[k]) for k in range(3))
 
     szz = sigma(2, 2)
     q22 = szz - c[2] * c[2]

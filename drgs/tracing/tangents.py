@@ -8,8 +8,9 @@ import torch
 from drgs.guards import memory
 from drgs.settings import EPS_ALPHA
 from drgs.tracing.bridge import to_drjit
-from drgs.tracing.call import OF_VIEW, Call, Output, numbers
+from drgs.tracing.call import OF_VIEW, Call, Output, checked_pixel_rays, numbers
 from drgs.tracing.pose import quaternion_product, rigid_pose, shifted, turned, twisted
+from drgs.tracing.shutter import rolling_view
 
 __all__ = ["push_forward"]
 
@@ -39,7 +40,12 @@ def _columns(call: Call, tangents: dict) -> tuple[list[dict], bool]:
     if "quats" in shapes:
         shapes["rotations"] = (shapes["quats"][0], 3)
     shapes["camera"] = (6,)
-    shapes["lens"] = call.camera.lens_parameters.shape
+    if call.pixel_rays is not None:
+        shapes["rays"] = tuple(call.pixel_rays.shape)
+    else:
+        shapes["lens"] = call.camera.lens_parameters.shape
+        if call.camera.is_rolling:
+            shapes["camera_end"] = (6,)
     lengths = set()
     given = {}
     for name, x in tangents.items():
@@ -68,6 +74,8 @@ def _column(call: Call, given: dict) -> dict:
     if "rotations" in given:
         q = call.inputs["quats"].to(torch.float64)
         column["quats"] = column.get("quats", 0) + 0.5 * quaternion_product(given["rotations"].to(call.home), q)
+    if call.free:
+        return column | _free_column(call, given)
     if "lens" in given:
         lens = torch.from_numpy(call.camera.lens_parameters.copy())
         local, moved = torch.func.jvp(call.motion.directions, (lens,), (given["lens"].cpu(),))
@@ -80,18 +88,48 @@ def _column(call: Call, given: dict) -> dict:
     if "camera" in given:
         twist = given["camera"]
         w2c = rigid_pose(call.camera).detach()  # numbers: where the derivative is taken
-        change = twisted(w2c, twist)
-        # Numbers as well. The inputs are of a re-centered world: w2c there is that of x + origin.
-        w2c_there = call.inputs["w2c"].cpu().detach().reshape(3, 4)
-        origin = torch.linalg.solve(w2c[:3, :3], w2c_there[:, 3] - w2c[:3, 3])
-        column["w2c"] = shifted(change, origin).to(call.home)
+        # The inputs are of a re-centered world: w2c there is that of x + origin.
+        column["w2c"] = shifted(twisted(w2c, twist), call.origin).to(call.home)
         if "ray_directions" in call.inputs:
             turning = turned(twist[:3], call.inputs["ray_directions"])
             column["ray_directions"] = column.get("ray_directions", 0) + turning
         if "ray_origins" in call.inputs:
-            o = call.inputs["ray_origins"] + origin.to(call.home)
+            o = call.inputs["ray_origins"] + call.origin.to(call.home)
             column["ray_origins"] = turned(twist[:3], o) + twist[3:].to(call.home)
     return column
+
+
+def _free_column(call: Call, given: dict) -> dict:
+    """Tangents of w2c and of the rays of pixels that have no common origin."""
+    column = {}
+    if call.pixel_rays is not None:
+        if "camera" in given:  # the rays are the caller's: what moves is from where colors are seen
+            # Numbers: where the derivative is taken.
+            moved = twisted(rigid_pose(call.camera).detach(), given["camera"])
+            column["w2c"] = shifted(moved, call.origin).to(call.home)
+        if "rays" in given:
+            ways = lambda rays: checked_pixel_rays(rays, call.camera)[:2]  # noqa: E731
+            _, (o, d) = torch.func.jvp(ways, (call.pixel_rays.detach(),), (given["rays"],))
+            column |= {"ray_origins": o.to(call.home), "ray_directions": d.to(call.home)}
+        return column
+    camera = call.camera
+    if not {"camera", "camera_end", "lens"} & set(given):
+        return column
+    poses = rigid_pose(camera).detach(), rigid_pose(camera, "w2c_end").detach()  # numbers, as above
+    lens = torch.from_numpy(camera.lens_parameters.copy())
+
+    def view(start: torch.Tensor, end: torch.Tensor, lens: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        local = call.motion.directions(lens) if "lens" in given else call.local_directions()
+        pose, o, d = rolling_view(camera, start, end, local)
+        return shifted(pose, call.origin), o - call.origin, d
+
+    twists = [
+        twisted(pose, given[name]) if name in given else torch.zeros_like(pose)
+        for pose, name in zip(poses, ("camera", "camera_end"), strict=True)
+    ]
+    primals = (*poses, lens)
+    _, moved = torch.func.jvp(view, primals, (*twists, given.get("lens", torch.zeros_like(lens)).cpu()))
+    return {name: x.to(call.home) for name, x in zip(("w2c", "ray_origins", "ray_directions"), moved, strict=True)}
 
 
 def _pushed(call: Call, columns: list[dict]) -> tuple[dict, list[dict]]:

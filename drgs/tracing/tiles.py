@@ -21,6 +21,7 @@ from drgs.guards import memory
 from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
+from drgs.tracing.free_rays import FreeRays
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.lens_rays import LensRays
 from drgs.tracing.primitives import Patch, Projected, Ray
@@ -49,11 +50,9 @@ class TileTraversal:
 
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
-        lens: The camera's, if it is no pinhole.
+        lens: The camera's, if it is no pinhole; of rays without a common origin `FreeRays`.
         trimmed: Leave tails out, in `ray` order, whose opacities add up to `_TAILS` at most in a pixel.
     """
-
-    world = False
 
     def __init__(
         self,
@@ -77,6 +76,7 @@ class TileTraversal:
         self.rays = width * height
         self.certificate: dict = {}
         self.lens = lens
+        self.world = lens is not None and lens.world
         self.holes = None if lens is None else lens.known
         self.pinhole = [lib.Float(v) for v in pinhole]
         dr.make_opaque(*self.pinhole)
@@ -220,6 +220,8 @@ class TileTraversal:
     def _ray(self, x: Float, y: Float, flat: UInt32, inside: Mask) -> Ray:
         """Through a point of the image; |d| is that of the direction with d_z = 1."""
         carried = [dr.gather(self.lib.Float, c, flat, inside) for c in self.carried]
+        if self.world:
+            return Ray(carried=carried, basis=self.basis)
         if self.lens is not None:
             return self.lens.ray(self.pinhole, flat, inside, carried, self.basis, self.shifted)
         fx, skew, cx, fy, cy = self.pinhole
@@ -427,10 +429,11 @@ class _Tiles:
         self.lens = lens
         self.r = loaded
         self.response = response_of(settings)
-        self.limit = loaded[layout.EXT2] - cut
+        world = lens is not None and lens.world
+        self.limit = loaded[layout.W_EXT2 if world else layout.EXT2] - cut
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
-            needed = 2 * dr.log(loaded[layout.ALPHA] / least)
+            needed = 2 * dr.log(loaded[layout.W_ALPHA if world else layout.ALPHA] / least)
             # What float32 rounds must not lose a hit: 1e-4 is a hundred times as much.
             self.limit = dr.minimum(self.limit, needed + 1e-4 * abs(needed) + 1e-4)
 
@@ -445,6 +448,8 @@ class _Tiles:
 
     def may_hit(self, x: Int32, y: Int32) -> Mask:
         """False only where no pixel center of tile (x, y) has a hit."""
+        if isinstance(self.lens, FreeRays):
+            return self.lens.may_meet(self.r, x, y, self.limit)
         return self.response.may_hit(self.r, self.patch(x, y), self.limit)
 
 
