@@ -86,6 +86,7 @@ _MODULES = frozenset(
         "runtime",
         "select",
         "settings",
+        "shutters",
         "splats",
         "studies",
         "testing",
