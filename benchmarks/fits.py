@@ -16,6 +16,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import LossTerm
+from drgs.fitting.renderers import RendererSchedule
 from drgs.fitting.start import start
 from drgs.metrics import through_renderers
 from drgs.settings import RenderSettings
@@ -53,7 +54,10 @@ def split_of(dataset: Dataset, config: FitConfig) -> tuple[list[View], list[View
 
 
 def fitted(
-    scene: str, config: FitConfig, terms: Callable[[list[Frame]], Sequence[LossTerm]] = lambda frames: ()
+    scene: str,
+    config: FitConfig,
+    terms: Callable[[list[Frame]], Sequence[LossTerm]] = lambda frames: (),
+    cycle: Sequence[RenderSettings] = (),
 ) -> Fit:
     """Fit Gaussians to a capture, all steps of the configuration.
 
@@ -61,6 +65,7 @@ def fitted(
         scene: Name of a capture, or a folder.
         config: Configuration of the fit.
         terms: Training photographs -> terms of the loss, beside those of the configuration.
+        cycle: What steps are rendered with in turn, if not with what the configuration says.
     """
     dataset = load(DATA / scene)
     train, test = split_of(dataset, config)
@@ -68,6 +73,8 @@ def fitted(
     trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
     parts = trainer.parts
     trainer.parts = dataclasses.replace(parts, terms=[*parts.terms, *terms(frames)])
+    if cycle:
+        trainer.renderers = RendererSchedule(config.max_steps, ((0.0, tuple(cycle)),))
     took: list[float] = []
     began = time.process_time()
     while trainer.step_index < config.max_steps:
