@@ -158,6 +158,7 @@ if TYPE_CHECKING:
     from drgs import rasterize as rasterize
     from drgs import report as report
     from drgs import settings as settings
+    from drgs import shutters as shutters
     from drgs import splats as splats
     from drgs import studies as studies
     from drgs import testing as testing

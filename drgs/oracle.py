@@ -21,6 +21,7 @@ __all__ = [
     "Footprints",
     "OracleRays",
     "OracleScene",
+    "Tiles",
     "activate",
     "cull_near",
     "float64",
@@ -40,19 +41,33 @@ class Footprints:
         means: (N, 2) projected means, pixels.
         rows: (N, 2, 3) rows of J W R S, pixels: the semi-axes as the local affine approximation projects them.
         diagonal: (N, 2) diagonal of Sigma', dilation included, px^2.
-        tiles: Three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by the tolerance, exact,
-            grown by it. None without tile culling.
     """
 
     means: torch.Tensor
     rows: torch.Tensor
     diagonal: torch.Tensor
-    tiles: list[tuple[torch.Tensor, torch.Tensor]] | None
 
     def take(self, keep: torch.Tensor) -> Footprints:
         """The footprints at `keep`, a mask or an index."""
-        tiles = None if self.tiles is None else [(first[keep], last[keep]) for first, last in self.tiles]
-        return Footprints(self.means[keep], self.rows[keep], self.diagonal[keep], tiles)
+        return Footprints(self.means[keep], self.rows[keep], self.diagonal[keep])
+
+
+@dataclasses.dataclass(frozen=True)
+class Tiles:
+    """The tiles that a rasterizer looks for Gaussians in; N of them.
+
+    Attributes:
+        size: Pixels of a tile in a row.
+        ranges: Three pairs (first, last) of (N, 2) tile coordinates, `last` exclusive: shrunk by the tolerance, exact,
+            grown by it.
+    """
+
+    size: int
+    ranges: list[tuple[torch.Tensor, torch.Tensor]]
+
+    def take(self, keep: torch.Tensor) -> Tiles:
+        """The ranges at `keep`, a mask or an index."""
+        return Tiles(self.size, [(first[keep], last[keep]) for first, last in self.ranges])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +88,7 @@ class OracleScene:
         colors: (N, 3) where they are those towards the means; None where they depend on the ray.
         near_margin: (N,) z / near - 1, where means behind `near` were culled; else None.
         screen: Footprints on the image plane, of `ewa`; else None.
+        tiles: Tiles that Gaussians are culled to; None without such culling.
     """
 
     means: torch.Tensor
@@ -88,13 +104,15 @@ class OracleScene:
     colors: torch.Tensor | None = None
     near_margin: torch.Tensor | None = None
     screen: Footprints | None = None
+    tiles: Tiles | None = None
 
     def take(self, keep: torch.Tensor) -> OracleScene:
         """The Gaussians at `keep`, a mask or an index."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         taken: dict[str, Any] = {name: x[keep] for name, x in fields.items() if isinstance(x, torch.Tensor)}
-        screen = None if self.screen is None else self.screen.take(keep)
-        return dataclasses.replace(self, **taken, screen=screen)
+        parts = {"screen": self.screen, "tiles": self.tiles}
+        taken |= {name: part.take(keep) for name, part in parts.items() if part is not None}
+        return dataclasses.replace(self, **taken)
 
     def colored(self, center: torch.Tensor) -> OracleScene:
         """The scene with the colors towards the means from a camera's center (3,)."""

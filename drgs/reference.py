@@ -22,6 +22,7 @@ from drgs.oracle import (
     Footprints,
     OracleRays,
     OracleScene,
+    Tiles,
     activate,
     cull_near,
     float64,
@@ -122,6 +123,8 @@ def render(
         or getattr(cam, "shutter", "global") != "global"
     ):
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got a lens, a rolling shutter or rays")
+    if s.culling == "ut" and (cam is None or rays is not None):
+        raise ValueError("reference.render: culling='ut' needs the pixels of a camera, got rays")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
     scene = activate(g, s)
@@ -130,7 +133,11 @@ def render(
     if cam is not None:
         scene = cull_near(scene, rotation, center, s, tolerance)
     if s.planar:
-        scene = dataclasses.replace(scene, screen=_project(scene, cam, rotation, center, s, tolerance))
+        screen, tiles = _project(scene, cam, rotation, center, s, tolerance)
+        scene = dataclasses.replace(scene, screen=screen, tiles=tiles)
+    elif s.culling == "ut":
+        offset = float64(getattr(g, "origin", (0, 0, 0)))
+        scene = dataclasses.replace(scene, tiles=_unscented(scene, cam, offset, tolerance))
     if window is not None:
         scene = _in_window(scene, s, view, window, tolerance)
     if s.sh_direction == "gaussian" and center is not None:
@@ -157,7 +164,7 @@ def render(
 
 def _project(
     scene: OracleScene, cam: Any, rotation: Tensor, center: Tensor, s: RenderSettings, tolerance: float
-) -> Footprints:
+) -> tuple[Footprints, Tiles | None]:
     """Gaussians on the image plane, and the tiles that each is culled to."""
     scale, shift = scale_and_shift(cam)
     x, y, z = ((scene.means - center) @ rotation.T).unbind(-1)
@@ -165,7 +172,7 @@ def _project(
     rows = screen_rows(x, y, z, cam, s.fov_clamp, rotation, scene.axes)
     diagonal = rows.square().sum(-1) + s.dilation
     if s.culling == "extent":
-        return Footprints(mean2d, rows, diagonal, None)
+        return Footprints(mean2d, rows, diagonal), None
     # Culling has no derivative.
     m = mean2d.detach()
     cov = diagonal.detach()
@@ -188,7 +195,47 @@ def _project(
             last = torch.ceil((m + radius) / _TILE + slack)
             last = torch.where((255 * alpha < 1 - slack)[:, None], first, last)
         bounds.append((first, last))
-    return Footprints(mean2d, rows, diagonal, bounds)
+    return Footprints(mean2d, rows, diagonal), Tiles(_TILE, bounds)
+
+
+def _unscented(scene: OracleScene, cam: Any, offset: Tensor, tolerance: float) -> Tiles:
+    """The tiles of gsplat's 3DGUT: of the box of the mean and covariance that the unscented transform finds on the
+    image, with alpha = 0.1, beta = 2, kappa = 0 for three dimensions, hence lambda = alpha^2 3 - 3.
+    """
+    alpha, beta, dimensions = 0.1, 2.0, 3
+    lamb = alpha**2 * dimensions - dimensions
+    means = scene.means.detach()  # culling has no derivative
+    steps = math.sqrt(dimensions + lamb) * scene.axes.detach().transpose(1, 2)  # nor has this
+    points = torch.cat([means[:, None], means[:, None] + steps, means[:, None] - steps], 1) + offset
+    pixels, z = (torch.from_numpy(x) for x in cam.project(points.reshape(-1, 3).numpy()))
+    seen = torch.isfinite(pixels).all(-1) & ((z > 0) | (cam.model != "pinhole"))
+    pixels = torch.where(seen[:, None], pixels, 0.0).reshape(-1, 7, 2)
+    size = torch.tensor([cam.width, cam.height], dtype=torch.float64)
+    inside = ((pixels >= -0.1 * size) & (pixels < 1.1 * size)).all(-1)
+    weights = torch.full((7,), 0.5 / (dimensions + lamb), dtype=torch.float64)
+    weights[0] = lamb / (dimensions + lamb)
+    middle = torch.einsum("k,nki->ni", weights, pixels)
+    weights[0] += 1 - alpha**2 + beta
+    off = pixels - middle[:, None]
+    cov = torch.einsum("k,nki,nkj->nij", weights, off, off) + 0.3 * torch.eye(2, dtype=torch.float64)
+    det = torch.linalg.det(cov)
+    opacity = torch.sigmoid(scene.logits.detach())  # nor has this
+    extent = (2 * (255 * opacity).clamp(min=1).log()).sqrt().clamp(max=3.33)
+    variance = cov.diagonal(dim1=1, dim2=2)
+    mid = variance.mean(-1)
+    largest = mid + (mid * mid - det).clamp(min=0.01).sqrt()
+    reach = extent[:, None] * torch.minimum(variance, largest[:, None]).clamp(min=0).sqrt()
+    tile = 8 if cam.height < 1080 else 16
+    drawn = (inside & seen.reshape(-1, 7)).any(1) & (det > 0)
+    ranges = []
+    for slack in (-tolerance, 0.0, tolerance):
+        radius = torch.ceil(reach * (1 + slack))
+        there = drawn & (255 * opacity >= 1 - slack) & (radius > 0).all(1)
+        there &= ((middle + radius > -slack) & (middle - radius < size + slack)).all(1)
+        first = torch.floor((middle - radius) / tile - slack)
+        last = torch.ceil((middle + radius) / tile + slack)
+        ranges.append((first, torch.where(there[:, None], last, first)))
+    return Tiles(tile, ranges)
 
 
 def _in_window(
@@ -205,13 +252,14 @@ def _in_window(
     assert screen is not None  # of a planar response
     low = torch.tensor(window[:2], dtype=torch.float64) + 0.5
     high = low + torch.tensor(window[2:], dtype=torch.float64) - 1
-    if screen.tiles is None:
+    if scene.tiles is None:
         # What is left out has no derivative.
         middle = screen.means.detach()
         reach = (scene.extent[:, None] * screen.diagonal.detach().sqrt()) * (1 + 2 * tolerance)
         return scene.take(((middle + reach >= low) & (middle - reach <= high)).all(1))
-    first, last = screen.tiles[-1]
-    return scene.take(((last > torch.floor(low / _TILE)) & (first <= torch.floor(high / _TILE))).all(1))
+    first, last = scene.tiles.ranges[-1]
+    tile = scene.tiles.size
+    return scene.take(((last > torch.floor(low / tile)) & (first <= torch.floor(high / tile))).all(1))
 
 
 def _responses(
@@ -251,14 +299,13 @@ def _responses(
             exists.logical_and_(inside)
             margin.copy_(torch.minimum(margin, relative))
 
-        if s.culling == "extent":
+        if s.culling in ("extent", "ut"):
             rho = rho2.sqrt()
             cut(rho <= scene.extent, (scene.extent - rho) / scene.extent.clamp(min=1e-300))  # no 0 / 0
-        else:
-            tile = torch.floor(pixels / _TILE)[:, None, :]
-            assert scene.screen is not None  # tiles cull where the response is planar
-            assert scene.screen.tiles is not None
-            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.screen.tiles)
+        if s.culling != "extent":
+            assert scene.tiles is not None  # `render` has found them
+            tile = torch.floor(pixels / scene.tiles.size)[:, None, :]
+            tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.tiles.ranges)
             cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
         if form.front_only:
             cut(t > 0, t / torch.maximum(distance, _sway(scene, o, d) / tolerance).clamp(min=1e-300))  # no 0 / 0

@@ -124,8 +124,10 @@ class RenderSettings:
         dilation: Added to the diagonal of the projected covariance, in px^2 (`ewa` only).
         near: Gaussians whose mean has camera z <= near are left out; 0 leaves none out.
         fov_clamp: Clamp of x/z and y/z in the `ewa` Jacobian: `none`, `inria` (symmetric) or `gsplat` (off-center).
-        culling: `extent` (the extent above), `inria` (16x16-pixel tiles touched by the square of the 3-sigma radius)
-            or `gsplat` (per-axis radius min(3.33, sqrt(2 ln(255 alpha))) sigma; no other cut than alpha_min).
+        culling: `extent` (the extent above), `inria` (16x16-pixel tiles touched by the square of the 3-sigma radius),
+            `gsplat` (per-axis radius min(3.33, sqrt(2 ln(255 alpha))) sigma; no other cut than alpha_min) or, for
+            responses along rays on tiles, `ut` (the extent, and the tiles of the box that the unscented transform
+            gives: what gsplat's 3DGUT does not look at).
         sh_direction: SH are evaluated towards each Gaussian's mean (`gaussian`) or along each pixel's ray (`ray`).
         background: RGB composited behind everything.
     """
@@ -144,7 +146,7 @@ class RenderSettings:
     dilation: float = 0.0
     near: float = 0.0
     fov_clamp: Literal["none", "inria", "gsplat"] = "none"
-    culling: Literal["extent", "inria", "gsplat"] = "extent"
+    culling: Literal["extent", "inria", "gsplat", "ut"] = "extent"
     sh_direction: Literal["gaussian", "ray"] = "gaussian"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -224,7 +226,12 @@ def legal(s: RenderSettings) -> str | None:
         return f"response={s.response!r} has one depth per Gaussian, use order='center' (got {s.order!r})"
     if s.order == "entry" and s.traversal == "tiles":
         return "order='entry' is Mitsuba's order of entry points, use traversal='bvh' (got 'tiles')"
-    if s.culling != "extent" and not s.planar:
+    if s.culling == "ut" and (s.planar or s.traversal != "tiles"):
+        return (
+            "culling='ut' belongs to responses along rays on traversal='tiles', use culling='extent' (got "
+            f"{s.response!r} on {s.traversal!r})"
+        )
+    if s.culling not in ("extent", "ut") and not s.planar:
         return f"culling={s.culling!r} belongs to response='ewa', use culling='extent' (got {s.response!r})"
     if s.fov_clamp != "none" and not s.planar:
         return f"fov_clamp={s.fov_clamp!r} belongs to response='ewa', use fov_clamp='none' (got {s.response!r})"

@@ -25,6 +25,7 @@ from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.primitives import Screen
 from drgs.tracing.shutter import rolling_view
 from drgs.tracing.tiles import TILE, TileTraversal
+from drgs.tracing.unscented import unscented_boxes
 from drgs.tracing.walk import Traversal
 
 __all__ = ["OF_VIEW", "Call", "Output", "checked_pixel_rays", "numbers"]
@@ -276,11 +277,15 @@ class Call:
             size = (self.camera.width, self.camera.height)
             pinhole = [dr.opaque(lib.Float64, float(v)) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2])]
             lens = self.table or lens_of(lib, self.camera, TILE)
+            cull = None
+            if s.culling == "ut":
+                cull = lambda g: unscented_boxes(lib, g, self.camera, self.origin)  # noqa: E731
+            given = lib, p, p["w2c"]
             if self.table is not None:
                 screen = Screen(pinhole, *size, None, None, lens)
-                projected = projection.project_world(lib, p, p["w2c"], s, self.coefficients, screen)
+                projected = projection.project_world(*given, s, self.coefficients, screen, cull)
             else:
-                projected = projection.project_screen(lib, p, p["w2c"], pinhole, s, *size, self.coefficients, lens)
+                projected = projection.project_screen(*given, pinhole, s, *size, self.coefficients, lens, cull)
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
             trimmed = not self.want & {"depth", "count"}
             traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed, lens)

@@ -8,17 +8,22 @@ Notation: W = S^-1 R^T takes a world vector into the local frame of a Gaussian; 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 
 from drgs.settings import RenderSettings
-from drgs.tracing.arrays import Float, Lib
+from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.lens_rays import LensRays, on_side
 from drgs.tracing.primitives import Activated, Projected, Screen
 from drgs.tracing.records import ALPHA
 from drgs.tracing.responses import Response, response_of
 from drgs.tracing.silhouettes import silhouette
 
-__all__ = ["project_screen", "project_world"]
+__all__ = ["Cull", "project_screen", "project_world"]
+
+Cull = Callable[[Activated], tuple[list[Float], Mask]]
+"""Bounds x0, y0, x1, y1 in pixels that Gaussians are seen within, and which of them are there."""
 
 
 def project_screen(
@@ -31,6 +36,7 @@ def project_screen(
     height: int,
     coefficients: int,
     lens: LensRays | None = None,
+    cull: Cull | None = None,
 ) -> Projected:
     """Screen records of a camera.
 
@@ -43,6 +49,7 @@ def project_screen(
         width, height: Size of the image, in pixels.
         coefficients: SH coefficients in `p["sh"]`.
         lens: The camera's, if it is no pinhole.
+        cull: What else bounds Gaussians on the image.
     Returns:
         Records, depth keys and bounds of all N Gaussians.
     """
@@ -61,7 +68,18 @@ def project_screen(
         alive &= dr.detach(g.center[2]) > settings.near
     # Keys order hits, and an order has no derivative.
     key = dr.detach(g.center[2] if settings.depth_key == "z" else distance)
+    bounds, alive = _culled(g, bounds, alive, cull)
     return Projected(record, Float(key), [Float(b) for b in bounds], alive, frame=frame)
+
+
+def _culled(g: Activated, bounds: list[Float], alive: Mask, cull: Cull | None) -> tuple[list[Float], Mask]:
+    """Bounds within those of `cull`, if there is any, and what is left."""
+    if cull is None:
+        return bounds, alive
+    boxes, seen = cull(g)
+    low = [dr.maximum(a, b) for a, b in zip(bounds[:2], boxes[:2], strict=True)]
+    high = [dr.minimum(a, b) for a, b in zip(bounds[2:], boxes[2:], strict=True)]
+    return [*low, *high], alive & seen
 
 
 def _screen(lib: Lib, c: list[Float], pinhole: list[Float], width: int, height: int, lens: LensRays | None) -> Screen:
@@ -93,7 +111,13 @@ def _screen(lib: Lib, c: list[Float], pinhole: list[Float], width: int, height: 
 
 
 def project_world(
-    lib: Lib, p: dict, w2c: Float, settings: RenderSettings, coefficients: int, screen: Screen | None = None
+    lib: Lib,
+    p: dict,
+    w2c: Float,
+    settings: RenderSettings,
+    coefficients: int,
+    screen: Screen | None = None,
+    cull: Cull | None = None,
 ) -> Projected:
     """World records for arbitrary rays: mean, W = S^-1 R^T, opacity, extent^2, color.
 
@@ -104,6 +128,7 @@ def project_world(
         settings: Settings of the render.
         coefficients: SH coefficients in `p["sh"]`.
         screen: The image that bounds are wanted on, of the camera of w2c; its lens says where its rays are.
+        cull: What else bounds Gaussians on that image.
     Returns:
         Records, depth keys, and either bounds or, without a screen, the ellipsoids of the extents.
     """
@@ -124,7 +149,8 @@ def project_world(
     frame = g.rotation, g.scale, None, None
     if screen is not None:
         bounds, seen = silhouette(g, screen)
-        return Projected(record, Float(key), [Float(b) for b in bounds], alive & seen, frame=frame)
+        bounds, alive = _culled(g, bounds, alive & seen, cull)
+        return Projected(record, Float(key), [Float(b) for b in bounds], alive, frame=frame)
     # The proxies of `bvh` may stop where alpha_min cuts, unless it is their entry points that order the hits. They
     # only say which hits to look at, hence no derivative.
     extent = dr.detach(g.extent) if settings.order == "entry" else g.listed_extent()

@@ -1,0 +1,110 @@
+"""Which tiles gsplat's 3DGUT looks for a Gaussian in: those of the box of its covariance on the image, as the unscented
+transform estimates it.
+
+The transform (Julier and Uhlmann 1997; Wan and van der Merwe 2000, alpha = 0.1, beta = 2, kappa = 0, as in 3DGUT: Wu
+et al. 2025) projects the mean and six points at sqrt(3) alpha standard deviations around it, and takes a weighted mean
+and covariance of what it finds. What a large Gaussian near the camera covers beyond that box is not drawn: `culling`
+`ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import numpy as np
+import torch
+
+from drgs.cameras import Camera
+from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.primitives import Activated
+
+__all__ = ["unscented_boxes"]
+
+_ALPHA, _BETA = 0.1, 2.0
+_SPREAD = _ALPHA * math.sqrt(3.0)  # standard deviations
+_OTHERS = 1 / (2 * _SPREAD**2)  # weight of each point but the mean
+_MEAN = 1 - 6 * _OTHERS  # weight of the mean's projection in the mean, and
+_MEAN_COVARIANCE = _MEAN + 1 - _ALPHA**2 + _BETA  # in the covariance
+_MARGIN = 0.1  # of the image, around it: a Gaussian without a point within is not drawn
+_DILATION = 0.3  # px^2, gsplat's default
+_EXTENT = 3.33  # standard deviations, or where the opacity falls to
+_OPACITY = 1 / 255
+_FINE, _COARSE = 8, 16  # pixels of gsplat's tiles: in images of less than `_HIGH` rows, and in others
+_HIGH = 1080
+_INSIDE = 0.25  # px, off the edge of a tile, so that rounding does not take its neighbor
+
+
+def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor) -> tuple[list[Float], Mask]:
+    """Bounds x0, y0, x1, y1 in pixels, of whole tiles, and which Gaussians have any.
+
+    Args:
+        lib: Dr.Jit types of the backend.
+        g: Gaussians, in the axes of the camera.
+        camera: Its lens and shutter are followed.
+        origin: (3,) what was taken off the world.
+    """
+    F = lib.Float64
+    points = _pixels(lib, g, camera, origin)
+    there = lib.Bool(False)
+    for x, y, front in points:
+        margin_x, margin_y = _MARGIN * camera.width, _MARGIN * camera.height
+        inside = (x >= -margin_x) & (x < camera.width + margin_x)
+        there |= front & inside & (y >= -margin_y) & (y < camera.height + margin_y)
+    weights = [_MEAN, *[_OTHERS] * 6]
+    mean = [sum(w * p[k] for w, p in zip(weights, points, strict=True)) for k in range(2)]
+    weights[0] = _MEAN_COVARIANCE
+    off = [(p[0] - mean[0], p[1] - mean[1]) for p in points]
+    xx, xy, yy = (sum(w * o[i] * o[j] for w, o in zip(weights, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    xx += _DILATION
+    yy += _DILATION
+    det = xx * yy - xy * xy
+    opacity = dr.detach(g.opacity)  # boxes have no derivative
+    extent = dr.minimum(dr.sqrt(2 * dr.log(dr.maximum(opacity / _OPACITY, 1))), _EXTENT)
+    middle = 0.5 * (xx + yy)
+    largest = middle + dr.sqrt(dr.maximum(middle * middle - det, 0.01))
+    size = F(camera.width), F(camera.height)
+    tile = _FINE if camera.height < _HIGH else _COARSE
+    low, high = [], []
+    seen = there & (det > 0) & (opacity >= _OPACITY)
+    for m, variance, side in zip(mean, (xx, yy), size, strict=True):
+        radius = dr.ceil(extent * dr.sqrt(dr.minimum(variance, largest)))
+        seen &= (m + radius > 0) & (m - radius < side) & (radius > 0)
+        low.append(tile * dr.floor((m - radius) / tile) + _INSIDE)
+        high.append(tile * dr.ceil((m + radius) / tile) - _INSIDE)
+    return [*low, *high], seen
+
+
+def _pixels(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor) -> list[tuple[Float, Float, Mask]]:
+    """Pixel of the mean and of the six points around it, and whether it is in front of the camera; else at (0, 0)."""
+    center = [dr.detach(x) for x in g.center]  # numbers, as all of this
+    scale = [dr.detach(s) * _SPREAD for s in g.scale]
+    if not camera.is_distorted and not camera.is_rolling:
+        axes = [[dr.detach(g.from_local[r][k]) * scale[k] for r in range(3)] for k in range(3)]
+        fx, skew, cx, fy, cy = (
+            dr.opaque(lib.Float64, float(camera.K[i, j])) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2))
+        )
+        found = []
+        for x, y, z in _around(center, axes):
+            front = z > 0
+            iz = 1 / dr.select(front, z, 1)
+            u, v = fx * x * iz + skew * y * iz + cx, fy * y * iz + cy
+            found.append((dr.select(front, u, 0), dr.select(front, v, 0), front))
+        return found
+    mean = [dr.detach(x) + float(o) for x, o in zip(g.mean, origin, strict=True)]
+    axes = [[dr.detach(g.rotation[r][k]) * scale[k] for r in range(3)] for k in range(3)]
+    zero = dr.zeros(lib.Float64, dr.width(mean[0]))
+    points = [np.stack([(x + zero).numpy() for x in point], 1) for point in _around(mean, axes)]
+    pixels, z = camera.project(np.concatenate(points))
+    front = np.isfinite(pixels).all(1) & ((z > 0) | (camera.model != "pinhole"))
+    pixels = np.where(front[:, None], pixels, 0.0)
+    columns = [np.split(x, 7) for x in (pixels[:, 0], pixels[:, 1], front)]
+    floats = [[lib.Float64(np.ascontiguousarray(x)) for x in column] for column in columns[:2]]
+    masks = [lib.UInt32(x.astype(np.uint32)) != 0 for x in columns[2]]
+    return list(zip(*floats, masks, strict=True))
+
+
+def _around(center: list[Float], axes: list[list[Float]]) -> list[list[Float]]:
+    """A point, and the two along each of three axes."""
+    signed = [[sign * x for x in axis] for sign in (1, -1) for axis in axes]
+    return [center, *([c + x for c, x in zip(center, axis, strict=True)] for axis in signed)]
