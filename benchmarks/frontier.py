@@ -44,7 +44,7 @@ def measured(scene: str, eighths: int, steps: int) -> dict:
     config = FitConfig.of(settings=renderers["fast"], renderers=("fast",), max_steps=steps, **SIZE)
     fit = fitted(scene, config, cycle=[renderers[PAIR[turn]] for turn in turns])
     psnr = psnr_by_renderer(fit.gaussians, frames_for(fit.test, config.data), renderers)
-    return {"scene": scene, "eighths": eighths, "max_steps": steps, **SIZE, "psnr": psnr, **ran()}
+    return {"scene": Path(scene).name, "eighths": eighths, "max_steps": steps, **SIZE, "psnr": psnr, **ran()}
 
 
 def table(found: list[dict]) -> str:
@@ -74,7 +74,7 @@ def main() -> None:
     done = {(row["scene"], row["eighths"], row["max_steps"]) for row in read_rows(ROWS)}
     for scene in [] if args.page else args.scenes:
         for eighths in EIGHTHS:
-            if (scene, eighths, args.steps) not in done:
+            if (Path(scene).name, eighths, args.steps) not in done:
                 row = measured(scene, eighths, args.steps)
                 add_row(ROWS, row)
                 print(
