@@ -16,7 +16,7 @@ PYTEST_FLAGS ?= -q -n 2 --dist loadfile
 # as far as this machine has the instructions.
 TARGETS ?= $(shell grep -qsw fma /proc/cpuinfo && echo x86-64-v2/4/+fma; grep -qsw avx2 /proc/cpuinfo && echo haswell/8; \
              grep -qsw avx512vl /proc/cpuinfo && echo x86-64-v4/16)
-NUMERICS := integrator extremes order tiles lenses features fisher gain backdrop mitsuba_preset
+NUMERICS := integrator extremes order tiles lenses shutter unscented features fisher gain backdrop mitsuba_preset
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed

@@ -46,7 +46,7 @@ from drgs.lenses import (
     undistort_opencv,
 )
 from drgs.runtime import uncompiled
-from drgs.shutters import BY_COLUMN, FORWARD, line_poses, line_times, turn_between
+from drgs.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_seen, turn_between
 
 __all__ = [
     "Camera",
@@ -65,7 +65,8 @@ _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded
 # An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
 _INVERSE_TOLERANCE = 1e-3
 _SHOWN = 80  # characters of a name in messages
-_SHUTTER_ROUNDS = 30  # of pose and line in turn, until a point is on the line that sees it
+_SHUTTER_ROUNDS = 30  # of pose and line in turn, at most, until a point is on the line that sees it:
+_SAME_LINE = 1e-8  # of a line, between two rounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,16 +240,19 @@ class Camera:
             local = points @ rotation.T + translation
             return self._project_local(local), local[:, 2]
         start, end = (_homogeneous(*self._rigid(name)) for name in ("w2c", "w2c_end"))
-        along = self.width if self.shutter in BY_COLUMN else self.height
+        axis, lines = (0, self.width) if self.shutter in BY_COLUMN else (1, self.height)
+        at = points_seen(start, end, points)
         times = np.full(len(points), 0.5)
         for _ in range(_SHUTTER_ROUNDS):
-            poses = line_poses(start, end, times)
-            local = np.einsum("pjk,pk->pj", poses[:, :3, :3], points) + poses[:, :3, 3]
+            local = at(times)
             pixels = self._project_local(local)
-            line = pixels[:, 0 if self.shutter in BY_COLUMN else 1] - 0.5
-            found = line / (along - 1) if along > 1 else np.full(len(points), 0.5)
+            found = (pixels[:, axis] - 0.5) / (lines - 1) if lines > 1 else times
             found = found if self.shutter in FORWARD else 1 - found
-            times = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), times)
+            found = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), times)
+            moved = np.abs(found - times).max(initial=0.0) * lines
+            times = found
+            if moved < _SAME_LINE:
+                break
         return pixels, local[:, 2]
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:

@@ -8,9 +8,11 @@ rotation along the shortest turn, at a constant rate (slerp: Shoemake 1985).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-__all__ = ["BY_COLUMN", "FORWARD", "SHUTTERS", "line_poses", "line_times", "turn_between"]
+__all__ = ["BY_COLUMN", "FORWARD", "SHUTTERS", "line_poses", "line_times", "points_seen", "turn_between"]
 
 SHUTTERS = (
     "global",
@@ -57,3 +59,26 @@ def line_poses(start: np.ndarray, end: np.ndarray, times: np.ndarray) -> np.ndar
     poses[:, :3, :3] = turns @ start[:3, :3]
     poses[:, :3, 3] = (1 - times)[:, None] * start[:3, 3] + times[:, None] * end[:3, 3]
     return poses
+
+
+def points_seen(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Function of times (P,) that gives points (P, 3) in the axes of the camera at each point's own time.
+
+    Args:
+        start, end: (4, 4) world-to-camera matrices.
+        points: (P, 3) in the world.
+    """
+    turn = turn_between(start[:3, :3], end[:3, :3])
+    angle = np.linalg.norm(turn)
+    axis = turn / angle if angle > 0 else turn
+    first = np.einsum("pk,jk->pj", points, start[:3, :3])  # no `@`, as in `Camera.pixel_directions`
+    # Rodrigues' formula: what of a point moves with the sine of the angle, and what with 1 minus its cosine.
+    across = np.cross(axis, first)
+    back = np.cross(axis, across)
+
+    def at(times: np.ndarray) -> np.ndarray:
+        t = times[:, None]
+        moved = first + np.sin(t * angle) * across + (1 - np.cos(t * angle)) * back
+        return moved + (1 - t) * start[:3, 3] + t * end[:3, 3]
+
+    return at

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.lenses import distorted, fisheye_polynomial
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.primitives import Activated
 
@@ -79,16 +80,15 @@ def _pixels(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor) -> lis
     """Pixel of the mean and of the six points around it, and whether it is in front of the camera; else at (0, 0)."""
     center = [dr.detach(x) for x in g.center]  # numbers, as all of this
     scale = [dr.detach(s) * _SPREAD for s in g.scale]
-    if not camera.is_distorted and not camera.is_rolling:
+    if not camera.is_rolling and camera.model in _PLANES:
         axes = [[dr.detach(g.from_local[r][k]) * scale[k] for r in range(3)] for k in range(3)]
         fx, skew, cx, fy, cy = (
             dr.opaque(lib.Float64, float(camera.K[i, j])) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2))
         )
         found = []
         for x, y, z in _around(center, axes):
-            front = z > 0
-            iz = 1 / dr.select(front, z, 1)
-            u, v = fx * x * iz + skew * y * iz + cx, fy * y * iz + cy
+            x, y, front = _PLANES[camera.model](x, y, z, camera.distortion)
+            u, v = fx * x + skew * y + cx, fy * y + cy
             found.append((dr.select(front, u, 0), dr.select(front, v, 0), front))
         return found
     mean = [dr.detach(x) + float(o) for x, o in zip(g.mean, origin, strict=True)]
@@ -102,6 +102,30 @@ def _pixels(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor) -> lis
     floats = [[lib.Float64(np.ascontiguousarray(x)) for x in column] for column in columns[:2]]
     masks = [lib.UInt32(x.astype(np.uint32)) != 0 for x in columns[2]]
     return list(zip(*floats, masks, strict=True))
+
+
+def _pinhole(x: Float, y: Float, z: Float, distortion: tuple) -> tuple[Float, Float, Mask]:
+    """Where the plane z = 1 shows a point, and whether it does."""
+    front = z > 0
+    iz = 1 / dr.select(front, z, 1)
+    return x * iz, y * iz, front
+
+
+def _opencv(x: Float, y: Float, z: Float, distortion: tuple) -> tuple[Float, Float, Mask]:
+    """The same through OpenCV's lens."""
+    u, v, front = _pinhole(x, y, z, distortion)
+    return *distorted(u, v, distortion), front
+
+
+def _fisheye(x: Float, y: Float, z: Float, distortion: tuple) -> tuple[Float, Float, Mask]:
+    """The same through OpenCV's fisheye, which sees behind itself."""
+    radius = dr.sqrt(x * x + y * y)
+    seen, _ = fisheye_polynomial(dr.atan2(radius, z), distortion)
+    factor = dr.select(radius > 0, seen / dr.select(radius > 0, radius, 1), 0)
+    return x * factor, y * factor, radius >= 0
+
+
+_PLANES = {"pinhole": _pinhole, "opencv": _opencv, "opencv_fisheye": _fisheye}
 
 
 def _around(center: list[Float], axes: list[list[Float]]) -> list[list[Float]]:
