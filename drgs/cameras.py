@@ -8,8 +8,8 @@ Conventions, stated once for the whole project:
   center of pixel (column i, row j) lies at (i + 0.5, j + 0.5). Resizing an image by s therefore multiplies fx, cx (and
   fy, cy) by s exactly. OpenCV functions that resample images count pixel centers at integers, so they get
   `cx - 0.5, cy - 0.5`; functions on points need no shift.
-- Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6]]), model `opencv_fisheye` with
-  (k1, k2, k3, k4) on the angle; `pinhole` has none.
+- Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]]), model
+  `opencv_fisheye` with (k1, k2, k3, k4) on the angle; `pinhole` has none.
 - Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right, +y
   up, looking along -z), LLFF `poses_bounds` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
   looking along +z). World axes never change, only the camera's.

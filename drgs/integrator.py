@@ -27,7 +27,7 @@ from drgs.tracing.call import Call, Output
 from drgs.tracing.errors import own_errors
 from drgs.tracing.tangents import push_forward
 
-__all__ = ["OUTPUTS", "Output", "render", "render_jvp", "render_rays"]
+__all__ = ["OUTPUTS", "Output", "render", "render_jvp", "render_normals", "render_rays", "render_with_offsets"]
 
 OUTPUTS = ("depth", "median_depth", "count", "visibility")
 _NAMES = {"depth": "depth", "median_depth": "median", "count": "count", "visibility": "visibility"}
@@ -175,6 +175,66 @@ def render_jvp(
     )
     with own_errors():
         return push_forward(call, tangents)
+
+
+@runtime.alone
+def render_with_offsets(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RenderSettings,
+    outputs: tuple[str, ...] | str = (),
+    rays: torch.Tensor | np.ndarray | None = None,
+    mean_offsets: torch.Tensor | None = None,
+) -> Output:
+    """What `render` gives, whose Gaussians' projected means can be moved: what density control of rasterizers reads.
+
+    Args:
+        gaussians, camera, settings, outputs, rays: Arguments of `render`.
+        mean_offsets: (N, 2) zeros in pixels, added to the projected means of a model of the image plane; the derivative
+            by them is that by the projected means, all else held.
+    """
+    check_view("render", gaussians, camera, settings)
+    call = Call(gaussians, camera, settings, _wanted(outputs), pixel_rays=rays, mean_offsets=mean_offsets)
+    with own_errors():
+        return call.output(differentiable(call))
+
+
+@runtime.alone
+def render_normals(
+    gaussians: Scene,
+    camera: Camera,
+    settings: RenderSettings | None = None,
+    rays: torch.Tensor | np.ndarray | None = None,
+) -> torch.Tensor:
+    """(H, W, 3) sum of w n over the Gaussians of each pixel, world frame: n is the third axis of a Gaussian's rotation,
+    that of its two directions that looks against the ray.
+
+    It is neither of unit length nor divided by alpha, as gsplat's `return_normals`. A disc's third axis is its normal
+    where its third scale is the smallest; of other Gaussians an axis is what it is.
+
+    Args:
+        gaussians, camera, settings, rays: Arguments of `render`; for responses along rays.
+    Gradients:
+        Those of `render`, in reverse and forward mode; which of the two directions is taken has none.
+    """
+    seen = gaussians_at("render_normals", gaussians, camera)
+    check_view("render_normals", seen, camera, settings)
+    settings = settings or RenderSettings.preset("exact")
+    if settings.planar:
+        raise NotImplementedError(
+            f"render_normals: the response must be one along rays, got {settings.response!r}; use preset exact, fast "
+            "or 3dgut"
+        )
+    w, x, y, z = torch.nn.functional.normalize(seen.quats.double(), dim=1).unbind(1)
+    axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    # SH of degree 1 along each ray tell hits where it goes; their color is not looked at.
+    plain = seen.replace(sh=seen.sh.new_zeros(len(seen), 4, 3), features=axis.to(seen.sh.dtype))
+    black = settings.replace(sh_direction="ray", background=(0.0, 0.0, 0.0))
+    call = Call(plain, camera, black, frozenset(), pixel_rays=rays, oriented=True)
+    with own_errors():
+        found = call.output(differentiable(call)).features
+    assert found is not None  # three channels of features were given
+    return found
 
 
 @runtime.alone

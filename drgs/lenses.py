@@ -10,17 +10,22 @@ __all__ = ["distort_opencv", "distorted", "fisheye_directions", "fisheye_polynom
 
 
 def distort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Image-plane points (P,2) through OpenCV's radial and tangential model."""
+    """Image-plane points (P,2) through OpenCV's radial, tangential and thin prism model."""
     return np.stack(distorted(*plane.T, distortion), axis=-1)
 
 
 def distorted(x: Any, y: Any, distortion: tuple) -> tuple[Any, Any]:
     """Both coordinates of `distort_opencv`; of arrays, or of tensors, whose graph is kept."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *([0.0] * (8 - len(distortion))))
+    k1, k2, p1, p2, k3, k4, k5, k6, *prism = (*distortion, *([0.0] * (8 - len(distortion))))
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     moved_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return moved_x, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    moved_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    if prism:
+        s1, s2, s3, s4 = prism
+        moved_x = moved_x + r2 * (s1 + r2 * s2)
+        moved_y = moved_y + r2 * (s3 + r2 * s4)
+    return moved_x, moved_y
 
 
 def undistort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:

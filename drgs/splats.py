@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import torch
@@ -145,11 +146,24 @@ def color_of(colors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, f
     return ((first + (shift - 0.5)) / Y_00)[:, None, :], rest if rest.shape[1] else None, shift
 
 
-def cameras_of(viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int) -> list[Camera]:
-    """Pinhole cameras of (C, 4, 4) poses, whose gradients they keep, and (C, 3, 3) intrinsics."""
+def cameras_of(
+    viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int, lenses: Sequence[Mapping[str, Any]] = ()
+) -> list[Camera]:
+    """Cameras of (C, 4, 4) poses, whose gradients they keep, and (C, 3, 3) intrinsics.
+
+    Args:
+        viewmats, Ks, width, height: Arguments of `drgs.rasterization`.
+        lenses: Fields of `Camera` that say what lens and shutter each camera has; empty: pinholes.
+    """
     return [
-        Camera(K=runtime.unwrapped(K, lambda K: K.cpu().double().numpy()), w2c=viewmat, width=width, height=height)
-        for viewmat, K in zip(viewmats, Ks, strict=True)
+        Camera(
+            K=runtime.unwrapped(K, lambda K: K.cpu().double().numpy()),
+            w2c=viewmat,
+            width=width,
+            height=height,
+            **lens,
+        )
+        for viewmat, K, lens in zip(viewmats, Ks, lenses or [{}] * len(Ks), strict=True)
     ]
 
 

@@ -38,6 +38,10 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"codecs"}, "Gaussians in the formats of others"),
     ({"tracing"}, "the engine"),
     ({"integrator", "plugin"}, "rendering with it, from torch and from Mitsuba"),
+    (
+        {"gsplat_options", "projected", "covariances"},
+        "what gsplat's options mean here, and what it returns beside images",
+    ),
     ({"rasterize"}, "the same under gsplat's names"),
     ({"deform", "dynamics"}, "Gaussians that move: what comes above sees a scene, by its protocol"),
     ({"features"}, "what Gaussians and pixels are called: teacher maps, decoder, labels, queries"),

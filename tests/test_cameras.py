@@ -254,7 +254,7 @@ FLIPPED = np.diag([1.0, 1.0, -1.0, 1.0])
         ({"model": "fov"}, "model must be pinhole, opencv or opencv_fisheye, got 'fov'"),
         (
             {"model": "opencv", "distortion": (1, 2)},
-            "takes 4 or 5 or 8 distortion coefficients, got 2",
+            "takes 4 or 5 or 8 or 12 distortion coefficients, got 2",
         ),
         ({"distortion": (0.1,)}, "pinhole takes 0 distortion coefficients, got 1"),
     ],

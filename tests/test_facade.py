@@ -19,7 +19,18 @@ import drgs
 from drgs.cameras import orbit
 
 # What is no room of a user's: tables of a machine, math of lenses, and options in, files out.
-_INSIDE = {"commands", "lenses", "libllvm", "llvm_target", "machine", "scenes", "sizes"}
+_INSIDE = {
+    "commands",
+    "covariances",
+    "gsplat_options",
+    "lenses",
+    "libllvm",
+    "llvm_target",
+    "machine",
+    "projected",
+    "scenes",
+    "sizes",
+}
 
 
 @pytest.fixture(scope="module")

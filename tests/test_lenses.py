@@ -25,6 +25,7 @@ LENSES = {
     "barrel": ("opencv", (-0.2, 0.05, 0.003, -0.002), 1.0),
     "cushion": ("opencv", (0.3, 0.1, 0.01, 0.02, 0.02), 1.2),
     "rational": ("opencv", (0.4, -0.2, 0.01, -0.01, 0.05, 0.3, 0.1, 0.02), 0.8),
+    "thin prism": ("opencv", (0.1, -0.05, 0.01, -0.01, 0.02, 0.1, 0.0, 0.01, 0.03, -0.01, -0.02, 0.01), 0.9),
     # The polynomial turns back within the image: no inverse there, rays are approximate.
     "folded": ("opencv", (-0.9, 0.1, 0.0, 0.0), 0.7),
     "fisheye": ("opencv_fisheye", (0.05, -0.02, 0.01, -0.003), 1.0),
@@ -108,6 +109,7 @@ KINDS = [
     ("barrel", {"order": "ray"}),
     ("cushion", {"response": "integral", "alpha_min": 1 / 255, "near": 0.01}),
     ("rational", CUTS),
+    ("thin prism", {"order": "ray"}),
     ("folded", {"order": "ray"}),
     ("fisheye", {"order": "ray", "sh_direction": "ray"}),
     ("fisheye", CUTS),

@@ -180,15 +180,61 @@ def test_every_degree_is_gsplats(degree):
     agree(given, drawn(drgs.rasterization, given), drawn(gsplat_torch.rasterization, given))
 
 
-@needs_gsplat
+NAMES = [  # of gsplat 1.6's signature, in its order
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+    "colors",
+    "viewmats",
+    "Ks",
+    "width",
+    "height",
+    "near_plane",
+    "far_plane",
+    "radius_clip",
+    "eps2d",
+    "sh_degree",
+    "packed",
+    "tile_size",
+    "backgrounds",
+    "render_mode",
+    "sparse_grad",
+    "absgrad",
+    "rasterize_mode",
+    "distributed",
+    "camera_model",
+    "segmented",
+    "covars",
+    "with_ut",
+    "with_eval3d",
+    "macro_tile",
+    "return_normals",
+    "global_z_order",
+    "rays",
+    "radial_coeffs",
+    "tangential_coeffs",
+    "thin_prism_coeffs",
+    "ftheta_coeffs",
+    "lidar_coeffs",
+    "external_distortion_coeffs",
+    "rolling_shutter",
+    "viewmats_rs",
+    "ut_params",
+    "extra_signals",
+    "extra_signals_sh_degree",
+    "renderer_config",
+]
+
+
 def test_signature_is_gsplats():
-    """The same names in the same order with the same defaults, and `preset` behind them."""
-    theirs = inspect.signature(pytest.importorskip("gsplat").rasterization).parameters
+    """The names of 1.6 in their order, behind them what 1.5.3 had besides, and `preset`."""
     ours = inspect.signature(drgs.rasterization).parameters
-    assert [*theirs, "preset"] == list(ours)
+    assert [*NAMES, "channel_chunk", "preset"] == list(ours)
+    theirs = inspect.signature(pytest.importorskip("gsplat").rasterization).parameters
     for name, parameter in theirs.items():
-        # Their default is a member of an enumeration that only they have.
-        if name != "rolling_shutter":
+        # The one is a member of an enumeration that only they have, the other is 16 or 8 in 1.6.
+        if name not in ("rolling_shutter", "tile_size"):
             assert ours[name].default == parameter.default, name
 
 
@@ -309,11 +355,22 @@ def test_forward_mode_is_the_transpose():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"camera_model": "fisheye"}, NotImplementedError, "camera_model is not supported; use drgs.integrator"),
-        ({"absgrad": True}, NotImplementedError, "absgrad is not supported; there are no gradients"),
-        ({"covars": torch.eye(3)}, NotImplementedError, "covars is not supported; pass quats and scales"),
-        ({"with_ut": True}, NotImplementedError, "with_ut is not supported"),
-        ({"render_mode": "XYZ"}, ValueError, "render_mode must be one of RGB, D, ED, RGB\\+D, RGB\\+ED, got 'XYZ'"),
+        ({"camera_model": "fisheye"}, ValueError, "camera_model='fisheye' must come with with_eval3d=True"),
+        ({"camera_model": "ortho"}, NotImplementedError, "camera_model='ortho' is not supported; pass its rays"),
+        ({"camera_model": "mirror"}, ValueError, "camera_model must be one of pinhole, fisheye, got 'mirror'"),
+        ({"lidar_coeffs": 1}, NotImplementedError, "lidar_coeffs is not supported; pass its rays as rays="),
+        ({"covars": torch.eye(3)}, ValueError, r"covars must have shape .*got \(3, 3\)"),
+        ({"quats": None}, ValueError, "quats and scales must be tensors where there are no covars"),
+        ({"with_ut": True}, NotImplementedError, "with_ut without with_eval3d is not supported; .* pass both"),
+        ({"render_mode": "XYZ"}, ValueError, "render_mode must be one of RGB, D, ED, RGB\\+D, .*, got 'XYZ'"),
+        ({"render_mode": "RGB-d"}, ValueError, "render modes with d and Ed must come with with_eval3d=True"),
+        ({"return_normals": True}, ValueError, "return_normals must come with with_eval3d=True"),
+        ({"rays": torch.zeros(1, 40, 48, 6)}, ValueError, "rays must come with with_eval3d=True"),
+        ({"rays": torch.zeros(40, 48, 6), "with_eval3d": True}, ValueError, r"rays must have shape \(1, 40, 48, 6\)"),
+        ({"rolling_shutter": "ROLLING_UP"}, ValueError, "rolling_shutter must be one of global, rolling_top"),
+        ({"rolling_shutter": "ROLLING_TOP_TO_BOTTOM"}, ValueError, "viewmats_rs must be there for rolling shutters"),
+        ({"radial_coeffs": torch.zeros(1, 5), "with_eval3d": True}, ValueError, r"radial_coeffs must have .*\(1, 6"),
+        ({"extra_signals": torch.zeros(3, 2)}, ValueError, r"extra_signals must have shape \(\.\.\., N, E\)"),
         ({"preset": "exact", "rasterize_mode": "antialiased"}, NotImplementedError, "use preset='gsplat'"),
         ({"viewmats": torch.eye(4)}, ValueError, r"viewmats must have shape \(\.\.\., C, 4, 4\).*viewmat\[None\]"),
         ({"quats": torch.ones(60, 3)}, ValueError, r"quats must have shape \(60, 4\).*got \(60, 3\)"),

@@ -27,7 +27,7 @@ __all__ = [
     "read_only",
 ]
 
-_OPENCV_LENGTHS = (4, 5, 8)
+_OPENCV_LENGTHS = (4, 5, 8, 12)
 _ROTATION_TOLERANCE = 1e-4  # of R R^T: what four digits a number leave; more is a scale or a shear
 _ROW_TOLERANCE = 1e-6  # of the row 0 0 0 1, which only rounding may have touched
 # Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.

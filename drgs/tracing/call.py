@@ -30,7 +30,13 @@ from drgs.tracing.walk import Traversal
 
 __all__ = ["OF_VIEW", "Call", "Output", "checked_pixel_rays", "numbers"]
 
-OF_VIEW = ("w2c", "ray_origins", "ray_directions", "ray_shifts")  # inputs that follow from the pose and the lens
+OF_VIEW = (
+    "w2c",
+    "ray_origins",
+    "ray_directions",
+    "ray_shifts",
+    "mean_offsets",
+)  # inputs that follow from the pose and the lens
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,6 +78,8 @@ class Call:
         couple: The argument `couple_features` of `render`.
         lens: The camera's `lens_parameters`, if derivatives by them are wanted.
         pixel_rays: (H, W, 6) origin and direction of each pixel, in the world, instead of those that the camera has.
+        mean_offsets: (N, 2) zeros in pixels, added to projected means, of a model of the image plane; differentiated.
+        oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
             `time`, `w2c` (12 floats), rays where they are traced.
@@ -97,6 +105,8 @@ class Call:
         timed: bool = False,
         lens: torch.Tensor | None = None,
         pixel_rays: torch.Tensor | np.ndarray | None = None,
+        mean_offsets: torch.Tensor | None = None,
+        oriented: bool = False,
     ):
         self.lib = runtime.dr_types()
         self.settings = settings
@@ -104,6 +114,7 @@ class Call:
         self.want = want
         must_be("render", "couple_features", couple, bool, "True or False")
         self.couple = couple
+        self.oriented = oriented
         if settings.planar and camera.is_distorted:
             raise NotImplementedError(
                 f"render: response={settings.response!r} is a model of a pinhole's image plane, got a camera of model "
@@ -144,6 +155,8 @@ class Call:
 
             self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
+        if mean_offsets is not None:
+            self.inputs["mean_offsets"] = self._move(mean_offsets)
         self.count = len(gaussians)
         self.coefficients = gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
@@ -289,9 +302,18 @@ class Call:
             # A depth is relative to what a pixel has, be it next to nothing, and a count has every hit.
             trimmed = not self.want & {"depth", "count"}
             traversal = TileTraversal(lib, s, projected, pinhole, *size, trimmed, lens)
-        rays = [self._column(p, name) for name in OF_VIEW[1:]]
+        rays = [self._column(p, name) for name in OF_VIEW[1:4]]
         return compositor_of(
-            lib, s, traversal, p, self.coefficients, *rays, want=self.want, width=self.width, couple=self.couple
+            lib,
+            s,
+            traversal,
+            p,
+            self.coefficients,
+            *rays,
+            want=self.want,
+            width=self.width,
+            couple=self.couple,
+            oriented=self.oriented,
         )
 
     def fields(self, inputs: dict) -> dict:

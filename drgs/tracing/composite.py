@@ -50,11 +50,12 @@ def compositor_of(
     want: frozenset = frozenset(),
     width: int = 0,
     couple: bool = True,
+    oriented: bool = False,
 ) -> tuple[Compositor, Arguments]:
     """The compositor of a view, and what it composites.
 
     Args:
-        lib, settings, traversal, want, width, couple: Arguments of `Compositor`.
+        lib, settings, traversal, want, width, couple, oriented: Arguments of `Compositor`.
         p: Flat raw parameters by name, of which `sh` and `features` are read.
         coefficients: SH coefficients in `p["sh"]`.
         origins, directions: Three (P,) columns each, unit directions, both in the world of the means. Needed where rays
@@ -75,7 +76,7 @@ def compositor_of(
         carried += [*origins, *directions]
     elif shifts is not None:
         carried += shifts
-    compositor = Compositor(lib, settings, traversal, want, width, len(basis), couple)
+    compositor = Compositor(lib, settings, traversal, want, width, len(basis), couple, oriented)
     # Casts: parameters may be float64, where means are; hits are composited in float32.
     sh = lib.Float(p["sh"]) if along_ray else None
     features = lib.Float(p["features"]) if width else None
@@ -95,6 +96,7 @@ class Compositor:
         width: Number of feature channels.
         basis: How many of the arrays that rays carry are SH basis values.
         couple: Derivatives of the feature image reach all that it depends on; else only the features.
+        oriented: The features are axes that are turned towards each ray: `Channels.oriented`.
     Attributes:
         certificate: Numbers of rays, of redone rays and of listed entries, after `forward`.
         extra: Outputs without a derivative, after `forward`.
@@ -111,8 +113,10 @@ class Compositor:
         width: int = 0,
         basis: int = 0,
         couple: bool = True,
+        oriented: bool = False,
     ) -> None:
         self.lib = lib
+        self.oriented = oriented
         self.settings = settings
         self.traversal = traversal
         self.want = want
@@ -160,6 +164,7 @@ class Compositor:
         dr.eval(self.buffers, carried)
         view.start(self.model, self.buffers["record"], carried, self.basis, keep)
         self.certificate.update(view.certificate)
+        joint = self.width if self.oriented else joint
         self.passes = [self._channels(0, joint, color=True)]
         chunks = range(joint, self.width, CHUNK)
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
@@ -220,7 +225,7 @@ class Compositor:
         return out
 
     def _channels(self, first: int = 0, channels: int = 0, color: bool = False) -> Channels:
-        return Channels(self.buffers, self.width, first, channels, color)
+        return Channels(self.buffers, self.width, first, channels, color, self.oriented)
 
     def _images(self) -> dict:
         """Flat images of zeros."""

@@ -301,7 +301,10 @@ class Tangent:
                 dr.set_grad(x, v)
             color = sh_color(basis, lambda k, c: moved[3 * k + c])
             dr.forward_to(color)
-            return [dr.grad(x) for x in color] + speed.get("features", [])
+            features = speed.get("features", [])
+            if self.channels.oriented:
+                features = self.channels.towards(loaded["features"], features, ray)
+            return [dr.grad(x) for x in color] + features
 
 
 def _along(slopes: Gradient, record: dict, carried: list[Float]) -> Float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 
 from drgs.ellipsoids import Y_00
 from drgs.tracing.arrays import Float
 
-__all__ = ["sh_basis", "sh_color"]
+__all__ = ["higher_harmonics", "sh_basis", "sh_color"]
 
 _LINEAR = 0.4886025119029199
 _QUADRATIC = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
@@ -26,8 +27,13 @@ _CUBIC = (
 
 def sh_basis(direction: list[Float], coefficients: int) -> list[Float]:
     """The first 1, 4, 9 or 16 real spherical harmonics at a unit `direction` (three floats)."""
+    return [type(direction[0])(Y_00), *higher_harmonics(direction, coefficients)]
+
+
+def higher_harmonics(direction: list[Any], coefficients: int) -> list[Any]:
+    """The same without the first one, which is a constant; of Dr.Jit's floats or of tensors."""
     x, y, z = direction
-    basis = [type(x)(Y_00)]
+    basis: list[Any] = []
     if coefficients > 1:
         basis += [-_LINEAR * y, _LINEAR * z, -_LINEAR * x]
     if coefficients > 4:

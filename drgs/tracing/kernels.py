@@ -81,6 +81,8 @@ class Channels:
         buffers: Name -> Float. `record` has RECORD floats a Gaussian; `sh` 3 K, present when SH are evaluated along
             each ray; `features` has `width` and channels first .. first + channels are composited.
         color: RGB are composited.
+        oriented: The three features are an axis in the world, that of the two directions that looks against the ray;
+            rays carry an SH basis.
     """
 
     buffers: dict
@@ -88,6 +90,7 @@ class Channels:
     first: int = 0
     channels: int = 0
     color: bool = True
+    oriented: bool = False
 
     @property
     def outputs(self) -> int:
@@ -126,7 +129,15 @@ class Channels:
             values += sh_color(ray.carried[: ray.basis], lambda k, c: loaded["sh"][3 * k + c])
         elif self.color:
             values += loaded["record"][model.rgb : model.rgb + 3]
-        return values + loaded.get("features", [])
+        features = loaded.get("features", [])
+        return values + (self.towards(features, features, ray) if self.oriented else features)
+
+    def towards(self, axis: list[Float], values: list[Float], ray: Ray) -> list[Float]:
+        """Values, or their negatives where an axis looks along the ray: a choice, without a derivative."""
+        # The linear harmonics of a direction (x, y, z) are -c y, c z, -c x.
+        _, y, z, x = (dr.detach(v) for v in ray.carried[:4])
+        along = dr.detach(axis[2]) * z - dr.detach(axis[0]) * x - dr.detach(axis[1]) * y
+        return [dr.select(along > 0, -v, v) for v in values]
 
 
 class Primal:

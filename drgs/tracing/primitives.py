@@ -68,6 +68,8 @@ class Screen(NamedTuple):
             the place where it is, from -1 to 1.
         lens: The lens, if there is one.
         side: (N,) the side of the cube, 0, 1 or 2 for x, y and z, that the anchor is on; None of what is no wide lens.
+        offsets: Two (N,) columns of zeros in pixels, added to projected means: derivatives by these are by them; None
+            where nobody asks.
     """
 
     pinhole: list[Float]
@@ -77,6 +79,7 @@ class Screen(NamedTuple):
     y: Float
     lens: Lens | None = None
     side: Float | Any = None
+    offsets: list[Float] | None = None
 
     def axes(self) -> tuple[list[Float], list[Float], list[Float]]:
         """Three vectors in camera axes: the direction of a ray changes by so much in x and y, from that at the anchor

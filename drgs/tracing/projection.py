@@ -42,7 +42,8 @@ def project_screen(
 
     Args:
         lib: Dr.Jit types of the backend.
-        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh.
+        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh, and mean_offsets if derivatives by
+            projected means are wanted.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix; differentiable.
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
         settings: Settings of the render, with traversal `tiles`.
@@ -57,6 +58,8 @@ def project_screen(
     response = response_of(settings)
     g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
     screen = _screen(lib, dr.detach(g.center), pinhole, width, height, lens)
+    if "mean_offsets" in p:
+        screen = screen._replace(offsets=[lib.Float64(g.column("mean_offsets", k, 2)) for k in range(2)])
     shape, bounds, alive, frame = response.project(g, screen)
     distance = g.distance()
     record = [Float(screen.x), Float(screen.y), *[Float(x) for x in shape]]

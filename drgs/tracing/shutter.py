@@ -7,7 +7,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.shutters import BY_COLUMN, line_times
 
-__all__ = ["rolling_view"]
+__all__ = ["middle_pose", "rolling_view"]
 
 _SMALL = 1e-6  # of a squared sine or angle, below which series replace quotients of zeros
 
@@ -38,6 +38,11 @@ def rolling_view(
     return middle, origins.reshape(-1, 3), directions.reshape(-1, 3)
 
 
+def middle_pose(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+    """(3, 4) in the middle between two poses, (3, 4) each."""
+    return _poses(start, end, start.new_tensor([0.5]))[0]
+
+
 def _poses(start: torch.Tensor, end: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
     """(T, 3, 4) between two poses."""
     turn = end[:, :3] @ start[:, :3].T
@@ -58,7 +63,7 @@ def _poses(start: torch.Tensor, end: torch.Tensor, times: torch.Tensor) -> torch
     first = torch.where(small, 1 - angles2 / 6 + angles2**2 / 120, angles.sin() / angles)
     second = torch.where(small, 0.5 - angles2 / 24 + angles2**2 / 720, (1 - angles.cos()) / angles**2)
     t = times[:, None, None]
-    identity = torch.eye(3, dtype=torch.float64)
+    identity = torch.eye(3, dtype=torch.float64, device=start.device)
     turns = identity + t * first * generator + t * t * second * (generator @ generator)
     translations = (1 - times)[:, None] * start[:, 3] + times[:, None] * end[:, 3]
     return torch.cat([turns @ start[:, :3], translations[:, :, None]], 2)

@@ -62,6 +62,9 @@ class Ewa(AlphaStrength):
         r12 = -cxy * dr.rsqrt(cyy * det)
         px = fx * c[0] * iz + skew * c[1] * iz + cx
         py = fy * c[1] * iz + cy
+        if screen.offsets is not None:
+            px += screen.offsets[0]
+            py += screen.offsets[1]
         ox, oy = screen.x - px, screen.y - py
         shape = [r11, r12, r11 * ox + r12 * oy, Float64(0), r22, r22 * oy, *[Float64(0)] * 5]
         shape.append(c[2] if s.depth_key == "z" else g.distance())

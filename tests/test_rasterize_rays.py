@@ -1,0 +1,335 @@
+"""`drgs.rasterization` along rays: what gsplat 1.6 has with `with_eval3d`, against the float64 oracle."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+
+import pytest
+import torch
+from test_rasterize import arguments
+
+import drgs
+from drgs import reference
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.settings import RenderSettings
+
+
+class RollingShutterType(enum.Enum):
+    """Names of gsplat's enumeration."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    ROLLING_RIGHT_TO_LEFT = 3
+    GLOBAL = 4
+
+
+RADIAL = (0.1, -0.05, 0.02, 0.05, 0.01, 0.0)
+TANGENTIAL = (0.01, -0.02)
+PRISM = (0.02, -0.01, -0.02, 0.01)
+FISHEYE = (0.05, -0.02, 0.01, -0.003)
+LENSES = {
+    "pinhole": ({}, {}),
+    "opencv": (
+        {"radial_coeffs": RADIAL, "tangential_coeffs": TANGENTIAL},
+        {"model": "opencv", "distortion": (*RADIAL[:2], *TANGENTIAL, *RADIAL[2:])},
+    ),
+    "thin prism": (
+        {"thin_prism_coeffs": PRISM},
+        {"model": "opencv", "distortion": (*[0.0] * 8, *PRISM)},
+    ),
+    "fisheye": (
+        {"camera_model": "fisheye", "radial_coeffs": FISHEYE},
+        {"model": "opencv_fisheye", "distortion": FISHEYE},
+    ),
+    "plain fisheye": ({"camera_model": "fisheye"}, {"model": "opencv_fisheye", "distortion": (0.0,) * 4}),
+}
+
+
+def options_of(lens, cameras=1):
+    """gsplat's arguments of a lens, and the fields of a camera that has it."""
+    given, fields = LENSES[lens]
+    as_tensor = lambda x: torch.tensor(x, dtype=torch.float64).expand(cameras, -1)  # noqa: E731
+    return {name: x if isinstance(x, str) else as_tensor(x) for name, x in given.items()}, fields
+
+
+def turned(viewmats, angle=0.05, move=0.1):
+    """Poses at the end of an exposure."""
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 0] = turn[2, 2] = math.cos(angle)
+    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
+    turn[:3, 3] = move * torch.tensor([1.0, -0.5, 0.3], dtype=torch.float64)
+    return turn @ viewmats
+
+
+def gaussians_of(given, features=None):
+    """The scene of the arguments."""
+    return Gaussians.from_arrays(
+        given["means"], given["quats"], given["scales"], given["opacities"], given["colors"], features=features
+    )
+
+
+def oracle(given, fields, settings, **options):
+    """Image with the background, alpha, and what else the oracle gives, of the first camera."""
+    w2c = given["viewmats"][0]
+    camera = Camera(K=given["Ks"][0].numpy(), w2c=w2c, width=given["width"], height=given["height"], **fields)
+    out = reference.render(gaussians_of(given), camera, settings, tolerance=1e-5, **options)
+    return out, out.rgb + (1 - out.alpha[..., None]) * given["backgrounds"][0]
+
+
+UT = RenderSettings.preset("3dgut", culling="ut")
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_images_and_gradients_through_lenses(lens):
+    """Image and every gradient are the oracle's; no gradient is gsplat's that is none of ours."""
+    options, fields = options_of(lens)
+    given = arguments(n=40, width=30, height=26)
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+    leaves = {name: given[name].clone().requires_grad_() for name in names}
+    ours, alpha, _ = drgs.rasterization(**{**given, **leaves}, **options, with_ut=True, with_eval3d=True)
+    theirs = {name: given[name].clone().requires_grad_() for name in names}
+    out, image = oracle({**given, **theirs}, fields, UT)
+    good = ~out.ambiguous
+    assert good.double().mean() > 0.8
+    assert float((ours[0] - image).abs()[good].max()) < 2e-5
+    assert float((alpha[0, ..., 0] - out.alpha).abs()[good].max()) < 2e-5
+    u = torch.randn(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * good[..., None]
+    mine = torch.autograd.grad((ours[0] * u).sum(), list(leaves.values()))
+    expected = torch.autograd.grad((image * u).sum(), list(theirs.values()))
+    for name, a, b in zip(names, mine, expected, strict=True):
+        assert float((a - b).norm()) < 2e-4 * float(b.norm()), name
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "opencv"])
+@pytest.mark.parametrize("shutter", list(RollingShutterType)[:2])
+def test_rolling_shutters(lens, shutter):
+    """Images and the gradients of both poses; colors are seen from the middle of both centers."""
+    options, fields = options_of(lens)
+    given = arguments(n=40, width=30, height=26, degree=2)
+    poses = {"viewmats": given["viewmats"].clone().requires_grad_()}
+    poses["viewmats_rs"] = turned(given["viewmats"]).requires_grad_()
+    ours, _, _ = drgs.rasterization(
+        **{**given, **poses}, **options, rolling_shutter=shutter, with_ut=True, with_eval3d=True
+    )
+    start, end = (x.detach().clone().requires_grad_() for x in poses.values())
+    fields = {**fields, "shutter": shutter.name.lower(), "w2c_end": end[0]}
+    center = sum(-x[0, :3, 3] @ x[0, :3, :3] for x in (start, end)) / 2
+    from drgs.oracle import sh_colors  # the truth's own colors, towards that point
+
+    plain = sh_colors(given["colors"], given["means"] - center)
+    # Colors as SH of degree 0 whose clamp is out of the way.
+    flat = {**given, "viewmats": start, "colors": ((plain + 0.5) / 0.28209479177387814)[:, None]}
+    out, _ = oracle(flat, fields, UT)
+    image = out.rgb - out.alpha[..., None] + (1 - out.alpha[..., None]) * given["backgrounds"][0]
+    good = ~out.ambiguous
+    assert float((ours[0] - image).abs()[good].max()) < 3e-5
+    u = torch.randn(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * good[..., None]
+    mine = torch.autograd.grad((ours[0] * u).sum(), list(poses.values()))
+    expected = torch.autograd.grad((image * u).sum(), [start, end])
+    for a, b, pose in zip(mine, expected, (start, end), strict=True):
+        for k in range(3):  # along translations, and rotations
+            move = torch.zeros(4, 4, dtype=torch.float64)
+            move[k, 3] = 1.0
+            turn = torch.zeros(4, 4, dtype=torch.float64)
+            turn[k, (k + 1) % 3], turn[(k + 1) % 3, k] = 1.0, -1.0
+            for change in (move, turn):
+                along = change @ pose[0].detach()
+                got, want = float((a[0] * along).sum()), float((b[0] * along).sum())
+                assert got == pytest.approx(want, rel=5e-4, abs=2e-3)
+
+
+def test_depths_of_gaussians_and_along_rays():
+    """D and ED blend the Gaussian's own depth, z or distance; d and Ed the distance along each ray."""
+    given = arguments(n=40, width=30, height=26)
+    call = lambda mode, **o: drgs.rasterization(**given, render_mode=mode, with_ut=True, with_eval3d=True, **o)  # noqa: E731
+    camera = Camera(K=given["Ks"][0].numpy(), w2c=given["viewmats"][0], width=30, height=26)
+    local = given["means"] @ given["viewmats"][0, :3, :3].T + given["viewmats"][0, :3, 3]
+    for by_z, own in ((True, local[:, 2:]), (False, local.norm(dim=1, keepdim=True))):
+        settings = UT.replace(depth_key="z" if by_z else "distance")
+        out = reference.render(gaussians_of(given, own), camera, settings, tolerance=1e-5)
+        good = ~out.ambiguous
+        expected = {"D": out.features, "d": out.depth[..., None] * out.alpha[..., None]}
+        for mode, total in expected.items():
+            sums = call(mode, global_z_order=by_z)
+            assert float((sums[0][0] - total).abs()[good].max()) < 1e-4
+            mean = call("E" + mode, global_z_order=by_z)
+            size = total / out.alpha.clamp_min(1e-10)[..., None]
+            assert float(((mean[0][0] - size).abs() * (out.alpha > 1e-3)[..., None])[good].max()) < 1e-4
+            both = call("RGB+D" if mode == "D" else "RGB-d", global_z_order=by_z)[0]
+            assert both.shape == (1, 26, 30, 4)
+            assert torch.equal(both[0, ..., 3:], sums[0][0])
+            assert call("RGB+ED" if mode == "D" else "RGB-Ed", global_z_order=by_z)[0].shape == (1, 26, 30, 4)
+
+
+def test_colors_may_be_missing_from_depths():
+    """As in gsplat, where only a depth is drawn."""
+    given = {**arguments(n=20), "colors": None, "sh_degree": None, "backgrounds": None}
+    assert drgs.rasterization(**given, render_mode="D")[0].shape == (1, 40, 48, 1)
+    assert drgs.rasterization(**given, render_mode="Ed", with_eval3d=True)[0].shape == (1, 40, 48, 1)
+
+
+def test_normals():
+    """Third axes, turned against each ray, blended with the weights."""
+    given = arguments(n=30, width=30, height=26)
+    _, _, meta = drgs.rasterization(**given, with_ut=True, with_eval3d=True, return_normals=True)
+    camera = Camera(K=given["Ks"][0].numpy(), w2c=given["viewmats"][0], width=30, height=26)
+    weights = reference.render(gaussians_of(given, torch.eye(30, dtype=torch.float64)), camera, UT, tolerance=1e-5)
+    w, x, y, z = torch.nn.functional.normalize(given["quats"], dim=1).unbind(1)
+    axes = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    along = torch.from_numpy(camera.pixel_directions()) @ axes.T
+    expected = torch.einsum("hwn,nk->hwk", weights.features * torch.where(along > 0, -1.0, 1.0), axes)
+    assert meta["normals"].shape == (1, 26, 30, 3)
+    assert float((meta["normals"][0] - expected).abs()[~weights.ambiguous].max()) < 2e-5
+
+
+def test_extra_signals():
+    """Channels beside the colors, on nothing, plain or as coefficients that are not clamped."""
+    given = arguments(n=30, width=30, height=26)
+    make = torch.Generator().manual_seed(3)
+    plain = torch.randn(30, 5, generator=make, dtype=torch.float64)
+    image, alpha, meta = drgs.rasterization(**given, extra_signals=plain, render_mode="RGB+D")
+    both = drgs.rasterization(**{**given, "colors": plain, "sh_degree": None, "backgrounds": None})[0]
+    assert image.shape == (1, 26, 30, 4)
+    assert torch.allclose(meta["render_extra_signals"], both, atol=2e-5)
+    assert torch.allclose(image, drgs.rasterization(**given, render_mode="RGB+D")[0], atol=1e-6)
+    coefficients = torch.randn(30, 4, 2, generator=make, dtype=torch.float64)
+    meta = drgs.rasterization(**given, extra_signals=coefficients, extra_signals_sh_degree=1)[2]
+    center = -given["viewmats"][0, :3, 3] @ given["viewmats"][0, :3, :3]
+    from drgs.oracle import sh_basis
+
+    basis = sh_basis(torch.nn.functional.normalize(given["means"] - center, dim=1), 4)
+    values = 0.5 + torch.einsum("nk,nkd->nd", basis, coefficients)
+    expected = drgs.rasterization(**{**given, "colors": values, "sh_degree": None, "backgrounds": None})[0]
+    assert torch.allclose(meta["render_extra_signals"], expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
+def test_coefficients_of_any_number_of_channels(channels):
+    """SH of other channels than three: each is what it would be among three."""
+    given = arguments(n=30, width=30, height=26)
+    wide = given["colors"].repeat(1, 1, 2)[..., :channels]
+    behind = given["backgrounds"].repeat(1, 2)[..., :channels]
+    found = drgs.rasterization(**{**given, "colors": wide, "backgrounds": behind})[0]
+    expected = drgs.rasterization(**given)[0].repeat(1, 1, 1, 2)[..., :channels]
+    assert torch.allclose(found, expected, atol=2e-5)
+
+
+def test_coefficients_are_shared_by_batches():
+    """(N, K, 3) of gsplat 1.6 beside scenes with leading axes."""
+    given = arguments(n=20, cameras=2)
+    names = ("means", "quats", "scales", "opacities", "viewmats", "Ks", "backgrounds")
+    batch = {name: given[name].expand(2, *given[name].shape) for name in names}
+    found = drgs.rasterization(**{**given, **batch})[0]
+    assert found.shape == (2, 2, 40, 48, 3)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], drgs.rasterization(**given)[0])
+
+
+def test_rays_of_the_caller():
+    """The camera's own rays give its image; others their own, with a gradient."""
+    given = arguments(n=30, width=30, height=26, cameras=2)
+    cameras = [
+        Camera(K=K.numpy(), w2c=w2c.numpy(), width=30, height=26)
+        for K, w2c in zip(given["Ks"], given["viewmats"], strict=True)
+    ]
+    rays = torch.stack(
+        [
+            torch.cat([torch.from_numpy(c.pixel_origins().copy()), torch.from_numpy(c.pixel_directions())], -1)
+            for c in cameras
+        ]
+    ).requires_grad_()
+    image = drgs.rasterization(**given, rays=rays, with_eval3d=True, with_ut=True)[0]
+    expected = drgs.rasterization(**given, with_eval3d=True, with_ut=True)[0]
+    assert torch.allclose(image, expected, atol=2e-5)
+    image.square().sum().backward()
+    assert rays.grad.shape == rays.shape
+    assert torch.isfinite(rays.grad).all()
+    assert rays.grad.abs().sum() > 0
+
+
+def test_covariances():
+    """Images are those of quaternions and scales; gradients those of central differences of the oracle."""
+    given = arguments(n=8, width=20, height=16)
+    R = drgs.ellipsoids.semi_axes(given["quats"], given["scales"])
+    covars = (R @ R.mT).requires_grad_()
+    image = drgs.rasterization(**{**given, "quats": None, "scales": None}, covars=covars, with_eval3d=True)[0]
+    expected = drgs.rasterization(**given, with_eval3d=True)[0]
+    assert torch.allclose(image, expected, atol=2e-5)
+    make = torch.Generator().manual_seed(7)
+    u = torch.randn(image.shape, generator=make, dtype=torch.float64)
+    (found,) = torch.autograd.grad((image * u).sum(), [covars])
+    settings = RenderSettings.preset("3dgut", culling="extent")
+    direction = torch.randn(8, 3, 3, generator=make, dtype=torch.float64)
+    direction = 0.5 * (direction + direction.mT) * covars.detach().abs().amax((1, 2), keepdim=True)
+
+    def total(step):
+        from drgs.covariances import quats_and_scales
+
+        quats, scales = quats_and_scales("test", covars.detach() + step * direction)
+        _, moved = oracle({**given, "quats": quats, "scales": scales}, {}, settings)
+        return float((moved * u[0]).sum())
+
+    h = 1e-6
+    assert float((found * direction).sum()) == pytest.approx((total(h) - total(-h)) / (2 * h), rel=2e-3)
+    for bad, message in (
+        (torch.eye(3, dtype=torch.float64).expand(8, 3, 3).clone().requires_grad_(), "three different eigenvalues"),
+        (covars.detach() - 2 * torch.eye(3), "without a negative eigenvalue"),
+        (covars.detach() + torch.ones(3, 3).triu(1), "symmetric to 1e-5"),
+    ):
+        with pytest.raises((ValueError, NotImplementedError), match=message):
+            drgs.rasterization(**{**given, "quats": None, "scales": None}, covars=bad)
+
+
+def test_gradient_of_projected_means():
+    """meta["means2d"] is a leaf with the gradient by the projected means, all else held, in pixels."""
+    given = arguments(n=12, width=20, height=16)
+    leaves = {"means": given["means"].clone().requires_grad_()}
+    image, _, meta = drgs.rasterization(**{**given, **leaves})
+    means2d = meta["means2d"]
+    means2d.retain_grad()
+    u = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    (image * u).sum().backward()
+    assert means2d.shape == (1, 12, 2)
+    # Moving the principal point moves all projected means by as much, and their Jacobians' clamps, which are far here.
+    camera = Camera(K=given["Ks"][0].numpy(), w2c=given["viewmats"][0], width=20, height=16)
+    settings = RenderSettings.preset("gsplat", fov_clamp="none", alpha_min=0.0, culling="extent", transmittance_min=0.0)
+    whole, _, meta = drgs.rasterization(**{**given, **leaves}, preset=settings)
+    (whole * u).sum().backward()
+    h = 1e-4
+    for axis in range(2):
+        sums = []
+        for sign in (1, -1):
+            K = camera.K.copy()
+            K[axis, 2] += sign * h
+            shifted = dataclasses.replace(camera, K=K)
+            out = reference.render(gaussians_of(given), shifted, settings)
+            moved = out.rgb + (1 - out.alpha[..., None]) * given["backgrounds"][0]
+            sums.append(float((moved * u[0]).sum()))
+        expected = (sums[0] - sums[1]) / (2 * h)
+        assert float(meta["means2d"].grad[0, :, axis].sum()) == pytest.approx(expected, rel=1e-3)
+    assert drgs.rasterization(**given)[2]["means2d"].requires_grad is False
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_meta_by_the_unscented_transform(lens):
+    """Radii are the boxes that cull: a Gaussian with radius 0 is not drawn, one alone stays within its box's tiles."""
+    options, _ = options_of(lens)
+    given = {**arguments(n=30, channels=3), "backgrounds": None}
+    _, _, meta = drgs.rasterization(**given, **options, with_ut=True, with_eval3d=True)
+    for i in range(30):
+        one = {
+            **given,
+            **{name: given[name][i : i + 1] for name in ("means", "quats", "scales", "opacities", "colors")},
+        }
+        alpha = drgs.rasterization(**one, **options, with_ut=True, with_eval3d=True)[1][0, ..., 0]
+        radius = meta["radii"][0, i].double()
+        if not bool((radius > 0).all()):
+            assert not alpha.any()
+            continue
+        rows, columns = alpha.nonzero().unbind(1)
+        low = ((meta["means2d"][0, i] - radius) / 8).floor() * 8
+        high = ((meta["means2d"][0, i] + radius) / 8).ceil() * 8
+        inside = (columns + 0.5 > low[0]) & (columns + 0.5 < high[0]) & (rows + 0.5 > low[1]) & (rows + 0.5 < high[1])
+        assert bool(inside.all())
