@@ -8,6 +8,7 @@ changes an image lives anywhere else. Symbols: `a` opacity of one hit, `alpha_i`
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
 from collections.abc import Iterable
 from typing import Any, Literal
@@ -79,9 +80,9 @@ _TABLE: dict[str, dict[str, Any]] = {
     },
     "3dgut": {
         "depth_key": "z",
-        "extent": 3.33,
+        "extent": math.sqrt(-2 * math.log(0.0113)),  # where the response falls to that
         "alpha_min": 1 / 255,
-        "alpha_max": 0.999,
+        "alpha_max": 0.99,
         "transmittance_min": 1e-4,
         "stop": "before_eq",
         "near": 0.01,
