@@ -137,7 +137,7 @@ def render(
         scene = dataclasses.replace(scene, screen=screen, tiles=tiles)
     elif s.culling == "ut":
         offset = float64(getattr(g, "origin", (0, 0, 0)))
-        scene = dataclasses.replace(scene, tiles=_unscented(scene, cam, offset, tolerance))
+        scene = dataclasses.replace(scene, tiles=_unscented(scene, cam, view, offset, tolerance))
     if window is not None:
         scene = _in_window(scene, s, view, window, tolerance)
     if s.sh_direction == "gaussian" and center is not None:
@@ -198,7 +198,7 @@ def _project(
     return Footprints(mean2d, rows, diagonal), Tiles(_TILE, bounds)
 
 
-def _unscented(scene: OracleScene, cam: Any, offset: Tensor, tolerance: float) -> Tiles:
+def _unscented(scene: OracleScene, cam: Any, view: OracleRays, offset: Tensor, tolerance: float) -> Tiles:
     """The tiles of gsplat's 3DGUT: of the box of the mean and covariance that the unscented transform finds on the
     image, with alpha = 0.1, beta = 2, kappa = 0 for three dimensions, hence lambda = alpha^2 3 - 3.
     """
@@ -206,9 +206,15 @@ def _unscented(scene: OracleScene, cam: Any, offset: Tensor, tolerance: float) -
     lamb = alpha**2 * dimensions - dimensions
     means = scene.means.detach()  # culling has no derivative
     steps = math.sqrt(dimensions + lamb) * scene.axes.detach().transpose(1, 2)  # nor has this
-    points = torch.cat([means[:, None], means[:, None] + steps, means[:, None] - steps], 1) + offset
-    pixels, z = (torch.from_numpy(x) for x in cam.project(points.reshape(-1, 3).numpy()))
-    seen = torch.isfinite(pixels).all(-1) & ((z > 0) | (cam.model != "pinhole"))
+    points = torch.cat([means[:, None], means[:, None] + steps, means[:, None] - steps], 1).reshape(-1, 3)
+    if getattr(cam, "model", "pinhole") == "pinhole" and getattr(cam, "shutter", "global") == "global":
+        scale, shift = scale_and_shift(cam)
+        local = (points - view.center.detach()) @ view.rotation.detach().T  # nor have boxes, as above
+        pixels = local[:, :2] / local[:, 2:] @ scale.T + shift
+        seen = local[:, 2] > 0
+    else:
+        pixels, z = (torch.from_numpy(x) for x in cam.project((points + offset).numpy()))
+        seen = torch.isfinite(pixels).all(-1) & ((z > 0) | (cam.model != "pinhole"))
     pixels = torch.where(seen[:, None], pixels, 0.0).reshape(-1, 7, 2)
     size = torch.tensor([cam.width, cam.height], dtype=torch.float64)
     inside = ((pixels >= -0.1 * size) & (pixels < 1.1 * size)).all(-1)

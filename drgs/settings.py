@@ -86,6 +86,7 @@ _TABLE: dict[str, dict[str, Any]] = {
         "transmittance_min": 1e-4,
         "stop": "before_eq",
         "near": 0.01,
+        "culling": "ut",
     },
 }
 
@@ -179,9 +180,9 @@ class RenderSettings:
         `volprim_rf_basic` and draws the previews of fits; `mitsuba` is that integrator's model: its acceleration
         structure, order of entry points, SH along each ray, 64 hits a ray, without the hits that it loses. `inria` and
         `gsplat` are those rasterizers' models. `3dgut` is what gsplat composites with `with_ut` and `with_eval3d`: the
-        peak on each ray, with the rasterizer's cut-offs. It does not model 3DGUT's projection: neither the unscented
-        transform of lenses and rolling shutters, nor the culling by the box of the covariance that this gives, which
-        leaves out Gaussians whose rays it misjudges. docs/conventions.md lists the source of every constant.
+        peak on each ray, with the rasterizer's cut-offs, in the tiles of the boxes that the unscented transform gives,
+        which leave out what they misjudge; `culling="extent"` draws that, too. docs/conventions.md lists the source of
+        every constant.
 
         Args:
             name: One of `PRESETS`.
