@@ -1,78 +1,111 @@
-"""Gaussians by their covariances, as quaternions and standard deviations: for who stores the matrices."""
+"""Covariances as quaternions and scales, with the derivative by the covariance that an eigendecomposition loses.
+
+C = R S^2 R^T. In the axes R, a change D = R^T dC R turns them by w and changes the scales,
+
+    d s_i = D_ii / (2 s_i),        [w]x_ij = D_ij / (s_j^2 - s_i^2),
+
+which does not exist where two scales are the same, although the image has a derivative there. Gaussians whose scales
+are nearly the same get them spread by two small factors h and 2h, and 2 f'(h) - f'(2h) is the derivative within O(h^2).
+"""
 
 from __future__ import annotations
 
 import torch
 
-from drgs.guards.arguments import ArgumentError
+__all__ = ["SPREAD", "check_covariances", "factors", "nearly_round"]
 
-__all__ = ["quats_and_scales"]
+SPREAD = 1e-2
+"""Relative difference of variances below which they count as the same; also h above."""
+_THIN = 1e-24  # of the largest variance: a flat Gaussian has this much in place of 0
 
-_SAME = 1e-6  # relative difference of two eigenvalues, below which their axes are anybody's
-_LEAST = 1e-40  # of an eigenvalue, whose square root is differentiated
 
-
-def quats_and_scales(
-    where: str, covars: torch.Tensor, lead: tuple[int, ...] | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(..., 4) wxyz and (..., 3) of covariances (..., 3, 3), float64, by their eigenvectors.
+def check_covariances(where: str, covars: torch.Tensor, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless covariances are symmetric, positive semidefinite and of shape (..., N, 3, 3).
 
     Args:
-        where: What the caller is called, for messages.
-        covars: Symmetric to rounding, no eigenvalue below 0; differentiable.
-        lead: Their leading axes; None: any.
+        where: The function that is called.
+        covars: What was given.
+        shape: (..., N).
     Raises:
-        ValueError: If one is not symmetric, not finite, or has a negative eigenvalue.
-        NotImplementedError: If a derivative is asked for of one with two equal eigenvalues: what its off-diagonal
-            elements do there is no rotation and no scaling of the axes that it has.
+        ValueError: They are not.
+        NotImplementedError: They belong to `torch.func` or are dual numbers, which derivatives here do not know.
     """
-    shape = (*(covars.shape[:-2] if lead is None else lead), 3, 3)
-    if tuple(covars.shape) != shape:
-        raise ArgumentError(f"{where}: covars must have shape {tuple(shape)}, got {tuple(covars.shape)}")
-    x = covars.to(torch.float64)
-    numbers = x.detach()  # checks have no derivative
-    size = numbers.abs().amax((-1, -2)).clamp_min(1e-300)
-    _refuse(where, ~torch.isfinite(numbers).all(-1).all(-1), numbers, "finite")
-    skewed = (numbers - numbers.mT).abs().amax((-1, -2)) > 1e-5 * size
-    _refuse(where, skewed, numbers, "symmetric to 1e-5 of its largest element")
-    values, axes = torch.linalg.eigh(0.5 * (x + x.mT))
-    found = values.detach()  # as above
-    _refuse(where, found[..., 0] < -1e-6 * size, numbers, "without a negative eigenvalue")
-    if covars.requires_grad:
-        same = (found.diff(dim=-1) <= _SAME * size[..., None]).any(-1)
-        if bool(same.any()):
-            at = same.nonzero()[0].tolist()
-            raise NotImplementedError(
-                f"{where}: covars must have three different eigenvalues where they are differentiated, got "
-                f"{found[tuple(at)].tolist()} at index {at}; pass quats and scales, or differentiate these"
-            )
-    # A reflection of an axis is no rotation, and changes no Gaussian.
-    mirrored = torch.linalg.det(axes.detach()) < 0
-    axes = torch.cat([axes[..., :2], torch.where(mirrored[..., None, None], -axes[..., 2:], axes[..., 2:])], -1)
-    return _quaternions(axes), values.clamp_min(_LEAST).sqrt()
-
-
-def _refuse(where: str, bad: torch.Tensor, values: torch.Tensor, must: str) -> None:
-    """Raise for the first covariance that is bad."""
+    if not isinstance(covars, torch.Tensor) or tuple(covars.shape) != (*shape, 3, 3):
+        got = tuple(covars.shape) if isinstance(covars, torch.Tensor) else type(covars).__name__
+        raise ValueError(f"{where}: covars must be a tensor of shape {(*shape, 3, 3)}, got {got}; pass matrices")
+    if (
+        torch._C._functorch.is_functorch_wrapped_tensor(covars)
+        or torch.autograd.forward_ad.unpack_dual(covars).tangent is not None
+    ):
+        raise NotImplementedError(
+            f"{where}: derivatives by covars must be by torch.autograd's reverse mode, got torch.func or forward_ad; "
+            "use backward, or quats and scales"
+        )
+    x = covars.detach().double()  # a check has no derivative
+    if not x.numel():
+        return
+    size = x.abs().amax((-2, -1))
+    least = torch.linalg.eigvalsh(x).amin(-1)
+    skew = (x - x.transpose(-2, -1)).abs().amax((-2, -1))
+    bad = ~((least >= -1e-6 * size) & (skew <= 1e-5 * size) & torch.isfinite(size))
     if bool(bad.any()):
         at = bad.nonzero()[0].tolist()
-        raise ArgumentError(
-            f"{where}: covars must be {must}, got {values[tuple(at)].tolist()} at index {at}; correct it"
+        raise ValueError(
+            f"{where}: covars must be symmetric and positive semidefinite, got a smallest eigenvalue of "
+            f"{float(least[tuple(at)]):g} at index {at}; form them as A A^T"
         )
 
 
-def _quaternions(R: torch.Tensor) -> torch.Tensor:
-    """(..., 4) wxyz, not normalized, of rotations (..., 3, 3): a column of the matrix whose columns are the quaternion
-    times each of its entries, that with the largest diagonal element (Bar-Itzhack 2000).
+def nearly_round(covars: torch.Tensor) -> torch.Tensor:
+    """(...,) whether two variances of each of (..., 3, 3) differ by less than `SPREAD` of the larger one."""
+    variances = torch.linalg.eigvalsh(covars.detach().double())  # which ones is a choice, without derivative
+    return (variances.diff(dim=-1) < SPREAD * variances[..., 1:]).any(-1)
+
+
+def factors(covars: torch.Tensor, spread: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Quaternions (..., 4) and scales (..., 3) of covariances (..., 3, 3), in their precision.
+
+    Args:
+        covars: Symmetric; the upper and the lower half get the same derivative.
+        spread: Variances of what is `nearly_round` are spread by this factor; 0 leaves every value as it is, and gives
+            what is nearly round no derivative by rotations.
     """
-    m = [[R[..., i, j] for j in range(3)] for i in range(3)]
-    (a, b, c), (d, e, f), (g, h, i) = m
-    rows = [
-        [1 + a + e + i, h - f, c - g, d - b],
-        [h - f, 1 + a - e - i, b + d, c + g],
-        [c - g, b + d, 1 - a + e - i, f + h],
-        [d - b, c + g, f + h, 1 - a - e + i],
-    ]
-    K = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    largest = K.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)  # a choice, without a derivative
-    return torch.take_along_dim(K, largest[..., None, None], -1)[..., 0]
+    fixed = covars.detach().double()  # the axes that a change is seen in
+    variances, axes = torch.linalg.eigh(0.5 * (fixed + fixed.transpose(-2, -1)))
+    axes = axes * torch.linalg.det(axes).sign()[..., None, None]
+    variances = torch.maximum(variances, _THIN * variances[..., 2:].clamp_min(1e-30))
+    if spread:
+        steps = torch.tensor([-spread, 0.0, spread], dtype=torch.float64, device=fixed.device)
+        variances = variances * (1 + steps * nearly_round(fixed)[..., None])
+    change = covars.double() - fixed  # 0, with a graph
+    seen = axes.transpose(-2, -1) @ (0.5 * (change + change.transpose(-2, -1))) @ axes
+    scales = variances.sqrt()
+    scales = scales + seen.diagonal(dim1=-2, dim2=-1) / (2 * scales)
+
+    def turn(i: int, j: int) -> torch.Tensor:
+        gap = variances[..., j] - variances[..., i]
+        near = gap.abs() < 0.5 * SPREAD * torch.maximum(variances[..., i], variances[..., j])
+        return torch.where(near, 0.0, seen[..., i, j] / torch.where(near, 1.0, gap))
+
+    half = 0.5 * torch.stack([turn(2, 1), turn(0, 2), turn(1, 0)], -1)
+    return _turned(_quaternions(axes), half).to(covars.dtype), scales.to(covars.dtype)
+
+
+def _turned(q: torch.Tensor, half: torch.Tensor) -> torch.Tensor:
+    """q times (1, half): a turn by 2 half in the axes that q describes, to first order."""
+    w, v = q[..., :1], q[..., 1:]
+    real = w - (v * half).sum(-1, keepdim=True)
+    return torch.cat([real, v + w * half + torch.linalg.cross(v, half)], -1)
+
+
+def _quaternions(R: torch.Tensor) -> torch.Tensor:
+    """(..., 4) wxyz of rotations (..., 3, 3): the row of 4 q q^T with the largest diagonal (Shepperd 1978)."""
+    r = lambda i, j: R[..., i, j]  # noqa: E731
+    trace = r(0, 0) + r(1, 1) + r(2, 2)
+    squares = [1 + trace, *[1 - trace + 2 * r(k, k) for k in range(3)]]
+    x, y, z = r(2, 1) - r(1, 2), r(0, 2) - r(2, 0), r(1, 0) - r(0, 1)
+    xy, xz, yz = r(0, 1) + r(1, 0), r(0, 2) + r(2, 0), r(1, 2) + r(2, 1)
+    rows = [[squares[0], x, y, z], [x, squares[1], xy, xz], [y, xy, squares[2], yz], [z, xz, yz, squares[3]]]
+    table = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    best = torch.stack(squares, -1).argmax(-1)[..., None, None]
+    return torch.nn.functional.normalize(table.gather(-2, best.expand(*best.shape[:-1], 4)).squeeze(-2), dim=-1)

@@ -13,7 +13,7 @@ from drgs.guards.arguments import ArgumentError
 from drgs.settings import RenderSettings
 from drgs.shutters import SHUTTERS
 
-__all__ = ["MODES", "NEAR", "Mode", "lenses_of", "one_of", "refuse", "settings_of", "shutter_of"]
+__all__ = ["MODES", "NEAR", "Mode", "check_unscented", "lenses_of", "one_of", "refuse", "settings_of", "shutter_of"]
 
 # Defaults of gsplat's signature: another preset's own constants hold unless an argument differs from these.
 NEAR = 0.01
@@ -52,7 +52,6 @@ MODES = {
 _RAYS = "pass its rays as rays=, with with_eval3d=True"
 _INSTEAD = {
     "sparse_grad": "gradients are dense here; drop it",
-    "absgrad": "use the gradient of meta['means2d'], or gsplat's MCMCStrategy, which needs none",
     "distributed": "one process renders; split the cameras among processes yourself",
     "lidar_coeffs": _RAYS,
     "external_distortion_coeffs": _RAYS,
@@ -69,6 +68,17 @@ def refuse(**asked: bool) -> None:
     for name, is_asked in asked.items():
         if is_asked:
             raise NotImplementedError(f"rasterization: {name} is not supported; {_INSTEAD[name]}")
+
+
+def check_unscented(params: object) -> None:
+    """Raise NotImplementedError for parameters of the unscented transform that are not gsplat's defaults."""
+    for name, usual in (("alpha", 0.1), ("beta", 2.0), ("kappa", 0.0), ("in_image_margin_factor", 0.1)):
+        value = getattr(params, name, usual)
+        if value != usual:
+            raise NotImplementedError(
+                f"rasterization: ut_params must be alpha 0.1, beta 2, kappa 0, got {name}={value:g}; leave with_ut out, "
+                "and nothing is culled by boxes"
+            )
 
 
 def one_of(name: str, value: str, allowed: Sequence[str]) -> None:

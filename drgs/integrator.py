@@ -185,6 +185,7 @@ def render_with_offsets(
     outputs: tuple[str, ...] | str = (),
     rays: torch.Tensor | np.ndarray | None = None,
     mean_offsets: torch.Tensor | None = None,
+    mean_absolute: torch.Tensor | None = None,
 ) -> Output:
     """What `render` gives, whose Gaussians' projected means can be moved: what density control of rasterizers reads.
 
@@ -192,9 +193,19 @@ def render_with_offsets(
         gaussians, camera, settings, outputs, rays: Arguments of `render`.
         mean_offsets: (N, 2) zeros in pixels, added to the projected means of a model of the image plane; the derivative
             by them is that by the projected means, all else held.
+        mean_absolute: (N, 2) zeros; what a backward pass gives as their gradient is the sum over all pixels of the
+            absolute value of each pixel's gradient by the projected means (Ye et al. 2024, AbsGS).
     """
     check_view("render", gaussians, camera, settings)
-    call = Call(gaussians, camera, settings, _wanted(outputs), pixel_rays=rays, mean_offsets=mean_offsets)
+    call = Call(
+        gaussians,
+        camera,
+        settings,
+        _wanted(outputs),
+        pixel_rays=rays,
+        mean_offsets=mean_offsets,
+        mean_absolute=mean_absolute,
+    )
     with own_errors():
         return call.output(differentiable(call))
 

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 
 from drgs.cameras import Camera
-from drgs.covariances import quats_and_scales
+from drgs.covariances import SPREAD, check_covariances, factors, nearly_round
 from drgs.ellipsoids import Y_00
-from drgs.gsplat_options import MODES, NEAR, Mode, lenses_of, one_of, refuse, settings_of, shutter_of
+from drgs.gsplat_options import MODES, NEAR, Mode, check_unscented, lenses_of, one_of, refuse, settings_of, shutter_of
 from drgs.integrator import render_normals, render_with_offsets
 from drgs.projected import projected, unscented
 from drgs.runtime import uncompiled
@@ -106,10 +106,12 @@ def rasterization(
         backgrounds: (..., C, D) or None for black; behind a depth there is 0.
         render_mode: RGB; D (sum w z), ED (that over alpha), RGB+D, RGB+ED: the Gaussian's own depth as the last
             channel; d, Ed, RGB-d, RGB-Ed: the distance along the ray, of responses along rays.
+        absgrad: Whether a backward pass leaves the sum over all pixels of the absolute gradients by projected means in
+            `meta["means2d"].absgrad`, in pixels; of the rasterizer's own model.
         rasterize_mode: classic, or antialiased: opacities times sqrt(det Sigma / det (Sigma + eps2d I)).
         camera_model: One of pinhole and fisheye, which are OpenCV's.
-        covars: (..., N, 3, 3) covariances instead of `quats` and `scales`; differentiated where their eigenvalues are
-            three different ones.
+        covars: (..., N, 3, 3) covariances instead of `quats` and `scales`; differentiated in reverse mode. Where two
+            eigenvalues of one are nearly the same, its derivative takes two more images.
         with_eval3d: Gaussians are evaluated along rays, as 3DGUT does: preset `3dgut`.
         with_ut: Whether, with `with_eval3d`, tiles are those of the boxes of the unscented transform, as gsplat's are;
             else nothing is left out.
@@ -130,8 +132,9 @@ def rasterization(
     Returns:
         colors (..., C, H, W, X), alphas (..., C, H, W, 1), in the precision of `means`, and a dict: `radii` (..., C, N,
         2) int32 in pixels, 0 where a Gaussian is left out; `means2d` (..., C, N, 2), `depths` (..., C, N), `conics`
-        (..., C, N, 3), valid where radii > 0; `opacities` (..., C, N); `width`, `height`, `n_batches`, `n_cameras`; and
-        what `return_normals` and `extra_signals` ask for. Only `means2d` may have a gradient.
+        (..., C, N, 3), valid where radii > 0; `opacities` (..., C, N); `width`, `height`, `n_batches`, `n_cameras`;
+        None for what only packed arrays have; and what `return_normals` and `extra_signals` ask for. Only `means2d` may
+        have a gradient.
     Raises:
         ValueError: If a shape or value is wrong.
         NotImplementedError: If an option of gsplat's is asked for that does not exist here; the way round is named.
@@ -145,11 +148,11 @@ def rasterization(
         V. Ye et al., gsplat, JMLR 26, 2025; Z. Yu et al., Mip-Splatting, CVPR 2024 (antialiased); Q. Wu et al., 3DGUT,
         CVPR 2025.
     """
+    given_here = {**locals(), "covars": None}
     one_of("render_mode", render_mode, list(MODES))
     one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     refuse(
         sparse_grad=sparse_grad,
-        absgrad=absgrad,
         distributed=distributed,
         lidar_coeffs=lidar_coeffs is not None,
         external_distortion_coeffs=external_distortion_coeffs is not None,
@@ -157,6 +160,7 @@ def rasterization(
         **{f"camera_model={name!r}": camera_model == name for name in ("ortho", "ftheta", "lidar")},
         **{"with_ut without with_eval3d": with_ut and not with_eval3d and preset is None},
     )
+    check_unscented(ut_params)
     if not near_plane < far_plane:
         raise ValueError(
             f"rasterization: near_plane must be less than far_plane, got {near_plane:g} and {far_plane:g}; swap them"
@@ -165,7 +169,15 @@ def rasterization(
     antialiased = rasterize_mode == "antialiased"
     settings = settings_of(preset, near_plane, eps2d, antialiased, with_eval3d, with_ut, global_z_order)
     if covars is not None:
-        quats, scales = quats_and_scales("rasterization", covars, tuple(means.shape[:-1]))
+        if return_normals:
+            raise NotImplementedError(
+                "rasterization: return_normals is not supported with covars, whose axes have no order; pass quats and "
+                "scales"
+            )
+        check_covariances("rasterization", covars, tuple(means.shape[:-1]))
+        quats, scales = factors(covars)
+        if torch.is_grad_enabled() and covars.requires_grad and bool(nearly_round(covars).any()):
+            return _by_round_covariances(given_here, covars, quats.detach(), scales.detach())  # theirs is added there
     if quats is None or scales is None:
         raise ValueError("rasterization: quats and scales must be tensors where there are no covars, got None")
     if colors is None or not mode.color:
@@ -196,6 +208,7 @@ def rasterization(
     flat = {name: of(x) for name, x in given.items()}
     ends = None if viewmats_rs is None else of(viewmats_rs)
     leaf = _leaf(means, viewmats, opacities, settings, lead, count)
+    absolute = _absolute(leaf) if absgrad else None
     views = []
     for b in range(batches):
         for c in range(count):
@@ -219,6 +232,7 @@ def rasterization(
                     extra_signals_sh_degree,
                     None if rays is None else of(rays)[b, c],
                     None if leaf is None else leaf.reshape(batches, count, -1, 2)[b, c],
+                    None if absolute is None else absolute.reshape(batches, count, -1, 2)[b, c],
                     return_normals,
                 )
             )
@@ -235,6 +249,7 @@ def rasterization(
             leaf.copy_(meta["means2d"])
         meta["means2d"] = leaf
     meta |= {"width": width, "height": height, "n_batches": batches, "n_cameras": count}
+    meta |= dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))  # of packed arrays, which these are not
     return images, alphas, meta
 
 
@@ -256,6 +271,7 @@ class _View:
     extra_degree: int | None
     rays: torch.Tensor | None
     leaf: torch.Tensor | None
+    absolute: torch.Tensor | None
     normals: bool
 
     def draw(self) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
@@ -279,6 +295,7 @@ class _View:
         if self.mode.depth == "gaussian" and self.gsplat_depth:
             added.append(depth.to(splats.means.dtype))
         offsets = None if self.leaf is None else self.leaf - self.leaf.detach()  # zeros with its derivative
+        absolute = self.absolute
         kept = self._kept(meta, local[:, 2].detach())
         meta["radii"] = meta["radii"] * kept[:, None]
         if not bool(kept.all()) and (self.far < _FAR or self.clip > 0):
@@ -286,12 +303,13 @@ class _View:
             splats = splats.take(index)
             added = [x[index] for x in added]
             offsets = None if offsets is None else offsets[index]
+            absolute = None if absolute is None else absolute[index]
         gaussians, shift = splats.gaussians(with_color=self.mode.color)
         features = [x for x in (gaussians.features, *added) if x is not None]
         if added:
             gaussians = gaussians.replace(features=torch.cat([x.to(features[0].dtype) for x in features], 1))
         asked = ("depth",) if self.mode.depth and not (self.gsplat_depth and self.mode.depth == "gaussian") else ()
-        out = render_with_offsets(gaussians, camera, settings, asked, self.rays, offsets)
+        out = render_with_offsets(gaussians, camera, settings, asked, self.rays, offsets, absolute)
         if self.normals:
             meta["normals"] = render_normals(gaussians.replace(features=None), camera, settings, self.rays)
         kind = splats.means.dtype
@@ -356,6 +374,27 @@ class _View:
         return kept
 
 
+def _by_round_covariances(
+    given: dict[str, Any], covars: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, dict]:
+    """The call with quaternions and scales of covariances, some of which have variances that are nearly the same.
+
+    By rotations about axes of equal variances there is no derivative, by the covariance there is: f'(0) is 2 f'(h) -
+    f'(2h) but for O(h^2), where h spreads the variances (covariances.py).
+    """
+    image, alpha, meta = rasterization(**{**given, "quats": quats, "scales": scales})
+    # Other tensors have their derivatives already.
+    others: dict[str, Any] = {name: x.detach() if isinstance(x, torch.Tensor) else x for name, x in given.items()}
+    for factor, spread in ((2.0, SPREAD), (-1.0, 2 * SPREAD)):
+        q, s = factors(covars, spread)
+        moved_image, moved_alpha, moved = rasterization(**{**others, "quats": q, "scales": s})
+        image = image + factor * (moved_image - moved_image.detach())  # 0, with a derivative
+        alpha = alpha + factor * (moved_alpha - moved_alpha.detach())  # as the image
+        if (name := "render_extra_signals") in meta:
+            meta[name] = meta[name] + factor * (moved[name] - moved[name].detach())  # as the image
+    return image, alpha, meta
+
+
 def _evaluated(coefficients: torch.Tensor, degree: int, towards: torch.Tensor) -> torch.Tensor:
     """(N, D) 0.5 + SH of coefficients (N, K, D) in directions (N, 3) of any length."""
     used = (degree + 1) ** 2
@@ -392,6 +431,19 @@ def _leaf(
     if not wanted or not settings.planar or torch._C._functorch.is_functorch_wrapped_tensor(means):
         return None
     return means.new_zeros(*lead, count, means.shape[-2], 2).requires_grad_()
+
+
+def _absolute(leaf: torch.Tensor | None) -> torch.Tensor | None:
+    """Zeros like the leaf, whose gradient becomes its `absgrad` after each backward pass."""
+    if leaf is None:
+        return None
+    zeros = torch.zeros_like(leaf).requires_grad_()
+
+    def keep(x: torch.Tensor) -> None:
+        leaf.absgrad = x.grad  # type: ignore[attr-defined]  # where gsplat's strategies look
+
+    zeros.register_post_accumulate_grad_hook(keep)
+    return zeros
 
 
 def _check_along_rays(

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from drgs.cameras import rigid
 from drgs.guards.inputs import check_oracle
 from drgs.oracle import (
     Footprints,
@@ -24,6 +25,7 @@ from drgs.oracle import (
     OracleScene,
     Tiles,
     activate,
+    camera_rays,
     cull_near,
     float64,
     scale_and_shift,
@@ -123,12 +125,16 @@ def render(
         or getattr(cam, "shutter", "global") != "global"
     ):
         raise ValueError("reference.render: 'ewa' needs a pinhole camera, got a lens, a rolling shutter or rays")
-    if s.culling == "ut" and (cam is None or rays is not None):
+    if s.culling == "ut" and cam is None:
         raise ValueError("reference.render: culling='ut' needs the pixels of a camera, got rays")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
     scene = activate(g, s)
     view = view_rays(g, cam, rays, window)
+    if s.culling == "ut" and rays is not None:
+        if view.shape != (cam.height, cam.width):
+            raise ValueError(f"reference.render: culling='ut' needs a ray a pixel of cam, got shape {view.shape}")
+        view = dataclasses.replace(view, pixels=camera_rays(cam, rigid(float64(cam.w2c))[0])[0])
     rotation, center, directions = view.rotation, view.center, view.directions
     if cam is not None:
         scene = cull_near(scene, rotation, center, s, tolerance)

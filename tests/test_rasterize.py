@@ -359,7 +359,7 @@ def test_forward_mode_is_the_transpose():
         ({"camera_model": "ortho"}, NotImplementedError, "camera_model='ortho' is not supported; pass its rays"),
         ({"camera_model": "mirror"}, ValueError, "camera_model must be one of pinhole, fisheye, got 'mirror'"),
         ({"lidar_coeffs": 1}, NotImplementedError, "lidar_coeffs is not supported; pass its rays as rays="),
-        ({"covars": torch.eye(3)}, ValueError, r"covars must have shape .*got \(3, 3\)"),
+        ({"covars": torch.eye(3)}, ValueError, r"covars must be a tensor of shape .*got \(3, 3\)"),
         ({"quats": None}, ValueError, "quats and scales must be tensors where there are no covars"),
         ({"with_ut": True}, NotImplementedError, "with_ut without with_eval3d is not supported; .* pass both"),
         ({"render_mode": "XYZ"}, ValueError, "render_mode must be one of RGB, D, ED, RGB\\+D, .*, got 'XYZ'"),

@@ -249,39 +249,6 @@ def test_rays_of_the_caller():
     assert rays.grad.abs().sum() > 0
 
 
-def test_covariances():
-    """Images are those of quaternions and scales; gradients those of central differences of the oracle."""
-    given = arguments(n=8, width=20, height=16)
-    R = drgs.ellipsoids.semi_axes(given["quats"], given["scales"])
-    covars = (R @ R.mT).requires_grad_()
-    image = drgs.rasterization(**{**given, "quats": None, "scales": None}, covars=covars, with_eval3d=True)[0]
-    expected = drgs.rasterization(**given, with_eval3d=True)[0]
-    assert torch.allclose(image, expected, atol=2e-5)
-    make = torch.Generator().manual_seed(7)
-    u = torch.randn(image.shape, generator=make, dtype=torch.float64)
-    (found,) = torch.autograd.grad((image * u).sum(), [covars])
-    settings = RenderSettings.preset("3dgut", culling="extent")
-    direction = torch.randn(8, 3, 3, generator=make, dtype=torch.float64)
-    direction = 0.5 * (direction + direction.mT) * covars.detach().abs().amax((1, 2), keepdim=True)
-
-    def total(step):
-        from drgs.covariances import quats_and_scales
-
-        quats, scales = quats_and_scales("test", covars.detach() + step * direction)
-        _, moved = oracle({**given, "quats": quats, "scales": scales}, {}, settings)
-        return float((moved * u[0]).sum())
-
-    h = 1e-6
-    assert float((found * direction).sum()) == pytest.approx((total(h) - total(-h)) / (2 * h), rel=2e-3)
-    for bad, message in (
-        (torch.eye(3, dtype=torch.float64).expand(8, 3, 3).clone().requires_grad_(), "three different eigenvalues"),
-        (covars.detach() - 2 * torch.eye(3), "without a negative eigenvalue"),
-        (covars.detach() + torch.ones(3, 3).triu(1), "symmetric to 1e-5"),
-    ):
-        with pytest.raises((ValueError, NotImplementedError), match=message):
-            drgs.rasterization(**{**given, "quats": None, "scales": None}, covars=bad)
-
-
 def test_gradient_of_projected_means():
     """meta["means2d"] is a leaf with the gradient by the projected means, all else held, in pixels."""
     given = arguments(n=12, width=20, height=16)
@@ -310,6 +277,27 @@ def test_gradient_of_projected_means():
         expected = (sums[0] - sums[1]) / (2 * h)
         assert float(meta["means2d"].grad[0, :, axis].sum()) == pytest.approx(expected, rel=1e-3)
     assert drgs.rasterization(**given)[2]["means2d"].requires_grad is False
+
+
+@pytest.mark.parametrize("channels", [None, 5])
+def test_absolute_gradients_of_projected_means(channels):
+    """absgrad is the sum over pixels of the absolute value of what each alone gives."""
+    given = arguments(n=12, width=12, height=10, channels=channels)
+    means = given["means"].clone().requires_grad_()
+    image, _, meta = drgs.rasterization(**{**given, "means": means}, absgrad=True)
+    u = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    (image * u).sum().backward()
+    total = torch.zeros(12, 2, dtype=torch.float64)
+    signed = torch.zeros(12, 2, dtype=torch.float64)
+    for y in range(10):
+        for x in range(12):
+            image, _, one = drgs.rasterization(**{**given, "means": means})
+            (found,) = torch.autograd.grad((image[0, y, x] * u[0, y, x]).sum(), [one["means2d"]])
+            total += found[0].abs()
+            signed += found[0]
+    assert torch.allclose(meta["means2d"].absgrad[0], total, rtol=1e-4, atol=1e-5 * float(total.max()))
+    assert torch.allclose(meta["means2d"].grad[0], signed, rtol=1e-4, atol=1e-5 * float(total.max()))
+    assert float((total - signed.abs()).max()) > 0.01 * float(total.max())
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])

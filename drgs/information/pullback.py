@@ -30,8 +30,7 @@ class Pullback:
         self.compositor, arguments = call.prepare(self.inputs)
         # The compositor's adjoint is called by hand: of the graph only what leads to its arguments is recorded.
         with dr.suspend_grad():
-            record, sh, features, carried = dr.detach(list(arguments))
-            self.compositor.forward(record, sh, features, carried, keep=True)
+            self.compositor.forward(*dr.detach(list(arguments)), keep=True)
         # Features move where a scene computes them; those of Gaussians are wanted where rows are eliminated.
         moving = arguments.features if call.field or "features" in self.names else None
         self.attached = {"record": arguments.record, "sh": arguments.sh, "features": moving}

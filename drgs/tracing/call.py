@@ -36,7 +36,8 @@ OF_VIEW = (
     "ray_directions",
     "ray_shifts",
     "mean_offsets",
-)  # inputs that follow from the pose and the lens
+    "mean_absolute",
+)  # inputs that are no parameters of the scene
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,6 +80,8 @@ class Call:
         lens: The camera's `lens_parameters`, if derivatives by them are wanted.
         pixel_rays: (H, W, 6) origin and direction of each pixel, in the world, instead of those that the camera has.
         mean_offsets: (N, 2) zeros in pixels, added to projected means, of a model of the image plane; differentiated.
+        mean_absolute: (N, 2) zeros, whose gradient is to be the sum over all pixels of the absolute value of each
+            pixel's gradient by projected means.
         oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
@@ -106,6 +109,7 @@ class Call:
         lens: torch.Tensor | None = None,
         pixel_rays: torch.Tensor | np.ndarray | None = None,
         mean_offsets: torch.Tensor | None = None,
+        mean_absolute: torch.Tensor | None = None,
         oriented: bool = False,
     ):
         self.lib = runtime.dr_types()
@@ -155,8 +159,8 @@ class Call:
 
             self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
-        if mean_offsets is not None:
-            self.inputs["mean_offsets"] = self._move(mean_offsets)
+        of_means = {"mean_offsets": mean_offsets, "mean_absolute": mean_absolute}
+        self.inputs |= {name: self._move(x) for name, x in of_means.items() if x is not None}
         self.count = len(gaussians)
         self.coefficients = gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]

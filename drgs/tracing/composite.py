@@ -36,6 +36,7 @@ class Arguments(NamedTuple):
     sh: Any
     features: Any
     carried: list
+    absolute: Any = None
 
 
 def compositor_of(
@@ -80,7 +81,7 @@ def compositor_of(
     # Casts: parameters may be float64, where means are; hits are composited in float32.
     sh = lib.Float(p["sh"]) if along_ray else None
     features = lib.Float(p["features"]) if width else None
-    return compositor, Arguments(traversal.projected.record, sh, features, carried)
+    return compositor, Arguments(traversal.projected.record, sh, features, carried, p.get("mean_absolute"))
 
 
 class Compositor:
@@ -137,6 +138,7 @@ class Compositor:
         sh: Float | None,
         features: Float | None,
         carried: list[Float],
+        absolute: Float | None,
         keep: bool,
         columns: int = 0,
         joint: int = 0,
@@ -148,12 +150,15 @@ class Compositor:
             sh: Flat (N K 3) when SH are evaluated along rays, else None.
             features: Flat (N D) or None.
             carried: Columns (rays,): SH basis values, then o and d of world rays or shifts of others.
+            absolute: Flat (N 2) zeros whose gradient is to be the sum of each pixel's absolute gradient by projected
+                means; None: nobody asks.
             keep: The adjoint may follow.
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
                 its hits knows all that it composites (`information.replay`).
         """
         view = self.traversal
+        self.absolute: Any = absolute
         self.entries = len(record)
         self.carried = carried
         self.buffers = {"record": pack_records(self.lib, record)}
@@ -303,12 +308,13 @@ class Compositor:
         lib = self.lib
         grads = {name: dr.zeros(lib.Float, dr.width(x)) for name, x in self.buffers.items()}
         carried = [dr.zeros(lib.Float, self.rays) for _ in self.carried]
+        absolute = None if self.absolute is None else dr.zeros(lib.Float, dr.width(self.absolute))
         dr.eval(g)
         slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
             for part, states in done:
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
-                    self._adjoint(g, channels, part, states, grads, carried, slopes)
+                    self._adjoint(g, channels, part, states, grads, carried, slopes, absolute)
         if slopes is not None:
             grads["features"] += lib.Float(slopes.view(-1))
         i = dr.arange(lib.UInt32, dr.width(grads["record"]) // RECORD)
@@ -318,6 +324,8 @@ class Compositor:
             dr.gather(lib.Float, record, i * RECORD + k) if k in used else dr.zeros(lib.Float, dr.width(i))
             for k in range(self.entries)
         ]
+        if absolute is not None:
+            grads["absolute"] = type(self.absolute)(absolute)
         return grads | ({"carried": carried} if carried else {})
 
     def _adjoint(
@@ -329,8 +337,9 @@ class Compositor:
         grads: dict,
         carried: list[Float],
         slopes: torch.Tensor | None,
+        absolute: Float | None,
     ) -> None:
-        """Add what a part with its final states gives to `grads`, `carried` and the `slopes` of features."""
+        """Add what a part with its final states gives to `grads`, `carried`, the `slopes` of features, `absolute`."""
         depth = "depth" in self.want and channels.color
         scalars = None
         cotangents = self._cotangents(g, channels, part)
@@ -347,14 +356,14 @@ class Compositor:
             scalar = None
             if scalars is not None:
                 scalar = lambda k, place, ok: dr.gather(self.lib.Float, scalars, part.slot(k, place), ok)  # noqa: E731
-            return Adjoint(self.model, channels, grads, finals, own, depth, part.reduction, scalar, table)
+            return Adjoint(self.model, channels, grads, finals, own, depth, part.reduction, scalar, table, absolute)
 
         part, finals, table = along_lists(self.lib, part, finals, 1, kernel)
         states = part.run(kernel(part, finals, table))
         for st, at, inside in zip(states, part.flat, part.inside, strict=True):
             for total, x in zip(carried, st["carried"], strict=True):
                 dr.scatter_add(total, x, at, inside)
-        dr.eval(grads, carried)
+        dr.eval(grads, carried, absolute)
 
     def _products(
         self, part: Part, weights: Weights, g: torch.Tensor, slopes: torch.Tensor
@@ -495,11 +504,12 @@ class Composite(dr.CustomOp):
         sh: Float | None,
         features: Float | None,
         carried: list[Float],
+        absolute: Float | None,
         keep: bool,
     ) -> dict:
         """The images, as Dr.Jit asks for them."""
         self.compositor = compositor
-        return compositor.forward(record, sh, features, carried, keep)
+        return compositor.forward(record, sh, features, carried, absolute, keep)
 
     def backward(self) -> None:
         """Gradients of the arguments from those of the images, in Dr.Jit's reverse mode."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 
@@ -74,6 +75,7 @@ class Adjoint:
         scalar: What the features add to s: `scalar(shared ray, place, is hit)`; None without features here. The
             cotangents then have `rest`, the sum of it over the ray's weights.
         table: Filled for these cotangents: says what there is of each hit, in whatever order they come.
+        absolute: (2 N) added to: |dL / d projected mean| of each hit, in x and y, of a model of the image plane.
     """
 
     def __init__(
@@ -87,8 +89,10 @@ class Adjoint:
         mode: dr.ReduceMode,
         scalar: Callable[[int, list, Mask], Float] | None = None,
         table: Table | None = None,
+        absolute: Float | None = None,
     ) -> None:
         self.m = model
+        self.absolute = absolute
         self.channels = channels
         self.grads = grads
         self.mode = mode
@@ -150,6 +154,7 @@ class Adjoint:
             total = lib.Float(0)
             hits = lib.Bool(False)
             carried = []
+            moved = [lib.Float(0)] * 2
             for number, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
                 g = self.cotangents[number]
                 ray = dataclasses.replace(ray, carried=[dr.detach(x) for x in ray.carried])  # leaves, too
@@ -165,7 +170,12 @@ class Adjoint:
                 else:
                     T, w, (behind,), ok = self.table.read(place, a0)
                     new = dict(st)
-                local = dr.fma(dr.fma(T, lib.Float(s), -behind), a, w * g["depth"] * depth)
+                slope = dr.fma(T, lib.Float(s), -behind)
+                local = dr.fma(slope, a, w * g["depth"] * depth)
+                if self.absolute is not None:
+                    moved = [
+                        m + dr.select(ok, x, 0) for m, x in zip(moved, self._moves(slope, fixed, ray), strict=True)
+                    ]
                 for v, c in zip(values, g["sum"], strict=True):
                     local = dr.fma(w * c, v, local)
                 total += dr.select(ok, local, 0)
@@ -175,12 +185,27 @@ class Adjoint:
             grads = {name: [dr.grad(x) for x in xs] for name, xs in fixed.items()}
             for new, own in zip(out, carried, strict=True):
                 new["carried"] = [x + dr.grad(y) for x, y in zip(new["carried"], own, strict=True)]
+        if self.absolute is not None:
+            for k, x in enumerate(moved):
+                dr.scatter_add(self.absolute, x, 2 * index + k, hits, mode=self.mode)
         for name, (stride, offset, count) in self.channels.layout(rays[0]).items():
             for k in range(count):
                 if name != "record" or k in self.slots:
                     at = index * stride + offset + k
                     dr.scatter_add(self.grads[name], grads[name][k], at, hits, mode=self.mode)
         return out
+
+    def _moves(self, slope: Float, fixed: dict, ray: Ray) -> list[Float]:
+        """|dL / d projected mean| of a hit with dL/da = `slope`; 0 where a clamp ends the derivative of its opacity."""
+        record = dr.detach(fixed["record"])  # numbers: the derivative is written out
+        s = self.m.s
+        free = self.m.lib.Bool(True)
+        if s.alpha_max < 1 and s.alpha_max_gradient == "zero":
+            rho2, _, u = self.m.response.along(record, ray, self.m.world)
+            free = self.m.response.opacity(record[self.m.strength] * dr.exp(-0.5 * rho2), u) < self.m.alpha_max
+        response: Any = self.m.response  # a model of the image plane: nobody else is asked
+        moves = response.moves(record, ray)
+        return [dr.select(free, abs(dr.detach(slope) * x), 0) for x in moves]  # as above
 
 
 class Tangent:

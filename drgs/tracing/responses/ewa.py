@@ -101,6 +101,12 @@ class Ewa(AlphaStrength):
             slopes.append(-a * dr.fma(c1, d1, c2 * d2))
         return [*slopes, a]
 
+    def moves(self, r: list[Float], ray: Ray) -> tuple[Float, Float]:
+        """d opacity / d projected mean, in x and y."""
+        c1, c2, _, _ = _offset(r, ray)
+        a = r[layout.ALPHA] * dr.exp(-0.5 * dr.fma(c1, c1, c2 * c2))
+        return a * c1 * r[layout.R11], a * dr.fma(c1, r[layout.R12], c2 * r[layout.R22])
+
     # -- once a tile -------------------------------------------------------------------------------------------------
 
     def may_hit(self, r: list[Float], patch: Patch, limit: Float) -> Mask:
