@@ -31,7 +31,7 @@ from drgs.lab import conventions
 from drgs.lab.dumps import Dump, cotangents, one_line
 from drgs.lab.image_errors import error_line
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import COLORS, PARAMETERS, POSE, raw_of, with_colors, with_pose
+from drgs.lab.raw import COLORS, PARAMETERS, POSES, raw_of, with_colors, with_pose
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
 from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
@@ -116,7 +116,7 @@ def crossval(
     Args:
         rasterizer: The rasterizer, as `drgs.lab.rasterizers.load_rasterizer` returns it.
         g: Gaussians of the scene.
-        cameras: Pinhole cameras of one image size.
+        cameras: Cameras of one image size; lenses are of presets along rays.
         preset: Preset that it claims to be, or `auto`: the one whose image needs least to be explained.
         fields: Settings that replace the preset's, `background` among them.
         tolerance: Relative L2 difference of gradients that agree; default 5e-4, and 5e-3 in float32.
@@ -125,7 +125,8 @@ def crossval(
         channels: Width of the plain colors whose gradient is compared, too; 0 for none.
         advance: Function that is called with each stage's name.
     Raises:
-        ValueError: If cameras differ in size, or the rasterizer's function fails.
+        ValueError: If cameras differ in size, have a lens that the preset does not draw, or the rasterizer's function
+            fails.
     Reference:
         The reference is `drgs.render` (float32, its errors in docs/numerics.md); for our own renderers it is the
         float64 oracle, on a crop of every view of a large scene (`crops`).
@@ -136,6 +137,15 @@ def crossval(
         raise ValueError("crossval: the scene must have Gaussians, got 0")
     presets = _presets(rasterizer, preset)
     starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
+    through_lens = any(c.is_distorted or _moves(c) for c in cameras)
+    if through_lens and not (along_rays := [start for start in starts if not start.settings.planar]):
+        raise ValueError(
+            f"crossval: cameras must be pinholes for preset {presets[0]}, a model of their image plane, got a lens or a "
+            "rolling shutter; use cameras that are undistorted, or a preset along rays (3dgut, exact, fast)"
+        )
+    elif through_lens:
+        presets = [name for name, start in zip(presets, starts, strict=True) if start in along_rays]
+        starts = along_rays
     background = starts[0].settings.background
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
     cameras = [c if c.name else dataclasses.replace(c, name=str(i)) for i, c in enumerate(cameras)]
@@ -146,7 +156,7 @@ def crossval(
         g, cameras, found_places = crops(g, cameras, starts[0].settings)
         places = [*found_places]
     dtype = getattr(rasterizer, "dtype", torch.float32)
-    raw = with_pose(raw_of(g))
+    raw = with_pose(raw_of(g), any(_moves(c) for c in cameras))
     signs = cotangents(cameras, seed)
     say("images")
     if isinstance(rasterizer, Dump):
@@ -176,7 +186,12 @@ def crossval(
         return model.near_ties(raw, cameras[view])
 
     found = conventions.find(
-        pictures[first], starts, lambda m: drawn_by(m, first)[0], lambda m: ties_of(m, first), _SETTLED[dtype]
+        pictures[first],
+        starts,
+        lambda m: drawn_by(m, first)[0],
+        lambda m: ties_of(m, first),
+        _SETTLED[dtype],
+        lambda m: m.suits(cameras[first], len(g)),
     )
     model = found.model
     claimed = next(name for name, start in zip(presets, starts, strict=True) if start == found.start)
@@ -192,7 +207,7 @@ def crossval(
         models |= {f"preset {claimed}": found.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
         comparison.views = with_errors(comparison, pictures, models, drawn_by)
-    not_offered = {} if POSE in comparison.groups else {POSE: "its image has no gradient of them"}
+    not_offered = {k: "its image has no gradient of them" for k in POSES if k in raw and k not in comparison.groups}
     if channels:
         wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
         comparison.groups |= wide
@@ -268,6 +283,11 @@ def _presets(rasterizer: Rasterizer | Dump, preset: str) -> list[str]:
         return [preset]
     own = getattr(rasterizer, "preset", None)
     return [own] if own else list(_STARTS)
+
+
+def _moves(camera: Camera) -> bool:
+    """Whether a camera has a pose at the end of its shutter, too."""
+    return getattr(camera, "shutter", "global") != "global"
 
 
 def _legal(name: str, fields: dict) -> dict:
@@ -379,7 +399,7 @@ def _wide_gradients(
         (0.0, 0.0, 0.0),
     ):
         return {}, "what it does to colors is a convention of three channels"
-    fixed = {name: x for name, x in case.raw.items() if name != POSE}
+    fixed = {name: x for name, x in case.raw.items() if name not in POSES}
     raw = with_colors(fixed, channels, seed)
     black = (0.0,) * channels
     u = cotangents([camera], seed, channels)

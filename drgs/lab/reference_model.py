@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,10 +22,27 @@ from drgs.lab.raw import COLORS, gaussians_of, image_of, posed
 from drgs.oracle import activate, float64, screen_rows
 from drgs.settings import RenderSettings
 
-__all__ = ["ORDERS", "ReferenceModel"]
+__all__ = ["DISTORTIONS", "ORDERS", "SHUTTERS", "ReferenceModel"]
 
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
+SHUTTERS = (
+    "global",
+    "rolling_top_to_bottom",
+    "rolling_left_to_right",
+    "rolling_bottom_to_top",
+    "rolling_right_to_left",
+)
+# What may be made of OpenCV's (k1, k2, p1, p2, k3, ...): name -> the coefficients that it amounts to.
+DISTORTIONS = {
+    "as given": lambda k1, k2, p1, p2, *rest: (k1, k2, p1, p2, *rest),
+    "ignored": lambda *given: (0.0,) * len(given),
+    "tangential terms negated": lambda k1, k2, p1, p2, *rest: (k1, k2, -p1, -p2, *rest),
+    "tangential terms swapped": lambda k1, k2, p1, p2, *rest: (k1, k2, p2, p1, *rest),
+    "no tangential terms": lambda k1, k2, p1, p2, *rest: (k1, k2, 0.0, 0.0, *rest),
+    "in the order k1, k2, k3, p1, p2": lambda k1, k2, p1, p2, *rest: (k1, k2, *_later(p1, p2, *rest)),
+}
 _WINDOW = 16  # pixels a side
+_ODD_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
 _NEAR = 2e-6  # share of the distance: some ten times what float32 loses where it computes a depth
 _EFFECT = 1e-5  # part of a weight: what moves less moves no gradient by what counts
 _COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants
@@ -53,6 +71,11 @@ class ReferenceModel:
         pixel_center: Coordinates of the center of column 0 and row 0, in pixels.
         flip: How the image is mirrored: `none`, `vertical`, `horizontal`.
         pose: How the camera matrix is read, `w2c` or `c2w`.
+        ray_direction: The direction of a ray in a Gaussian's own frame: `normalized`, or `not normalized`, where
+            rho^2 = |d' x o'|^2 is not divided by |d'|^2.
+        peaks: Whether peaks of Gaussians count `in front` of the ray's origin only, or `everywhere`.
+        distortion: What is made of the coefficients of a lens: `as given`, or one of the others of `DISTORTIONS`.
+        shutter: Direction of a rolling shutter: `as given`, or one of `SHUTTERS`.
     """
 
     settings: RenderSettings
@@ -70,6 +93,37 @@ class ReferenceModel:
     pixel_center: tuple[float, float] = (0.5, 0.5)
     flip: str = "none"
     pose: str = "w2c"
+    ray_direction: str = "normalized"
+    peaks: str = "in front"
+    distortion: str = "as given"
+    shutter: str = "as given"
+
+    def suits(self, camera: Camera, count: int) -> bool:
+        """Whether a view of so many Gaussians can be drawn of this model, and needs each of its conventions.
+
+        False where a simpler model draws the same: a lens is of cameras that have one, a shutter of those that move,
+        and where a ray meets a Gaussian of rays.
+        """
+        moves = getattr(camera, "shutter", "global") != "global"
+        if self.settings.planar and (camera.is_distorted or moves):
+            return False
+        if self.distortion != "as given" and not self._reads(camera):
+            return False
+        if self.shutter != "as given" and (not moves or self.shutter == camera.shutter):  # type: ignore[attr-defined]
+            return False
+        pairs = camera.width * camera.height * count
+        return not self._is_odd or (self.settings.response == "peak" and pairs <= _ODD_PAIRS and not moves)
+
+    @property
+    def _is_odd(self) -> bool:
+        """Whether a ray meets Gaussians as in none of our renderers: the oracle draws that, every pair of a view."""
+        return (self.ray_direction, self.peaks) != ("normalized", "in front")
+
+    def _reads(self, camera: Camera) -> bool:
+        """Whether the coefficients of this lens mean something else in this model."""
+        if camera.model == "opencv_fisheye":  # which has no tangential terms
+            return self.distortion in ("as given", "ignored") and any(camera.distortion)
+        return camera.is_distorted and _distorted(self.distortion, camera.distortion) != tuple(camera.distortion)
 
     def draw(self, raw: dict, camera: Camera, oracle: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
         """Image (H, W, 3) and alpha (H, W), differentiable by torch with respect to the raw parameters.
@@ -77,7 +131,7 @@ class ReferenceModel:
         Args:
             raw: Raw parameters by group, float64, and maybe a motion of the camera, `viewmats`. With `colors` (N, D)
                 instead of `sh` the image has D channels, on black.
-            camera: Pinhole camera.
+            camera: Camera, with a lens where the response is along rays.
             oracle: Whether the float64 oracle draws instead of the renderer.
         """
         rows: dict[int, list] = {}
@@ -111,10 +165,17 @@ class ReferenceModel:
         found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
         with torch.no_grad():  # marks of pixels have no derivative
             g, _ = gaussians_of(self._parameters(raw, camera))
-            for x, y, width, height in _windows(camera):
-                window = (x, y, width, height)
+            for x, y, width, height in _windows(camera, self._is_odd):
+                window = None if self._is_odd else (x, y, width, height)
                 out = reference.render(
-                    g, camera, self.settings, tolerance=_NEAR, window=window, exact_ties=True, effect=_EFFECT
+                    g,
+                    camera,
+                    self.settings,
+                    tolerance=_NEAR,
+                    window=window,
+                    exact_ties=True,
+                    effect=_EFFECT,
+                    **self._odd_ones(),
                 )
                 found[y : y + height, x : x + width] = out.ambiguous
         return self._flipped(found)
@@ -124,6 +185,10 @@ class ReferenceModel:
         camera = self._camera(posed(raw, camera))
         g, shift = gaussians_of(self._parameters(raw, camera))
         settings = self.settings.replace(background=(0.0, 0.0, 0.0)) if COLORS in raw else self.settings
+        if self._is_odd:
+            out = reference.render(g, camera, settings, **self._odd_ones())
+            yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
+            return
         if not oracle:
             out = render(g, camera, settings, outputs=())
             yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
@@ -131,6 +196,13 @@ class ReferenceModel:
         for x, y, width, height in _windows(camera):
             out = reference.render(g, camera, settings, window=(x, y, width, height))
             yield ((y, x), *self._developed(image_of(out, raw, shift), out.alpha))
+
+    def _odd_ones(self) -> dict[str, bool]:
+        """Arguments of the oracle for what our renderer does not have."""
+        return {
+            "plain_directions": self.ray_direction != "normalized",
+            "peaks_behind": self.peaks != "in front",
+        }
 
     def _developed(self, image: torch.Tensor, alpha: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Image and alpha, float64, with this model's channels and transfer function."""
@@ -161,7 +233,14 @@ class ReferenceModel:
         w2c = camera.w2c
         if self.pose == "c2w":
             w2c = torch.linalg.inv(w2c) if isinstance(w2c, torch.Tensor) else np.linalg.inv(w2c)
-        return dataclasses.replace(camera, K=K, w2c=w2c)
+        fields: dict[str, Any] = {"K": K, "w2c": w2c}
+        if self.distortion != "as given":
+            fields["distortion"] = _distorted(self.distortion, camera.distortion)
+        if self.shutter != "as given":
+            fields["shutter"] = self.shutter
+            if self.shutter == "global":
+                fields["w2c_end"] = None
+        return dataclasses.replace(camera, **fields)
 
     def _parameters(self, raw: dict, camera: Camera) -> dict:
         """The raw parameters that have this model's meaning in ours."""
@@ -213,8 +292,23 @@ class ReferenceModel:
         return ((color - 0.5) / Y_00)[:, None]  # the renderer clamps at 0 as ever
 
 
-def _windows(camera: Camera) -> Iterator[tuple[int, int, int, int]]:
+def _later(k3: float, p1: float, p2: float = 0.0, *rest: float) -> tuple[float, ...]:
+    """The coefficients behind k2 in OpenCV's order, of those that come as k3, p1, p2."""
+    return (p1, p2, k3, *rest)
+
+
+def _distorted(how: str, given: tuple[float, ...]) -> tuple[float, ...]:
+    """The coefficients of a lens as OpenCV reads them, of what a model makes of the given ones."""
+    if how == "as given" or not given:
+        return tuple(given)
+    return DISTORTIONS[how](*given)
+
+
+def _windows(camera: Camera, whole: bool = False) -> Iterator[tuple[int, int, int, int]]:
     """(x, y, width, height) of squares that cover the image: the oracle takes of each the Gaussians that it can see."""
+    if whole:
+        yield 0, 0, camera.width, camera.height
+        return
     for y in range(0, camera.height, _WINDOW):
         for x in range(0, camera.width, _WINDOW):
             yield x, y, min(_WINDOW, camera.width - x), min(_WINDOW, camera.height - y)
