@@ -22,12 +22,30 @@ from torch.nn.functional import normalize
 
 if __package__:  # `tests.torch_rays:...` from the root of a checkout
     from .torch_model import _harmonics, rotation_of
-    from .torch_rasterizer import Defect, _Backward, _Instead, _without_chain
+    from .torch_rasterizer import Defect, _Backward, _Instead, _without_chain, random_scene
 else:
     from torch_model import _harmonics, rotation_of
-    from torch_rasterizer import Defect, _Backward, _Instead, _without_chain
+    from torch_rasterizer import Defect, _Backward, _Instead, _without_chain, random_scene
 
-__all__ = ["CORRECT", "DEFECTS", "RayModel", "interpolated", "rasterization", "rasterizer", "turned"]
+__all__ = [
+    "CORRECT",
+    "DEFECTS",
+    "LENSES",
+    "RayModel",
+    "broken",
+    "interpolated",
+    "ray_scene",
+    "rasterization",
+    "rasterizer",
+    "turned",
+]
+
+# Model and coefficients in OpenCV's order, (k1, k2, p1, p2, k3) of the one, (k1, k2, k3, k4) of the other.
+LENSES = {
+    "pinhole": ("pinhole", ()),
+    "opencv": ("opencv", (0.08, 0.02, 0.03, -0.02, 0.01)),
+    "fisheye": ("opencv_fisheye", (0.02, -0.01, 0.003, 0.0005)),
+}
 
 _NEWTON = 40  # rounds at most; lenses that images are taken with need five
 
@@ -450,12 +468,12 @@ _TABLE = {
         "alpha is clamped at 0.95",
         {"alpha_max": 0.95},
     ),
-    "no_density_cutoff": (
+    "narrow_cutoff": (
         "convention",
         (),
         ("extent",),
-        "a Gaussian has no other cut-off than alpha",
-        {"density_min": 0.0},
+        "Gaussians are cut off at 2.5 standard deviations",
+        {"density_min": math.exp(-(2.5**2) / 2)},
     ),
     "stop_behind": (
         "convention",
@@ -477,3 +495,66 @@ DEFECTS = {
     name: Defect(kind, groups, words, what, name, fields)
     for name, (kind, groups, words, what, fields) in _TABLE.items()
 }
+
+
+def broken(name: str, right: RayModel = CORRECT) -> Callable:
+    """The rasterizer with that defect, one of `DEFECTS`, beside a right one of other constants."""
+    return rasterizer(dataclasses.replace(right, **DEFECTS[name].fields))
+
+
+def ray_scene(seed=0, n=40, width=32, height=24) -> dict:
+    """`torch_rasterizer.random_scene` with what shows on rays only: long Gaussians beside the eye, rays that end.
+
+    Four more Gaussians are long, faint and nearly in the plane of the camera, so that peaks lie behind the eye on some
+    rays, and three are opaque, one behind the other.
+    """
+    scene = random_scene(seed, n=n, width=width, height=height, degree=2)
+    make = torch.Generator().manual_seed(1000 + seed)
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=make, dtype=torch.float64)
+
+    angle = 2 * math.pi * (torch.arange(4) / 4 + 0.1)
+    beside = torch.stack([0.7 * angle.cos(), 0.7 * angle.sin(), uniform(0.05, 0.2, 4)], 1)
+    # Their long axis leans from the mean towards the view's axis behind the eye.
+    lean = normalize(torch.cat([-beside[:, :2], -uniform(0.5, 0.9, 4, 1)], 1), dim=1)
+    turn = _towards(lean)
+    center = uniform(-0.3, 0.3, 2)
+    stacked = torch.stack([torch.cat([depth * center, depth[None]]) for depth in torch.tensor([2.0, 2.3, 2.6]).double()])
+    w2c = scene["viewmat"]
+    quats = torch.cat([_product(_conjugate(_quaternion(w2c[:3, :3])), turn), torch.ones(3, 4)])
+    more = {
+        "means": (torch.cat([beside, stacked]) - w2c[:3, 3]) @ w2c[:3, :3],
+        "quats": quats,
+        "log_scales": torch.tensor([[-1.6, -1.6, 0.2]] * 4 + [[-0.7, -0.6, -0.8]] * 3).double(),
+        "logit_opacities": torch.tensor([-1.0] * 4 + [9.0] * 3).double(),
+        "sh": 0.4 * torch.randn(7, scene["sh"].shape[1], 3, generator=make, dtype=torch.float64),
+    }
+    rounded = {name: x.float().to(scene[name]) for name, x in more.items()}
+    return scene | {name: torch.cat([scene[name], x]) for name, x in rounded.items()}
+
+
+def _towards(axis):
+    """(P, 4) unit quaternions that turn the z axis to unit vectors (P, 3)."""
+    x, y, z = axis.unbind(1)
+    return normalize(torch.stack([1 + z, -y, x, torch.zeros_like(x)], 1), dim=1)
+
+
+def _quaternion(rotation):
+    """(4,) unit quaternion of a rotation by less than a third of a turn."""
+    w = (1 + rotation.diagonal().sum()).sqrt() / 2
+    part = torch.stack(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    return torch.cat([w[None], part / (4 * w)])
+
+
+def _conjugate(q):
+    return q * torch.tensor([1.0, -1, -1, -1]).to(q)
+
+
+def _product(a, b):
+    """Quaternion a (4,) times quaternions b (P, 4)."""
+    u, v = a[1:].expand(len(b), 3), b[:, 1:]
+    real = a[0] * b[:, :1] - (u * v).sum(1, keepdim=True)
+    return torch.cat([real, a[0] * v + b[:, :1] * u + torch.linalg.cross(u, v)], 1)

@@ -1,0 +1,200 @@
+"""Rasterizers that evaluate Gaussians along rays: right ones agree through every lens, broken ones are named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+import torch_rasterizer
+import torch_rays
+from torch_rays import DEFECTS, LENSES
+
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.lab.crossval import crossval
+from drgs.lab.rasterizers import function, load_rasterizer
+from drgs.lab.raw import PARAMETERS, POSES
+from drgs.settings import RenderSettings
+from drgs.testing import assert_matches
+
+BACKGROUND = (0.3, 0.6, 0.2)
+FIELDS = {"background": BACKGROUND}
+PRESET = RenderSettings.preset("3dgut")
+RIGHT = dataclasses.replace(
+    torch_rays.CORRECT, alpha_max=PRESET.alpha_max, density_min=math.exp(-(PRESET.extent**2) / 2)
+)
+# Of a convention or a lens: its name in the report, and what is found.
+CONVENTIONS = {
+    "tangential_sign": ("lens distortion", "tangential terms negated"),
+    "lens_ignored": ("lens distortion", "ignored"),
+    "plain_directions": ("ray direction in a Gaussian's frame", "not normalized"),
+    "peaks_behind": ("peaks that count", "everywhere"),
+    "sort_by_distance": ("depth sort key", "distance"),
+    "alpha_clamp": ("alpha_max", "0.95"),
+    "narrow_cutoff": ("extent", "2.5"),
+    "stop_behind": ("stop rule", "after"),
+}
+ROLLING = "shutter" in {field.name for field in dataclasses.fields(Camera)}
+
+
+def _made(seed=0, lens="pinhole"):
+    s = torch_rays.ray_scene(seed)
+    g = Gaussians(**{name: s[name].float() for name in PARAMETERS})
+    model, distortion = LENSES[lens]
+    size = {"width": s["width"], "height": s["height"]}
+    return g, Camera(K=s["K"].numpy(), w2c=s["viewmat"].numpy(), model=model, distortion=distortion, **size)
+
+
+def _end(w2c):
+    """The pose at the end of a shutter: a little turned and moved."""
+    turn = torch_rays.turned(torch.tensor([0.04, -0.06, 0.05]).to(w2c))
+    end = torch.eye(4).to(w2c)
+    end[:3, :3], end[:3, 3] = turn, torch.tensor([0.1, -0.05, 0.08]).to(w2c)
+    return end @ w2c
+
+
+def _checked(name, result):
+    """What is said of a defect is what it is, and nothing else is."""
+    defect, text = DEFECTS[name], "\n".join(result.lines())
+    if name in CONVENTIONS:
+        assert result.verdict == "other convention", text
+        assert [(c["name"], c["found"]) for c in result.report["conventions"]] == [CONVENTIONS[name]], text
+        assert all(row.verdict == "agreement" for row in result.groups.values()), text
+        return
+    assert not result.findings, text
+    verdict = "known deviation" if name == "clamp_passes_gradient" else "gradient bug"
+    assert result.verdict == verdict, text
+    found = {group for group, row in result.groups.items() if row.verdict == verdict and "channels" not in group}
+    if name == "clamp_passes_gradient":
+        assert "clamped alpha passes its gradient" in text
+        assert found <= {*defect.groups}, text
+    else:  # what is wrong for the weights is so for the colors of six channels
+        assert found == {*defect.groups, *(["colors"] if "sh" in defect.groups else [])}, text
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_right_one_agrees(lens, seed):
+    """Image and every gradient are the preset's, through every lens."""
+    g, camera = _made(seed, lens)
+    result = crossval(function(torch_rays.rasterizer(RIGHT), "right"), g, [camera], "3dgut", FIELDS)
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert not result.findings
+    assert result.report["image"]["after"] < 1e-6
+    assert max(row.relative for row in result.groups.values()) < 1e-5
+    assert {*result.groups} == {*PARAMETERS, "viewmats", "colors"}
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "opencv"])
+def test_it_is_recognized(lens):
+    """What it claims to be need not be said; of a lens, presets along rays are looked at only."""
+    g, camera = _made(1, lens)
+    result = crossval(function(torch_rays.rasterizer(RIGHT), "right"), g, [camera], "auto", FIELDS)
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert result.report["preset"] == "3dgut"
+
+
+@pytest.mark.parametrize(
+    ("name", "lens"),
+    [(name, "pinhole") for name, d in DEFECTS.items() if d.kind in ("gradient", "convention")]
+    + [(name, "opencv") for name, d in DEFECTS.items() if d.kind == "lens"]
+    + [("half_missing", "fisheye"), ("lens_ignored", "fisheye"), ("origin_detached", "opencv")],
+)
+def test_every_defect_is_named(name, lens):
+    """A kernel that is broken is a gradient bug in its own groups; another convention is called by its name."""
+    g, camera = _made(0, lens)
+    _checked(name, crossval(function(torch_rays.broken(name, RIGHT), name), g, [camera], "3dgut", FIELDS))
+
+
+@pytest.mark.parametrize("name", ["right", "shutter_end_detached"])
+def test_a_shutter_that_cameras_do_not_tell(name):
+    """A rolling shutter of the rasterizer's own is another model, and its gradient is judged by its own differences."""
+    g, camera = _made(0)
+    made = torch_rays.rasterizer(RIGHT) if name == "right" else torch_rays.broken(name, RIGHT)
+
+    def rolling(viewmats, **arguments):
+        ends = torch.stack([_end(w2c) for w2c in viewmats])
+        return made(viewmats=viewmats, viewmats_rs=ends, rolling_shutter="rolling_top_to_bottom", **arguments)
+
+    result = crossval(function(rolling, name), g, [camera], "3dgut", FIELDS, channels=0)
+    wrong = [group for group, row in result.groups.items() if row.verdict == "gradient bug"]
+    assert wrong == (["viewmats"] if name == "shutter_end_detached" else []), "\n".join(result.lines())
+    assert result.verdict == ("gradient bug" if wrong else "model difference")
+
+
+@pytest.mark.skipif(not ROLLING, reason="cameras have no rolling shutter here")
+@pytest.mark.parametrize("name", ["right", "shutter_end_detached"])
+@pytest.mark.parametrize("shutter", ["rolling_top_to_bottom", "rolling_right_to_left"])
+def test_a_shutter_of_the_camera(shutter, name):
+    """Both poses are compared; the direction of the shutter is a convention."""
+    g, camera = _made(0)
+    camera = dataclasses.replace(camera, shutter=shutter, w2c_end=_end(torch.tensor(camera.w2c)).numpy())
+    made = torch_rays.rasterizer(RIGHT) if name == "right" else torch_rays.broken(name, RIGHT)
+    result = crossval(function(made, name), g, [camera], "3dgut", FIELDS)
+    wrong = [group for group, row in result.groups.items() if row.verdict == "gradient bug"]
+    assert {*POSES} <= {*result.groups}
+    assert wrong == (["viewmats_rs"] if name != "right" else []), "\n".join(result.lines())
+    if name == "right":
+        assert result.verdict == "agreement", "\n".join(result.lines())
+
+        def reversed_one(rolling_shutter, **arguments):
+            return made(rolling_shutter="rolling_bottom_to_top", **arguments)
+
+        result = crossval(function(reversed_one, "reversed"), g, [camera], "3dgut", FIELDS)
+        assert [(c["name"], c["found"]) for c in result.report["conventions"]] == [("shutter", "rolling_bottom_to_top")]
+
+
+def test_projected_instead_of_along_rays():
+    """A rasterizer of the other kind than its preset is named so, and not by what follows from it."""
+    g, camera = _made(0)
+    made = function(torch_rasterizer.rasterization, "projected")
+    result = crossval(made, g, [camera], "3dgut", FIELDS, channels=0)
+    found = {c["name"]: (c["expected"], c["found"]) for c in result.report["conventions"]}
+    assert found["response"] == ("peak", "ewa"), "\n".join(result.lines())
+    assert not {"dilation", "culling", "field-of-view clamp", "extent"} & {*found}
+    assert result.report["image"]["after"] < 1e-5
+    assert result.verdict == "other convention"
+
+    result = crossval(function(torch_rays.rasterizer(RIGHT), "rays"), g, [camera], "gsplat", FIELDS, channels=0)
+    found = {c["name"]: c["found"] for c in result.report["conventions"]}
+    assert found["response"] == "peak", "\n".join(result.lines())
+    assert not {"dilation", "culling", "field-of-view clamp"} & {*found}
+    assert result.verdict == "other convention"
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_our_own_preset(lens):
+    """`drgs:3dgut` is held against the oracle through lenses, too."""
+    g, camera = _made(2, lens)
+    result = crossval(load_rasterizer("drgs:3dgut"), g, [camera], "auto", FIELDS)
+    assert result.verdict == "agreement", "\n".join(result.lines())
+    assert (result.report["preset"], result.report["reference"]) == ("3dgut", "float64 oracle")
+
+
+def test_assert_matches_along_rays():
+    """The helper for other people's tests takes scenes with a lens."""
+    g, camera = _made(1, "fisheye")
+    assert_matches(torch_rays.rasterizer(RIGHT), g, [camera], "3dgut", background=BACKGROUND)
+    with pytest.raises(AssertionError, match="log_scales: gradient bug"):
+        assert_matches(torch_rays.broken("scale_chain", RIGHT), g, [camera], "3dgut", background=BACKGROUND)
+
+
+def test_what_knows_no_lens_is_refused():
+    """One line says which argument is missing, or that the preset draws no lens."""
+    g, camera = _made(0, "opencv")
+
+    def only_pinholes(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds):
+        options = {"sh_degree": sh_degree, "backgrounds": backgrounds}
+        return torch_rasterizer.rasterization(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options
+        )
+
+    with pytest.raises(ValueError, match="must take camera_model for a camera of model 'opencv', does not") as error:
+        crossval(function(only_pinholes, "pinholes"), g, [camera], "3dgut", FIELDS)
+    assert "\n" not in str(error.value)
+    made = function(torch_rays.rasterizer(RIGHT), "right")
+    with pytest.raises(ValueError, match="must be pinholes for preset gsplat, a model of their image plane") as error:
+        crossval(made, g, [camera], "gsplat", FIELDS)
+    assert "\n" not in str(error.value)
