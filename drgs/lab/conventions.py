@@ -131,7 +131,7 @@ def find(
     for other in starts if odd or distance(model) > settled else ():
         # Beside a gross difference the nearest preset need not be the right one.
         moved = dataclasses.replace(model, settings=other.settings.replace(background=model.settings.background))
-        if other != start and distance(moved) < 2 * distance(start):
+        if other != start and suits(moved) and distance(moved) < 2 * distance(start):
             moved = _descend(distance, legal, moved, other, settled)
             few, many = (len(_different(*pair)) for pair in ((moved, other), (model, start)))
             near, far = max(distance(moved), settled), max(distance(model), settled)
@@ -141,7 +141,8 @@ def find(
     for field in _different(model, start):
         name, groups, _ = _VARIATIONS[field]
         usual = _usual(model, start, field)
-        without = distance(_changed(model, field, usual, start))
+        changed = _changed(model, field, usual, start)
+        without = distance(changed if suits(changed) else start)
         findings.append(Finding(name, _text(usual), _text(_get(model, field)), without, distance(model), groups))
     return Found(start, model, distance(start), distance(model), findings)
 
@@ -188,7 +189,7 @@ def _descend(
         model = _refined(distance, new, field, settled) if field in _FITTED else new
     for field in _different(model, start):
         without = _changed(model, field, _usual(model, start, field), start)
-        if distance(without) <= 1.05 * max(distance(model), settled):
+        if legal(without, field) and distance(without) <= 1.05 * max(distance(model), settled):
             model = without
     return model
 
