@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import sys
+import types
 
+import numpy as np
 import pytest
 import torch
 import torch_rasterizer
 import torch_rays
+from test_data import save, write_image
 from torch_rays import DEFECTS, LENSES
 
-from drgs.cameras import Camera
+from drgs import cli
+from drgs.cameras import Camera, c2w_to_opengl
 from drgs.ellipsoids import Gaussians
+from drgs.files import save_ply
+from drgs.lab import dumps
 from drgs.lab.crossval import crossval
+from drgs.lab.ladder import ladder
 from drgs.lab.rasterizers import function, load_rasterizer
 from drgs.lab.raw import PARAMETERS, POSES
 from drgs.settings import RenderSettings
@@ -47,12 +56,15 @@ def _made(seed=0, lens="pinhole"):
     return g, Camera(K=s["K"].numpy(), w2c=s["viewmat"].numpy(), model=model, distortion=distortion, **size)
 
 
-def _end(w2c):
-    """The pose at the end of a shutter: a little turned and moved."""
-    turn = torch_rays.turned(torch.tensor([0.04, -0.06, 0.05]).to(w2c))
-    end = torch.eye(4).to(w2c)
-    end[:3, :3], end[:3, 3] = turn, torch.tensor([0.1, -0.05, 0.08]).to(w2c)
-    return end @ w2c
+def write_capture(folder, camera):
+    """A transforms.json data set of one view, with the camera's lens."""
+    names = ("k1", "k2", "p1", "p2", "k3") if camera.model == "opencv" else ("k1", "k2", "k3", "k4")
+    K = camera.K
+    write_image(folder / "images" / "a.png", np.zeros((camera.height, camera.width, 3), np.uint8))
+    frame = {"file_path": "images/a.png", "transform_matrix": c2w_to_opengl(camera.c2w).tolist()}
+    data = {"camera_model": camera.model.upper(), **dict(zip(names, camera.distortion, strict=True))}
+    data |= {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": camera.width, "h": camera.height}
+    save(folder, data | {"frames": [frame]})
 
 
 def _checked(name, result):
@@ -113,12 +125,7 @@ def test_a_shutter_that_cameras_do_not_tell(name):
     """A rolling shutter of the rasterizer's own is another model, and its gradient is judged by its own differences."""
     g, camera = _made(0)
     made = torch_rays.rasterizer(RIGHT) if name == "right" else torch_rays.broken(name, RIGHT)
-
-    def rolling(viewmats, **arguments):
-        ends = torch.stack([_end(w2c) for w2c in viewmats])
-        return made(viewmats=viewmats, viewmats_rs=ends, rolling_shutter="rolling_top_to_bottom", **arguments)
-
-    result = crossval(function(rolling, name), g, [camera], "3dgut", FIELDS, channels=0)
+    result = crossval(function(torch_rays.rolling(made), name), g, [camera], "3dgut", FIELDS, channels=0)
     wrong = [group for group, row in result.groups.items() if row.verdict == "gradient bug"]
     assert wrong == (["viewmats"] if name == "shutter_end_detached" else []), "\n".join(result.lines())
     assert result.verdict == ("gradient bug" if wrong else "model difference")
@@ -130,7 +137,7 @@ def test_a_shutter_that_cameras_do_not_tell(name):
 def test_a_shutter_of_the_camera(shutter, name):
     """Both poses are compared; the direction of the shutter is a convention."""
     g, camera = _made(0)
-    camera = dataclasses.replace(camera, shutter=shutter, w2c_end=_end(torch.tensor(camera.w2c)).numpy())
+    camera = dataclasses.replace(camera, shutter=shutter, w2c_end=torch_rays.end_of(torch.tensor(camera.w2c)).numpy())
     made = torch_rays.rasterizer(RIGHT) if name == "right" else torch_rays.broken(name, RIGHT)
     result = crossval(function(made, name), g, [camera], "3dgut", FIELDS)
     wrong = [group for group, row in result.groups.items() if row.verdict == "gradient bug"]
@@ -197,4 +204,74 @@ def test_what_knows_no_lens_is_refused():
     made = function(torch_rays.rasterizer(RIGHT), "right")
     with pytest.raises(ValueError, match="must be pinholes for preset gsplat, a model of their image plane") as error:
         crossval(made, g, [camera], "gsplat", FIELDS)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("lens", ["opencv", "fisheye"])
+def test_command_through_a_lens(tmp_path, lens):
+    """With a preset along rays cameras keep their lens, without one they are pinholes as ever."""
+    g, camera = _made(0, lens)
+    save_ply(g, tmp_path / "scene.ply")
+    write_capture(tmp_path / "capture", camera)
+    seen = []
+
+    def rasterization(means, camera_model="pinhole", radial_coeffs=None, with_eval3d=False, **arguments):
+        """Asked for one Gaussian first."""
+        seen.append((camera_model, None if radial_coeffs is None else radial_coeffs.shape[1], with_eval3d))
+        options = {"camera_model": camera_model, "radial_coeffs": radial_coeffs}
+        return torch_rays.rasterizer(RIGHT)(means=means, **options, **arguments)
+
+    module = types.ModuleType("taken_down")
+    module.rasterization = rasterization
+    sys.modules["taken_down"] = module
+    command = ["crossval", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "capture"), "--quiet"]
+    command += ["--no-ladder", "--rasterizer", "taken_down:rasterization", "--set", "background=0.3,0.6,0.2"]
+    try:
+        out = tmp_path / "rays"
+        assert cli.main([*command, "--preset", "3dgut", "--strict", "-o", str(out)]) == 0
+        assert set(seen[1:]) == {("fisheye", 4, True) if lens == "fisheye" else ("pinhole", 6, True)}
+        assert json.loads((out / "crossval.json").read_text())["verdict"] == "agreement"
+        seen.clear()
+        assert cli.main([*command, "-o", str(tmp_path / "auto")]) == 0
+        assert set(seen) == {("pinhole", None, False)}
+    finally:
+        del sys.modules["taken_down"]
+
+
+def test_the_ladder_goes_through_a_lens():
+    """From `3dgut` to `exact`, and from `gsplat` with `3dgut` on the way, the image's shares sum to one."""
+    g, camera = _made(0, "opencv")
+    found = ladder(g, [camera], PRESET, crop=0, gradients=False)["image"]
+    assert "EWA" not in {row["rung"] for row in found["forward"]}
+    assert sum(row["share"] for row in found["forward"]) == pytest.approx(1, abs=1e-9)
+    start = RenderSettings.preset("gsplat")
+    asides = ladder(g, [camera.undistorted()], start, crop=0, gradients=False)["asides"]
+    assert 0 < {row["rung"]: row["share"] for row in asides}["3dgut"] < 2
+
+
+def test_a_lens_is_not_exported(tmp_path):
+    """What is written for another machine is pinholes, and a lens is refused in one line."""
+    g, camera = _made(0, "opencv")
+    with pytest.raises(ValueError, match="cameras that are exported must be pinholes, got a lens; undistort them"):
+        dumps.export(tmp_path / "scene.npz", g, [camera], BACKGROUND, 0)
+    save_ply(g, tmp_path / "scene.ply")
+    write_capture(tmp_path / "capture", camera)
+    command = ["crossval", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "capture"), "--quiet"]
+    assert cli.main([*command, "--preset", "3dgut", "--export", str(tmp_path / "scene.npz")]) == 0
+
+
+def test_an_image_that_shows_nothing():
+    """Where the preset shows Gaussians and the rasterizer none, the rasterizer is told so, and not the cameras."""
+    # In a world a thousand times smaller, directions that are not normalized leave nothing of any Gaussian.
+    g, camera = _made(0)
+    w2c = np.array(camera.w2c)
+    w2c[:3, 3] *= 1e-3
+    g = g.replace(means=g.means * 1e-3, log_scales=g.log_scales + math.log(1e-3))
+    camera = dataclasses.replace(camera, w2c=w2c)
+
+    def nothing(**arguments):
+        return torch_rays.broken("plain_directions", RIGHT)(**arguments, near_plane=0.0)
+
+    with pytest.raises(ValueError, match="shows the background alone where preset 3dgut shows some") as error:
+        crossval(function(nothing, "nothing"), g, [camera], "3dgut", FIELDS | {"near": 0.0})
     assert "\n" not in str(error.value)

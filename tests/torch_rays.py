@@ -1,4 +1,4 @@
-"""A rasterizer in plain torch that evaluates Gaussians along rays, as 3DGUT does, and copies that are broken on purpose.
+"""A rasterizer in plain torch that evaluates Gaussians along rays, as 3DGUT does, and copies broken on purpose.
 
 Written from the equations, from nothing of this package: it imports torch, math and the helpers of torch_model.py. With
 o, d the origin and unit direction of a pixel's ray, gro = S^-1 R^T (o - mu), grd = S^-1 R^T d / |S^-1 R^T d|, a
@@ -32,14 +32,18 @@ __all__ = [
     "DEFECTS",
     "LENSES",
     "RayModel",
+    "SHUTTERS",
     "broken",
+    "end_of",
     "interpolated",
     "ray_scene",
     "rasterization",
     "rasterizer",
+    "rolling",
     "turned",
 ]
 
+SHUTTERS = ("rolling_top_to_bottom", "rolling_left_to_right", "rolling_bottom_to_top", "rolling_right_to_left")
 # Model and coefficients in OpenCV's order, (k1, k2, p1, p2, k3) of the one, (k1, k2, k3, k4) of the other.
 LENSES = {
     "pinhole": ("pinhole", ()),
@@ -188,7 +192,7 @@ class RayModel:
             if self.keeps_last:  # the hit that ends a ray is composited
                 ended = torch.cat([torch.zeros_like(ended[:, :1]), ended[:, :-1]], 1)
         alpha = torch.where(ended, 0, alpha)
-        left = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], 1), 1)
+        left = torch.cumprod(torch.cat([alpha.new_ones(len(alpha), 1), 1 - alpha], 1), 1)
         return self.gathered(alpha, left[:, :-1], rgb) + left[:, -1:] * background, left[:, -1]
 
 
@@ -502,6 +506,24 @@ def broken(name: str, right: RayModel = CORRECT) -> Callable:
     return rasterizer(dataclasses.replace(right, **DEFECTS[name].fields))
 
 
+def end_of(w2c):
+    """A pose (4, 4) at the end of a shutter: a little turned and moved."""
+    turn = torch.eye(4).to(w2c)
+    turn[:3, :3] = turned(torch.tensor([0.04, -0.06, 0.05]).to(w2c))
+    turn[:3, 3] = torch.tensor([0.1, -0.05, 0.08]).to(w2c)
+    return turn @ w2c
+
+
+def rolling(function: Callable, shutter: str = SHUTTERS[0]) -> Callable:
+    """A rasterizer that is not told of a shutter and has one: its poses end at `end_of` those that it is given."""
+
+    def rasterize(viewmats, **arguments):
+        ends = torch.stack([end_of(w2c) for w2c in viewmats])
+        return function(viewmats=viewmats, viewmats_rs=ends, rolling_shutter=shutter, **arguments)
+
+    return rasterize
+
+
 def ray_scene(seed=0, n=40, width=32, height=24) -> dict:
     """`torch_rasterizer.random_scene` with what shows on rays only: long Gaussians beside the eye, rays that end.
 
@@ -520,7 +542,9 @@ def ray_scene(seed=0, n=40, width=32, height=24) -> dict:
     lean = normalize(torch.cat([-beside[:, :2], -uniform(0.5, 0.9, 4, 1)], 1), dim=1)
     turn = _towards(lean)
     center = uniform(-0.3, 0.3, 2)
-    stacked = torch.stack([torch.cat([depth * center, depth[None]]) for depth in torch.tensor([2.0, 2.3, 2.6]).double()])
+    stacked = torch.stack(
+        [torch.cat([depth * center, depth[None]]) for depth in torch.tensor([2.0, 2.3, 2.6]).double()]
+    )
     w2c = scene["viewmat"]
     quats = torch.cat([_product(_conjugate(_quaternion(w2c[:3, :3])), turn), torch.ones(3, 4)])
     more = {

@@ -68,9 +68,7 @@ def run(args: Crossval) -> int:
 
 
 def _along_rays(args: Crossval) -> bool:
-    """Whether the preset that is compared with is said to evaluate Gaussians along rays; of a dump, which is of pinholes,
-    it does not matter.
-    """
+    """Whether the preset that is compared with is said to evaluate Gaussians along rays; a dump is of pinholes."""
     own = args.rasterizer.removeprefix("drgs:") if args.rasterizer.startswith("drgs:") else "auto"
     name = own if own in PRESETS and args.preset == "auto" else args.preset
     if name == "auto" or args.rasterizer.endswith(dumps.SUFFIXES):

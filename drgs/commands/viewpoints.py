@@ -191,9 +191,7 @@ def drawn_views(
     return [_named(view) for view in views], f"{Path(text)} ({args.split})"
 
 
-def seen_views(
-    args: Crossval | Query | Tradeoff, given: SceneInput, lenses: bool = False
-) -> tuple[list[Camera], str]:
+def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput, lenses: bool = False) -> tuple[list[Camera], str]:
     """At most `--limit` cameras of `--cameras`, as large as they are drawn; and where they come from in words.
 
     Args:

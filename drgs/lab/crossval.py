@@ -138,14 +138,14 @@ def crossval(
     presets = _presets(rasterizer, preset)
     starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
     through_lens = any(c.is_distorted or _moves(c) for c in cameras)
-    if through_lens and not (along_rays := [start for start in starts if not start.settings.planar]):
-        raise ValueError(
-            f"crossval: cameras must be pinholes for preset {presets[0]}, a model of their image plane, got a lens or a "
-            "rolling shutter; use cameras that are undistorted, or a preset along rays (3dgut, exact, fast)"
-        )
-    elif through_lens:
-        presets = [name for name, start in zip(presets, starts, strict=True) if start in along_rays]
-        starts = along_rays
+    if through_lens:
+        if all(start.settings.planar for start in starts):
+            raise ValueError(
+                f"crossval: cameras must be pinholes for preset {presets[0]}, a model of their image plane, got a lens "
+                "or a rolling shutter; use undistorted cameras, or a preset along rays (3dgut, exact, fast)"
+            )
+        drawable = [pair for pair in zip(presets, starts, strict=True) if not pair[1].settings.planar]
+        presets, starts = [name for name, _ in drawable], [start for _, start in drawable]
     background = starts[0].settings.background
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
     cameras = [c if c.name else dataclasses.replace(c, name=str(i)) for i, c in enumerate(cameras)]
@@ -197,6 +197,11 @@ def crossval(
     claimed = next(name for name, start in zip(presets, starts, strict=True) if start == found.start)
     drawn = [drawn_by(model, view) for view in range(len(cameras))]
     if not any(bool(alpha.any()) for _, alpha in drawn):
+        if any(bool(drawn_by(found.start, view)[1].any()) for view in range(len(cameras))):
+            raise ValueError(
+                f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
+                "shows some; correct the rasterizer"
+            )
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
     comparison = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))

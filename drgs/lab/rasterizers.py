@@ -177,8 +177,8 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
             options |= {"with_ut": True, "with_eval3d": True}
         if missing := [] if open_ended else [k for k in lens if k not in accepted]:
             raise ValueError(
-                f"--rasterizer {name}: must take {missing[0]} for a camera of model {camera.model!r}, does not; compare "
-                "it on undistorted cameras"
+                f"--rasterizer {name}: must take {missing[0]} for a camera of model {camera.model!r}, does not; "
+                "compare it on undistorted cameras"
             )
         given = {k: v for k, v in options.items() if open_ended or k in accepted} | lens
         try:
