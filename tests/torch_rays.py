@@ -448,7 +448,7 @@ _TABLE = {
         "convention",
         (),
         ("direction",),
-        "directions are not normalized in the Gaussian's frame: exp(-|d x o|^2 / 2) without a division by |d|^2",
+        "directions are not normalized in the Gaussian's frame: exp(-(d x o)^2 / 2) without a division by d^2",
         {"local_direction": _same},
     ),
     "peaks_behind": (
