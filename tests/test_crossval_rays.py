@@ -24,7 +24,7 @@ from drgs.lab import dumps
 from drgs.lab.crossval import crossval
 from drgs.lab.ladder import ladder
 from drgs.lab.rasterizers import function, load_rasterizer
-from drgs.lab.raw import PARAMETERS, POSES
+from drgs.lab.raw import PARAMETERS, MOTIONS
 from drgs.settings import RenderSettings
 from drgs.testing import assert_matches
 
@@ -141,7 +141,7 @@ def test_a_shutter_of_the_camera(shutter, name):
     made = torch_rays.rasterizer(RIGHT) if name == "right" else torch_rays.broken(name, RIGHT)
     result = crossval(function(made, name), g, [camera], "3dgut", FIELDS)
     wrong = [group for group, row in result.groups.items() if row.verdict == "gradient bug"]
-    assert {*POSES} <= {*result.groups}
+    assert {*MOTIONS} <= {*result.groups}
     assert wrong == (["viewmats_rs"] if name != "right" else []), "\n".join(result.lines())
     if name == "right":
         assert result.verdict == "agreement", "\n".join(result.lines())

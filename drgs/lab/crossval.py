@@ -31,7 +31,7 @@ from drgs.lab import conventions
 from drgs.lab.dumps import Dump, cotangents, one_line
 from drgs.lab.image_errors import error_line
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import COLORS, PARAMETERS, POSES, raw_of, with_colors, with_pose
+from drgs.lab.raw import COLORS, PARAMETERS, MOTIONS, raw_of, with_colors, with_pose
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
 from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
@@ -212,7 +212,7 @@ def crossval(
         models |= {f"preset {claimed}": found.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
         comparison.views = with_errors(comparison, pictures, models, drawn_by)
-    not_offered = {k: "its image has no gradient of them" for k in POSES if k in raw and k not in comparison.groups}
+    not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
     if channels:
         wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
         comparison.groups |= wide
@@ -404,7 +404,7 @@ def _wide_gradients(
         (0.0, 0.0, 0.0),
     ):
         return {}, "what it does to colors is a convention of three channels"
-    fixed = {name: x for name, x in case.raw.items() if name not in POSES}
+    fixed = {name: x for name, x in case.raw.items() if name not in MOTIONS}
     raw = with_colors(fixed, channels, seed)
     black = (0.0,) * channels
     u = cotangents([camera], seed, channels)

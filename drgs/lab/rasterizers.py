@@ -22,7 +22,7 @@ from drgs.ellipsoids import Gaussians, sh_degree_of
 from drgs.guards.imports import imported_function
 from drgs.integrator import render
 from drgs.lab.dumps import SUFFIXES, Dump, one_line, read_dump
-from drgs.lab.raw import COLORS, POSES, gaussians_of, image_of, posed
+from drgs.lab.raw import COLORS, MOTIONS, gaussians_of, image_of, posed
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
 
@@ -70,11 +70,11 @@ class Rasterizer:
             loss = (image * cotangent.to(image)).sum()
             found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
         except Exception:
-            moving = [name for name in POSES if name in raw]
+            moving = [name for name in MOTIONS if name in raw]
             if not moving:
                 raise
             # It may make an array of the pose, or refuse one that wants a gradient: the others are asked for alone.
-            fixed = {name: x for name, x in raw.items() if name not in POSES}
+            fixed = {name: x for name, x in raw.items() if name not in MOTIONS}
             return {**self.gradient(fixed, camera, background, cotangent), **dict.fromkeys(moving)}
         # Gradients are numbers from here on; a function may have asked for a graph of them.
         return {name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, found, strict=True)}

@@ -16,7 +16,7 @@ from drgs.splats import color_of
 __all__ = [
     "COLORS",
     "POSE",
-    "POSES",
+    "MOTIONS",
     "POSE_END",
     "PARAMETERS",
     "depth_of",
@@ -31,7 +31,7 @@ __all__ = [
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # raw, as crossval and the ladder compare them
 POSE = "viewmats"  # (6,) of one view, 0: see `posed`
 POSE_END = "viewmats_rs"  # (6,) of the pose at the end of a rolling shutter, likewise
-POSES = (POSE, POSE_END)
+MOTIONS = (POSE, POSE_END)
 COLORS = "colors"  # (N, D) in place of `sh`
 
 
@@ -45,7 +45,7 @@ def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
 
 def with_pose(raw: dict[str, torch.Tensor], shutter: bool = False) -> dict[str, torch.Tensor]:
     """Raw parameters together with the motion of a view, or of both of its poses if it has two, which is none."""
-    return {**raw, **{name: torch.zeros(6, dtype=torch.float64) for name in POSES[: 1 + shutter]}}
+    return {**raw, **{name: torch.zeros(6, dtype=torch.float64) for name in MOTIONS[: 1 + shutter]}}
 
 
 def with_colors(raw: dict[str, torch.Tensor], channels: int, seed: int) -> dict[str, torch.Tensor]:
@@ -96,7 +96,7 @@ def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
 
 def gaussians_of(raw: dict[str, torch.Tensor]) -> tuple[Gaussians, float]:
     """Gaussians with SH, or with colors of any width, and what was added to the first three channels of those."""
-    fields = {name: x for name, x in raw.items() if name not in (*POSES, COLORS)}
+    fields = {name: x for name, x in raw.items() if name not in (*MOTIONS, COLORS)}
     if COLORS not in raw:
         return Gaussians(**fields), 0.0
     sh, features, shift = color_of(raw[COLORS])

@@ -18,7 +18,7 @@ from drgs.lab.differences import Differences, central
 from drgs.lab.dumps import Dump
 from drgs.lab.image_errors import OFF, Pattern, error_row, pattern_of
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import POSES
+from drgs.lab.raw import MOTIONS
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import AlphaRow, GroupRow, OwnRow, ViewRow, WorstGaussian, WorstPixel
 
@@ -84,7 +84,7 @@ class Case:
 
 def _joined(views: list[dict]) -> dict:
     """Gradients of parameters that views share are added, those of their poses are not."""
-    join = dict.fromkeys(POSES, torch.stack)
+    join = dict.fromkeys(MOTIONS, torch.stack)
     return {
         name: None if x is None else join.get(name, sum)([part[name] for part in views]) for name, x in views[0].items()
     }
@@ -136,7 +136,7 @@ def compared(
         case.say("gradients")
         theirs = case.theirs(u)
         ours = case.ours(model, u)
-        offered = [name for name, x in theirs.items() if name not in POSES or x is not None]
+        offered = [name for name, x in theirs.items() if name not in MOTIONS or x is not None]
         groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in offered}
         found = Compared(views, agrees, u, theirs, groups, ties, counted)
         if ties.any() or (agrees and all(row.verdict for row in groups.values())):
