@@ -107,8 +107,8 @@ def render(
         exact_ties: Keys that are equal make a pixel `ambiguous`, too: a renderer that rounds in another way, or sorts
             without the index, may have either order.
         effect: The change of a weight that matters to `ambiguous`.
-        plain_directions: Whether rho^2 is |o' x d'|^2, not divided by |d'|^2, as of a rasterizer that does not normalize d'
-            (`peak` without a window only).
+        plain_directions: Whether rho^2 is |o' x d'|^2, not divided by |d'|^2, as of a rasterizer that does not
+            normalize d' (`peak` without a window only).
         peaks_behind: Whether peaks behind the origin of a ray count, too (`peak` only).
     Returns:
         `ReferenceOutput` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.

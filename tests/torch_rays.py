@@ -77,6 +77,7 @@ class RayModel:
     radial: Callable = _same
     tangential: Callable = _same
     behind: bool = False
+    between: bool = True
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     density_min: float = 0.0113
@@ -165,8 +166,13 @@ class RayModel:
     def _colors(self, means, colors, first, last, degree):
         if degree is None:
             return colors
-        centers = [torch.linalg.inv(w2c)[:3, 3] for w2c in (first, last) if w2c is not None]
-        basis = _harmonics(normalize(means - sum(centers) / len(centers), dim=-1), degree)
+        if last is None or self.between:  # as in gsplat
+            centers = [torch.linalg.inv(w2c)[:3, 3] for w2c in (first, last) if w2c is not None]
+            center = sum(centers) / len(centers)
+        else:
+            turn, shift = (x[0] for x in interpolated(first, last, torch.full((1,), 0.5).to(first)))
+            center = -turn.T @ shift
+        basis = _harmonics(normalize(means - center, dim=-1), degree)
         return ((basis[:, :, None] * colors[:, : basis.shape[1]]).sum(1) + 0.5).clamp(min=0)
 
     def _alphas(self, o, d, means, quats, scales, opacities):
@@ -478,6 +484,13 @@ _TABLE = {
         ("extent",),
         "Gaussians are cut off at 2.5 standard deviations",
         {"density_min": math.exp(-(2.5**2) / 2)},
+    ),
+    "eye_between_poses": (
+        "shutter",
+        (),
+        ("direction",),
+        "colors are seen from between the centers of both poses of a shutter, as in gsplat, not from its middle pose",
+        {"between": True},
     ),
     "stop_behind": (
         "convention",

@@ -9,8 +9,9 @@ from typing import Any, get_args, get_type_hints
 
 import torch
 
-from drgs.lab.reference_model import DISTORTIONS, ORDERS, SHUTTERS, ReferenceModel
+from drgs.lab.reference_model import BETWEEN, DISTORTIONS, ORDERS, ReferenceModel
 from drgs.settings import RenderSettings
+from drgs.shutters import SHUTTERS
 
 __all__ = ["LEAST", "Finding", "Found", "find"]
 
@@ -56,7 +57,7 @@ _VARIATIONS: dict[str, tuple[str, tuple, tuple]] = {
     "pose": ("camera matrix", _ALL, ("w2c", "c2w")),
     "channels": ("channel order", ("sh",), (*ORDERS, *(f"{order}, not behind" for order in ORDERS[1:]))),
     "transfer": ("transfer function", ("sh",), ("none", "sRGB to linear", "sRGB to linear, not behind")),
-    "direction": ("SH direction", ("means", "sh"), ("to the mean", "to the camera", "camera frame")),
+    "direction": ("SH direction", ("means", "sh"), ("to the mean", "to the camera", "camera frame", BETWEEN)),
     "sh_direction": ("SH direction", ("means", "sh"), ("gaussian", "ray")),
     "sh_degree": ("SH bands", ("sh",), (0, 1, 2, 3)),
     "sh_sign": ("SH sign", ("sh",), ("none", "odd m", "band 1", "band 2", "band 3")),

@@ -31,7 +31,7 @@ from drgs.lab import conventions
 from drgs.lab.dumps import Dump, cotangents, one_line
 from drgs.lab.image_errors import error_line
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import COLORS, PARAMETERS, MOTIONS, raw_of, with_colors, with_pose
+from drgs.lab.raw import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors, with_pose
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
 from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
@@ -137,7 +137,7 @@ def crossval(
         raise ValueError("crossval: the scene must have Gaussians, got 0")
     presets = _presets(rasterizer, preset)
     starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
-    through_lens = any(c.is_distorted or _moves(c) for c in cameras)
+    through_lens = any(c.is_distorted or c.is_rolling for c in cameras)
     if through_lens:
         if all(start.settings.planar for start in starts):
             raise ValueError(
@@ -156,7 +156,7 @@ def crossval(
         g, cameras, found_places = crops(g, cameras, starts[0].settings)
         places = [*found_places]
     dtype = getattr(rasterizer, "dtype", torch.float32)
-    raw = with_pose(raw_of(g), any(_moves(c) for c in cameras))
+    raw = with_pose(raw_of(g), any(c.is_rolling for c in cameras))
     signs = cotangents(cameras, seed)
     say("images")
     if isinstance(rasterizer, Dump):
@@ -288,11 +288,6 @@ def _presets(rasterizer: Rasterizer | Dump, preset: str) -> list[str]:
         return [preset]
     own = getattr(rasterizer, "preset", None)
     return [own] if own else list(_STARTS)
-
-
-def _moves(camera: Camera) -> bool:
-    """Whether a camera has a pose at the end of its shutter, too."""
-    return getattr(camera, "shutter", "global") != "global"
 
 
 def _legal(name: str, fields: dict) -> dict:

@@ -80,10 +80,12 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
     `K` (C,3,3), `width`, `height`, `background` (3,), `cotangent` (C,H,W,3).
 
     Raises:
-        ValueError: If a camera has a lens.
+        ValueError: If a camera has a lens or a rolling shutter.
     """
-    if any(camera.is_distorted for camera in cameras):
-        raise ValueError("crossval: cameras that are exported must be pinholes, got a lens; undistort them")
+    if any(camera.is_distorted or camera.is_rolling for camera in cameras):
+        raise ValueError(
+            "crossval: cameras that are exported must be pinholes, got a lens or a rolling shutter; undistort them"
+        )
     arrays = scene_arrays(g, cameras, background)
     arrays["cotangent"] = cotangents(cameras, seed).float().numpy()
     arrays[_EXPORT] = _signature(arrays)

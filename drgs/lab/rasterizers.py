@@ -206,12 +206,11 @@ def _lens_arguments(camera: Camera, like: dict, accepted: Mapping[str, inspect.P
             "radial_coeffs": torch.tensor([radial], **like),
             "tangential_coeffs": torch.tensor([[p1, p2]], **like),
         }
-    shutter = getattr(camera, "shutter", "global")
-    if shutter != "global":
+    if camera.is_rolling:
         # gsplat's is a member of an enumeration, whose type its default has.
         kinds = type(accepted["rolling_shutter"].default) if "rolling_shutter" in accepted else str
-        kind = kinds[shutter.upper()] if issubclass(kinds, enum.Enum) else shutter
-        found |= {"rolling_shutter": kind, "viewmats_rs": float64(camera.w2c_end).to(**like)[None]}  # type: ignore[attr-defined]
+        kind = kinds[camera.shutter.upper()] if issubclass(kinds, enum.Enum) else camera.shutter
+        found |= {"rolling_shutter": kind, "viewmats_rs": float64(camera.w2c_end).to(**like)[None]}
     return found
 
 

@@ -19,19 +19,13 @@ from drgs.cameras import Camera, rigid
 from drgs.ellipsoids import Y_00
 from drgs.integrator import render
 from drgs.lab.raw import COLORS, gaussians_of, image_of, posed
-from drgs.oracle import activate, float64, screen_rows
+from drgs.oracle import activate, float64, rolling_poses, screen_rows
 from drgs.settings import RenderSettings
 
-__all__ = ["DISTORTIONS", "ORDERS", "SHUTTERS", "ReferenceModel"]
+__all__ = ["BETWEEN", "DISTORTIONS", "ORDERS", "ReferenceModel"]
 
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
-SHUTTERS = (
-    "global",
-    "rolling_top_to_bottom",
-    "rolling_left_to_right",
-    "rolling_bottom_to_top",
-    "rolling_right_to_left",
-)
+BETWEEN = "to the mean, from between both poses"  # as gsplat has it
 # What may be made of OpenCV's (k1, k2, p1, p2, k3, ...): name -> the coefficients that it amounts to.
 DISTORTIONS = {
     "as given": lambda k1, k2, p1, p2, *rest: (k1, k2, p1, p2, *rest),
@@ -61,7 +55,9 @@ class ReferenceModel:
         compensation: `none`, or opacities times sqrt(det / det after dilation) as in anti-aliased modes: `full`, or `at
             least 0.005`.
         direction: Direction that SH are evaluated in: `to the mean`, `to the camera` (the opposite), or `camera frame`
-            (to the mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
+            (to the mean, in camera axes). Along each pixel's ray is `settings.sh_direction`. Of a rolling shutter it
+            starts at the center of the pose in the middle of the exposure, or at the point between the centers of both
+            poses (`BETWEEN`).
         direction_gradient: Whether the mean gets a gradient through that direction.
         sh_degree: Largest SH degree that counts; bands above it are left out.
         sh_sign: Coefficients whose sign is turned: `none`, `odd m` (a basis without the factor (-1)^m), or a band.
@@ -75,7 +71,7 @@ class ReferenceModel:
             rho^2 = |d' x o'|^2 is not divided by |d'|^2.
         peaks: Whether peaks of Gaussians count `in front` of the ray's origin only, or `everywhere`.
         distortion: What is made of the coefficients of a lens: `as given`, or one of the others of `DISTORTIONS`.
-        shutter: Direction of a rolling shutter: `as given`, or one of `SHUTTERS`.
+        shutter: Direction of a rolling shutter: `as given`, or one of `drgs.shutters.SHUTTERS`.
     """
 
     settings: RenderSettings
@@ -104,15 +100,16 @@ class ReferenceModel:
         False where a simpler model draws the same: a lens is of cameras that have one, a shutter of those that move,
         and where a ray meets a Gaussian of rays.
         """
-        moves = getattr(camera, "shutter", "global") != "global"
-        if self.settings.planar and (camera.is_distorted or moves):
+        if self.settings.planar and (camera.is_distorted or camera.is_rolling):
             return False
         if self.distortion != "as given" and not self._reads(camera):
             return False
-        if self.shutter != "as given" and (not moves or self.shutter == camera.shutter):  # type: ignore[attr-defined]
+        if self.direction == BETWEEN and not camera.is_rolling:
+            return False
+        if self.shutter != "as given" and (not camera.is_rolling or self.shutter == camera.shutter):
             return False
         pairs = camera.width * camera.height * count
-        return not self._is_odd or (self.settings.response == "peak" and pairs <= _ODD_PAIRS and not moves)
+        return not self._is_odd or (self.settings.response == "peak" and pairs <= _ODD_PAIRS)
 
     @property
     def _is_odd(self) -> bool:
@@ -230,10 +227,10 @@ class ReferenceModel:
         """What this model reads of a camera; a torch pose keeps its graph."""
         K = np.array(camera.K, float)
         K[:2, 2] += 0.5 - np.asarray(self.pixel_center)
-        w2c = camera.w2c
+        poses = {"w2c": camera.w2c, **({"w2c_end": camera.w2c_end} if camera.is_rolling else {})}
         if self.pose == "c2w":
-            w2c = torch.linalg.inv(w2c) if isinstance(w2c, torch.Tensor) else np.linalg.inv(w2c)
-        fields: dict[str, Any] = {"K": K, "w2c": w2c}
+            poses = {k: (torch if isinstance(x, torch.Tensor) else np).linalg.inv(x) for k, x in poses.items()}
+        fields: dict[str, Any] = {"K": K, **poses}
         if self.distortion != "as given":
             fields["distortion"] = _distorted(self.distortion, camera.distortion)
         if self.shutter != "as given":
@@ -277,9 +274,7 @@ class ReferenceModel:
             sh = sh * factor[:, None]
         if (self.direction == "to the mean" and self.direction_gradient) or sh.shape[1] == 1:
             return sh
-        w2c = float64(camera.w2c)
-        rotation, translation = rigid(w2c)
-        towards = raw["means"] + rotation.T @ translation
+        towards = raw["means"] - _eye(camera, self.direction == BETWEEN)
         # What is known as a detached direction is so for the mean and the camera.
         towards = towards if self.direction_gradient else towards.detach()
         # A mean at the camera has no direction: 0 instead of NaN.
@@ -287,7 +282,7 @@ class ReferenceModel:
         if self.direction == "to the camera":
             towards = -towards
         elif self.direction == "camera frame":
-            towards = towards @ w2c[:3, :3].T
+            towards = towards @ float64(camera.w2c)[:3, :3].T
         color = 0.5 + (reference.sh_basis(towards, sh.shape[1])[..., None] * sh).sum(1)
         return ((color - 0.5) / Y_00)[:, None]  # the renderer clamps at 0 as ever
 
@@ -312,6 +307,18 @@ def _windows(camera: Camera, whole: bool = False) -> Iterator[tuple[int, int, in
     for y in range(0, camera.height, _WINDOW):
         for x in range(0, camera.width, _WINDOW):
             yield x, y, min(_WINDOW, camera.width - x), min(_WINDOW, camera.height - y)
+
+
+def _eye(camera: Camera, between: bool) -> torch.Tensor:
+    """(3,) the point that colors are seen from, float64: the camera's center, of a rolling shutter that of the pose in
+    the middle of the exposure, or the point between the centers of both poses.
+    """
+    if camera.is_rolling and not between:
+        turns, shifts = rolling_poses(camera)
+        return -turns[-1].T @ shifts[-1]
+    ends = [camera.w2c, camera.w2c_end] if camera.is_rolling else [camera.w2c]
+    centers = [-rotation.T @ translation for rotation, translation in (rigid(float64(w2c)) for w2c in ends)]
+    return torch.stack(centers).mean(0)
 
 
 def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) -> torch.Tensor:

@@ -136,7 +136,9 @@ def compared(
         case.say("gradients")
         theirs = case.theirs(u)
         ours = case.ours(model, u)
-        offered = [name for name, x in theirs.items() if name not in MOTIONS or x is not None]
+        # Who has a gradient of one pose of a shutter and none of the other has lost it.
+        poses = any(theirs.get(name) is not None for name in MOTIONS)
+        offered = [name for name, x in theirs.items() if name not in MOTIONS or poses]
         groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in offered}
         found = Compared(views, agrees, u, theirs, groups, ties, counted)
         if ties.any() or (agrees and all(row.verdict for row in groups.values())):
