@@ -340,6 +340,8 @@ def _ray_row(name: str, g: Gaussians, camera: Camera) -> dict:
         is_right = {*groups["gradient bug"]} - {"colors"} == {*defect.groups}
     elif moves and defect.groups:
         is_right = {*groups["gradient bug"]} == {POSE_END}
+    elif moves and found.verdict == "known deviation":  # the other eye, where the image does not show it
+        is_right = "from between both poses" in " ".join(row.why for row in found.groups.values())
     else:
         is_right = found.verdict == "other convention" and len(found.findings) == 1
     verdict = found.verdict if shown or defect is None or not is_right else "not shown"
