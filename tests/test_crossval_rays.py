@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import json
 import math
 import sys
@@ -24,8 +25,9 @@ from drgs.lab import dumps
 from drgs.lab.crossval import crossval
 from drgs.lab.ladder import ladder
 from drgs.lab.rasterizers import function, load_rasterizer, ours
-from drgs.lab.raw import MOTIONS, PARAMETERS
+from drgs.lab.raw import MOTIONS, PARAMETERS, raw_of
 from drgs.settings import RenderSettings
+from drgs.shutters import SHUTTERS
 from drgs.testing import assert_matches
 
 BACKGROUND = (0.3, 0.6, 0.2)
@@ -163,6 +165,22 @@ def test_a_shutter_of_the_camera(name, shutter, lens):
     else:
         assert not found, text
         assert result.verdict == ("agreement" if name == "right" else "gradient bug"), text
+
+
+def test_a_shutter_is_given_in_the_functions_own_words():
+    """Where a function's default is a member of an enumeration, as gsplat's, it is given a member of that."""
+    kinds = enum.Enum("RollingShutterType", [name.upper() for name in SHUTTERS])
+    given = []
+
+    def rasterization(rolling_shutter=kinds.GLOBAL, with_ut=False, **arguments):
+        given.append((rolling_shutter, with_ut))
+        return torch_rays.rasterizer(RIGHT)(rolling_shutter=rolling_shutter, **arguments)
+
+    g, camera = _made(0)
+    camera = _rolling(camera, "rolling_left_to_right")
+    function(rasterization, "own words").image(raw_of(g), camera, BACKGROUND)
+    assert given[0] == (kinds.GLOBAL, False)  # asked for one Gaussian first
+    assert given[-1] == (kinds.ROLLING_LEFT_TO_RIGHT, True)
 
 
 @pytest.mark.parametrize("read", ["rolling_bottom_to_top", "global"])
