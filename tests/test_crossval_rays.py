@@ -136,7 +136,7 @@ def test_a_shutter_that_cameras_do_not_tell(name):
     result = crossval(function(torch_rays.rolling(made), name), g, [camera], "3dgut", FIELDS, channels=0)
     wrong = [group for group, row in result.groups.items() if row.verdict == "gradient bug"]
     assert wrong == (["viewmats"] if name == "shutter_end_detached" else []), "\n".join(result.lines())
-    assert result.verdict == ("gradient bug" if wrong else "model difference")
+    assert result.verdict in (["gradient bug"] if wrong else ["model difference", "undecided"])
 
 
 @pytest.mark.parametrize(

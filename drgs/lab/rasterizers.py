@@ -200,12 +200,14 @@ def _lens_arguments(camera: Camera, like: dict, accepted: Mapping[str, inspect.P
         found |= {"camera_model": "fisheye", "radial_coeffs": torch.tensor([camera.distortion], **like)}
     elif camera.is_distorted:
         k1, k2, p1, p2, *rest = camera.distortion
-        radial = [k1, k2, *rest, *[0.0] * (4 - len(rest))]
+        rest = [*rest, *[0.0] * (8 - len(rest))]  # k3 to k6, and a thin prism's s1 to s4
         found |= {
             "camera_model": "pinhole",
-            "radial_coeffs": torch.tensor([radial], **like),
+            "radial_coeffs": torch.tensor([[k1, k2, *rest[:4]]], **like),
             "tangential_coeffs": torch.tensor([[p1, p2]], **like),
         }
+        if any(rest[4:]):
+            found["thin_prism_coeffs"] = torch.tensor([rest[4:]], **like)
     if camera.is_rolling:
         # gsplat's is a member of an enumeration, whose type its default has.
         kinds = type(accepted["rolling_shutter"].default) if "rolling_shutter" in accepted else str
