@@ -39,7 +39,6 @@ __all__ = [
     "ray_scene",
     "rasterization",
     "rasterizer",
-    "rolling",
     "turned",
 ]
 
@@ -525,16 +524,6 @@ def end_of(w2c):
     turn[:3, :3] = turned(torch.tensor([0.04, -0.06, 0.05]).to(w2c))
     turn[:3, 3] = torch.tensor([0.1, -0.05, 0.08]).to(w2c)
     return turn @ w2c
-
-
-def rolling(function: Callable, shutter: str = SHUTTERS[0]) -> Callable:
-    """A rasterizer that is not told of a shutter and has one: its poses end at `end_of` those that it is given."""
-
-    def rasterize(viewmats, **arguments):
-        ends = torch.stack([end_of(w2c) for w2c in viewmats])
-        return function(viewmats=viewmats, viewmats_rs=ends, rolling_shutter=shutter, **arguments)
-
-    return rasterize
 
 
 def ray_scene(seed=0, n=40, width=32, height=24) -> dict:
